@@ -1,0 +1,133 @@
+"""Reading strict JSON, and writes that are whole or absent.
+
+Every file this package writes goes through `write_atomically`: into a temporary file beside
+the target, then renamed over it. A killed process leaves the old file, never half a new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+from sme_registry.errors import MalformedDocumentError, OptionError
+
+MAX_DOCUMENT_BYTES = 64 * 2**20
+
+
+def parse_json(text: str | bytes, source: str = "document") -> Any:
+    """Parse strict JSON: UTF-8, no NaN or infinity, no key given twice.
+
+    Args:
+      text: the JSON text.
+      source: what to call it in an error, such as its path.
+
+    Returns:
+      The parsed value.
+
+    Raises:
+      MalformedDocumentError: with line and column where there is one.
+    """
+
+    def refuse_constant(name: str) -> NoReturn:
+        raise MalformedDocumentError(f"{source}: {name} is not JSON. Use a finite number.")
+
+    def refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in seen:
+                raise MalformedDocumentError(
+                    f"{source}: the key {key!r} is given twice. Keep one of them."
+                )
+            seen[key] = value
+        return seen
+
+    try:
+        if isinstance(text, bytes):
+            text = text.decode("utf-8")
+        return json.loads(
+            text, parse_constant=refuse_constant, object_pairs_hook=refuse_duplicates
+        )
+    except UnicodeDecodeError as error:
+        raise MalformedDocumentError(
+            f"{source}: not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
+        ) from None
+    except json.JSONDecodeError as error:
+        raise MalformedDocumentError(
+            f"{source}: not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
+        ) from None
+    except RecursionError:
+        raise MalformedDocumentError(
+            f"{source}: nested too deeply. No document of ours is nested more than ten deep."
+        ) from None
+    except MalformedDocumentError:
+        raise
+    except ValueError as error:  # an integer of thousands of digits
+        raise MalformedDocumentError(f"{source}: not JSON that can be read: {error}.") from None
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read a strict JSON file.
+
+    Raises:
+      MalformedDocumentError: the file is missing, unreadable, too large, or not strict JSON.
+    """
+    path = Path(path)
+    try:
+        if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
+            raise MalformedDocumentError(
+                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB; no document of ours is."
+            )
+        text = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise MalformedDocumentError(f"{path}: cannot be read: {reason}.") from None
+    return parse_json(text, str(path))
+
+
+def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
+    """Write a file whole or not at all; the folder is made where it is missing.
+
+    Args:
+      path: the target; an existing file is replaced.
+      content: text (written as UTF-8) or bytes.
+
+    Returns:
+      The path written.
+
+    Raises:
+      OptionError: the folder cannot be made or written to; what stood there is untouched.
+    """
+    path = Path(path)
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    temporary: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's 0600 would hide results from colleagues
+        os.replace(temporary, path)
+        temporary = None
+    except OSError as error:
+        raise OptionError(
+            f"{path}: cannot be written: {error.strerror or error}. "
+            "Give a path in a folder that you may write to."
+        ) from None
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+    return path
+
+
+def to_json(value: Any) -> str:
+    """Readable JSON text (two spaces, final newline) of plain data; refuses NaN."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,92 @@
+"""The catalogue: the files under `specs/`, found by name, by content, or by path.
+
+Nothing is listed twice: what is in the folders is in the catalogue.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.files import read_json
+from sme_registry.spec.envelope import EnvFile, Envelope, ProtocolFile, SuiteFile
+
+NAMESPACE = "SME"
+
+_E = TypeVar("_E", bound=Envelope)
+_FOLDERS: dict[type[Envelope], str] = {
+    EnvFile: "envs",
+    SuiteFile: "suites",
+    ProtocolFile: "protocols",
+}
+_VERSION = re.compile(r"-v(\d+)$")
+
+
+def spec_folder() -> Path:
+    """The folder of the catalogue: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "specs"
+    return installed if installed.is_dir() else package.parent / "specs"
+
+
+def paths(kind: type[Envelope]) -> list[Path]:
+    """The catalogue's files of one kind, in natural order (`StateDim4` before `StateDim16`)."""
+
+    def natural(path: Path) -> list[Any]:
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.stem)]
+
+    return sorted((spec_folder() / _FOLDERS[kind]).glob("*.json"), key=natural)
+
+
+def names(kind: type[Envelope]) -> list[str]:
+    """The versioned names of one kind: `Default-v1`, …"""
+    return [path.stem for path in paths(kind)]
+
+
+@functools.cache
+def _read(kind: type[_E], path: Path) -> _E:
+    return kind.read(path)
+
+
+def entries(kind: type[_E]) -> list[_E]:
+    """Every file of one kind, read and checked."""
+    return [_read(kind, path) for path in paths(kind)]
+
+
+def find(kind: type[_E], name: str) -> _E:
+    """The file of a name, with or without its version (the newest then).
+
+    Raises:
+      UnknownNameError: there is none; the message names the nearest.
+    """
+    known = names(kind)
+    if name in known:
+        return _read(kind, spec_folder() / _FOLDERS[kind] / f"{name}.json")
+    versions = [
+        (int(match[1]), full)
+        for full in known
+        if (match := _VERSION.search(full)) and full[: match.start()] == name
+    ]
+    if versions:
+        return find(kind, max(versions)[1])
+    short = [_VERSION.sub("", full) for full in known]
+    raise UnknownNameError(
+        f"{name!r}: no {kind.content} of this name is in the catalogue."
+        + (did_you_mean(name, known) or did_you_mean(name, short))
+        + " `sme list` shows what there is."
+    )
+
+
+def released() -> Iterator[tuple[str, str]]:
+    """`(versioned name, name by content)` of every environment, read without validation.
+
+    For registering the catalogue at import, which must stay cheap; what is made of a name is
+    validated in full.
+    """
+    for path in paths(EnvFile):
+        digest = read_json(path)["digest"]
+        yield path.stem, digest.replace(":", "-")[: len("sha256-") + 12]

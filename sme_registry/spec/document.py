@@ -1,0 +1,204 @@
+"""The base of every document: frozen, strict, hashed by its canonical JSON.
+
+digest = "sha256:" + hex(SHA-256(RFC 8785 canonical JSON of all fields)), so equal documents have
+equal digests on every machine, whatever the key order or the way a number was written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import types
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+
+import rfc8785
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from sme_registry.errors import SpecError, did_you_mean
+
+_EXPLAINED = "document"  # the error type of lines that already are in our words
+_SHOWN = 60  # characters of a bad value that an error repeats
+
+
+def _plain_number(value: Any) -> Any:
+    """NumPy's scalars as Python's, so that a sweep over `np.arange` needs no casts; no booleans."""
+    if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:
+        kind = value.dtype.kind
+        if kind in "iuf":
+            return value.item()
+    return value
+
+
+def _no_negative_zero(value: float) -> float:
+    return value + 0.0
+
+
+Integer = Annotated[int, BeforeValidator(_plain_number)]
+Real = Annotated[
+    float,
+    Field(allow_inf_nan=False),
+    BeforeValidator(_plain_number),
+    AfterValidator(_no_negative_zero),
+]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", min_length=1, max_length=64)]
+
+
+def explained(message: str) -> PydanticCustomError:
+    """An error for a validator to raise whose text is already field, value, range and fix."""
+    return PydanticCustomError(_EXPLAINED, "{message}", {"message": message})
+
+
+class StrictModel(BaseModel):
+    """Frozen and strict; unknown fields are refused, in words that say what to do."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_default=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_our_words(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return handler(data)
+        except ValidationError as error:
+            lines = [
+                InitErrorDetails(
+                    type=explained(_explain(cls, line)), loc=line["loc"], input=line["input"]
+                )
+                for line in error.errors()
+            ]
+            raise ValidationError.from_exception_data(cls.__name__, lines) from None
+
+    @classmethod
+    def parse(cls, data: Any, source: str = "") -> Self:
+        """Validate plain data (as `json.loads` gives it).
+
+        Args:
+          data: a mapping of field names to values.
+          source: what to call it in an error, such as its path.
+
+        Returns:
+          The document.
+
+        Raises:
+          SpecError: one line for each field that is wrong, missing or unknown.
+        """
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            lines = [line["msg"] for line in error.errors()]
+            head = f"{source or cls.__name__}: "
+            text = lines[0] if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
+            raise SpecError(head + text) from None
+
+    def plain(self) -> dict[str, Any]:
+        """Every field as plain JSON data."""
+        return self.model_dump(mode="json")
+
+    # Pydantic's own equality also compares private attributes, which are no part of the document.
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return bool(self.__dict__ == other.__dict__)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *self.__dict__.values()))
+
+
+class Document(StrictModel):
+    """What has an identity: equal documents have equal digests, and the other way round."""
+
+    def canonical_json(self) -> bytes:
+        """The RFC 8785 canonical JSON of every field."""
+        return rfc8785.dumps(self.plain())
+
+    @property
+    def digest(self) -> str:
+        """`sha256:` and 64 hex digits: the identity of this document."""
+        return "sha256:" + hashlib.sha256(self.canonical_json()).hexdigest()
+
+
+def _explain(document: type[StrictModel], line: Any) -> str:
+    """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
+    location, value = line["loc"], line["input"]
+    if line["type"] == _EXPLAINED:
+        return _from_the_root(str(line["msg"]), location)
+    if not location:
+        return f"{document.__name__}: must be an object of named fields, got {_show(value)}."
+    path = ".".join(str(part) for part in location)
+    fields = document.model_fields
+    name = str(location[0])
+    if line["type"] == "extra_forbidden":
+        hint = did_you_mean(name, fields) or f" Known fields: {', '.join(fields)}."
+        return f"{path}={_show(value)}: unknown field.{hint} Rename or remove it."
+    field = fields[name]
+    if line["type"] == "missing":
+        return f"{path}: missing: must be {_allowed(field)}. Add it."
+    fix = "Correct it."
+    if not field.is_required() and len(location) == 1:
+        fix = f"Leave it out for the default, {_show(field.get_default(call_default_factory=True))}."
+    allowed = f"must be {_allowed(field)}" if len(location) == 1 else str(line["msg"])
+    return f"{path}={_show(value)}: {allowed}. {fix}"
+
+
+def _from_the_root(message: str, location: tuple[int | str, ...]) -> str:
+    """A nested document's line with its field's whole path: `team.agents.1.observes=…`."""
+    parts = [str(part) for part in location]
+    for start in range(len(parts)):
+        tail = ".".join(parts[start:])
+        if message.startswith((f"{tail}=", f"{tail}:")):
+            return ".".join(parts) + message[len(tail) :]
+    return message
+
+
+def _show(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def _allowed(field: FieldInfo) -> str:
+    """The values a field takes, in words."""
+    low, high = "", ""
+    for bound in field.metadata:
+        match bound:
+            case Ge(ge=limit):
+                low = f"[{limit}"
+            case Gt(gt=limit):
+                low = f"({limit}"
+            case Le(le=limit):
+                high = f"{limit}]"
+            case Lt(lt=limit):
+                high = f"{limit})"
+    span = f"in {low or '(−∞'}, {high or '∞)'}" if low or high else ""
+    kind = _kind(field.annotation)
+    return f"{kind} {span}".strip() if kind else (span or field.description or "of another form")
+
+
+def _kind(annotation: Any) -> str:
+    origin = get_origin(annotation)
+    if annotation is int:
+        return "an integer"
+    if annotation is float:
+        return "a finite number"
+    if annotation is str:
+        return "a string of letters, digits, '_' and '-'"
+    if origin is Literal:
+        return " or ".join(repr(choice) for choice in get_args(annotation))
+    if origin is tuple:
+        return "a list"
+    if origin in (Union, types.UnionType):
+        return " or ".join(filter(None, (_kind(member) for member in get_args(annotation))))
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return f"an object: {', '.join(annotation.model_fields)}"
+    if annotation is type(None):
+        return "null"
+    return ""

@@ -1,0 +1,112 @@
+"""Files: a document in an envelope of name, version, description, tags and digest.
+
+The digest is of the document alone, so renaming a file or describing it better changes nothing.
+A file whose digest is not its document's is refused.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field
+
+from sme_registry.errors import DigestMismatchError
+from sme_registry.files import read_json, to_json, write_atomically
+from sme_registry.spec.document import Integer, Name, StrictModel
+from sme_registry.spec.protocol import EvaluationProtocol
+from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.suite import Suite
+
+_ROW = Annotated[tuple[float, ...], Field(strict=False)]
+_ROWS = Annotated[tuple[_ROW, ...], Field(strict=False, min_length=1, max_length=64)]
+
+
+class Fingerprint(StrictModel):
+    """A drawn task's numbers at fixed probes: π*(s) and T(s, a), `[P, A]` and `[P, S]`."""
+
+    optimal_action: _ROWS
+    next_state: _ROWS
+
+
+class Envelope(StrictModel):
+    """What every file carries beside its document."""
+
+    content: ClassVar[str]
+
+    name: Name
+    version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
+    description: Annotated[str, Field(max_length=2000)] = ""
+    tags: Annotated[tuple[Name, ...], Field(strict=False, max_length=64)] = ()
+    digest: Annotated[str, Field(pattern=r"^sha256:[0-9a-f]{64}$")]
+
+    @property
+    def versioned_name(self) -> str:
+        """`Default-v1`: how files and ids are called."""
+        return f"{self.name}-v{self.version}"
+
+    @classmethod
+    def open(cls, data: Any, source: str) -> Self:
+        """Validate an envelope and that its digest is its document's.
+
+        Args:
+          data: plain data.
+          source: what to call it in an error, such as its path.
+
+        Raises:
+          SpecError: a field is wrong.
+          DigestMismatchError: the digest is of another document.
+        """
+        envelope = cls.parse(data, source)
+        found = getattr(envelope, cls.content).digest
+        if found != envelope.digest:
+            raise DigestMismatchError(
+                f"{source}: digest={envelope.digest!r}: its {cls.content} has {found!r}. The "
+                f"{cls.content} or the digest was changed after it was written: take the file "
+                f"again from its source, or save the changed {cls.content} as a new file."
+            )
+        return envelope
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file.
+
+        Raises:
+          MalformedDocumentError: not readable, or not strict JSON.
+          SpecError: a field is wrong.
+          DigestMismatchError: the digest is of another document.
+        """
+        return cls.open(read_json(path), str(path))
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, whole or not at all.
+
+        Raises:
+          OptionError: it cannot be written; what stood there is untouched.
+        """
+        write_atomically(path, to_json(self.plain()))
+
+
+class EnvFile(Envelope):
+    """A task's file: `specs/envs/*.json`, or what `sme_registry.save` writes."""
+
+    content = "spec"
+
+    spec: SMESpec
+    fingerprint: Fingerprint
+
+
+class SuiteFile(Envelope):
+    """A suite's file: `specs/suites/*.json`."""
+
+    content = "suite"
+
+    suite: Suite
+
+
+class ProtocolFile(Envelope):
+    """A protocol's file: `specs/protocols/*.json`."""
+
+    content = "protocol"
+
+    protocol: EvaluationProtocol

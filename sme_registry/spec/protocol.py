@@ -1,0 +1,44 @@
+"""`EvaluationProtocol`: which states a policy is judged in, as a hashed document.
+
+METHOD, section 3: nested cubes X_ε = {s : ‖s − ½‖_∞ ≤ (1+ε)/2}; region 0 is the cube X_0 (WD),
+region m the half-open shell X_{ε_m} \\ X_{ε_{m−1}} (OOD m); states uniform by volume in each.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sme_registry.spec.document import Document, Integer, Real, explained
+
+
+class EvaluationProtocol(Document):
+    """How many states, in which regions, with which auxiliary inputs, from which seed."""
+
+    schema_version: Literal[1] = 1
+    states_per_region: Annotated[Integer, Field(ge=2, le=10**8)] = 50_000
+    epsilons: Annotated[
+        tuple[Real, ...],
+        Field(strict=False, min_length=1, max_length=1000, description="outer ε of each OOD shell"),
+    ] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    sampling: Literal["volume_uniform"] = "volume_uniform"
+    time_input: Literal["uniform_over_steps"] = "uniform_over_steps"
+    accumulated_reward_input: Literal["zero"] = "zero"
+    seed: Annotated[Integer, Field(ge=0, lt=2**53)] = 0
+
+    @model_validator(mode="after")
+    def _shells_are_nested(self) -> Self:
+        levels = (0.0, *self.epsilons)
+        if any(outer <= inner for inner, outer in zip(levels, levels[1:], strict=False)):
+            raise explained(
+                f"epsilons={list(self.epsilons)!r:.70}: must increase, from above 0. "
+                "Sort them and remove repeats and zeros."
+            )
+        return self
+
+    @property
+    def edges(self) -> tuple[tuple[float, float], ...]:
+        """`(ε_low, ε_high)` of each region, WD first: (0, 0), (0, ε_1), (ε_1, ε_2), …"""
+        levels = (0.0, *self.epsilons)
+        return ((0.0, 0.0), *zip(levels, levels[1:], strict=False))

@@ -1,0 +1,204 @@
+"""`SMESpec`: the handful of numbers that a Synthetic Monitoring Environment is generated from.
+
+Symbols of METHOD beside the fields: N_s `state_dim` (S), N_a `action_dim` (A), k, r_min, D,
+C_π* `complexity` (L), T `horizon`, H `hidden_width`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, PlainSerializer, PlainValidator, PrivateAttr, WithJsonSchema, model_validator
+
+from sme_registry.errors import SpecError
+from sme_registry.spec.document import Document, Integer, Real, explained
+
+MAX_DIM = 2**20
+MAX_SEED = 2**53  # above it not every integer is a JSON number that all readers agree on
+_HEX_SEED = re.compile(r"0x[0-9a-fA-F]{1,64}")
+_AGENT_NAME = r"^[A-Za-z][A-Za-z0-9-]*_(0|[1-9][0-9]*)$"
+
+
+def _seed(value: Any) -> int | str:
+    if isinstance(value, str) and _HEX_SEED.fullmatch(value):
+        return f"0x{int(value, 16):x}"
+    number = value.item() if type(value).__module__ == "numpy" and value.ndim == 0 else value
+    if isinstance(number, int) and not isinstance(number, bool) and 0 <= number < MAX_SEED:
+        return number
+    raise explained(
+        f"seed={value!r:.70}: must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
+        "'0x…' of 1 to 64 hex digits. Leave it out for the default, 0."
+    )
+
+
+Seed = Annotated[
+    int | str,
+    PlainValidator(_seed),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "integer", "minimum": 0, "exclusiveMaximum": MAX_SEED},
+                {"type": "string", "pattern": "^0x[0-9a-fA-F]{1,64}$"},
+            ]
+        }
+    ),
+]
+
+
+def _observed(value: Any) -> Any:
+    if value == "all":
+        return value
+    channels = list(value) if isinstance(value, list | tuple) else None
+    if not channels or any(type(c) is not int or c < 0 for c in channels):
+        raise explained(
+            f"observes={value!r:.70}: must be 'all' or a list of state channels, each an integer "
+            "in [0, state_dim). Leave it out for 'all'."
+        )
+    if sorted(set(channels)) != channels:
+        raise explained(
+            f"observes={value!r:.70}: channels must be in increasing order, each once. "
+            f"Write {sorted(set(channels))!r:.70}."
+        )
+    return tuple(channels)
+
+
+Observed = Annotated[
+    Literal["all"] | tuple[int, ...],
+    PlainValidator(_observed),
+    PlainSerializer(lambda channels: channels if channels == "all" else list(channels)),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"const": "all"},
+                {"type": "array", "items": {"type": "integer", "minimum": 0}, "minItems": 1},
+            ]
+        }
+    ),
+]
+
+
+class AgentSpec(Document):
+    """One agent of a team: the action channels it owns and the state channels it observes."""
+
+    name: Annotated[str, Field(pattern=_AGENT_NAME, max_length=64)]
+    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)]
+    observes: Observed = "all"
+
+
+class TeamSpec(Document):
+    """How the action channels are shared out; agents own consecutive channels, in order."""
+
+    agents: Annotated[tuple[AgentSpec, ...], Field(min_length=1, max_length=1024, strict=False)]
+    reward: Literal["individual", "team"] = "individual"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_names(cls, data: Any) -> Any:
+        """Agents without a name are `agent_0`, `agent_1`, …, as PettingZoo's own are."""
+        if not isinstance(data, dict) or not isinstance(data.get("agents"), list | tuple):
+            return data
+        agents = [
+            {"name": f"agent_{i}", **agent} if isinstance(agent, dict) else agent
+            for i, agent in enumerate(data["agents"])
+        ]
+        return {**data, "agents": agents}
+
+    @model_validator(mode="after")
+    def _unique_names(self) -> Self:
+        names = [agent.name for agent in self.agents]
+        for name in names:
+            if names.count(name) > 1:
+                raise explained(f"agents: the name {name!r} is given twice. Rename one of them.")
+        return self
+
+
+class Setting(Document):
+    """Everything that a task is generated from but its seed: one setting of the axes.
+
+    Defaults are the paper's (METHOD, section 1), and ours where it gives none.
+    """
+
+    schema_version: Literal[1] = 1
+    state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="S, state channels")] = 8
+    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="A, action channels")] = 4
+    k: Annotated[Integer, Field(ge=1, le=2**31 - 1, description="reward interval, steps")] = 1
+    r_min: Annotated[Real, Field(ge=0, lt=1, description="reward threshold")] = 0.0
+    D: Annotated[Real, Field(ge=0, lt=1, description="survival threshold")] = 0.0
+    complexity: Annotated[
+        Integer, Field(ge=1, le=10_000, description="L, layers of the optimal policy")
+    ] = 1
+    horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1, description="T, steps")] = 100
+    hidden_width: Annotated[
+        Integer, Field(ge=1, le=4096, description="H, width of the inner layers")
+    ] = 64
+    policy_init: Literal["semi_orthogonal", "unit_variance"] = "semi_orthogonal"
+    team: TeamSpec | None = None
+
+    @model_validator(mode="after")
+    def _team_fits(self) -> Self:
+        if self.team is None:
+            return self
+        owned = sum(agent.action_dim for agent in self.team.agents)
+        if owned != self.action_dim:
+            raise explained(
+                f"team.agents: their action channels add up to {owned}: must be "
+                f"action_dim={self.action_dim}. Change an agent's action_dim, or the task's."
+            )
+        for agent in self.team.agents:
+            if agent.observes != "all" and agent.observes[-1] >= self.state_dim:
+                raise explained(
+                    f"team.agents.{agent.name}.observes={list(agent.observes)!r:.70}: must be in "
+                    f"[0, state_dim={self.state_dim}). Remove channel {agent.observes[-1]}, or "
+                    "raise state_dim."
+                )
+        # The list of all channels and "all" are the same team, so they must be the same document.
+        everything = tuple(range(self.state_dim))
+        agents = tuple(
+            agent.model_copy(update={"observes": "all"}) if agent.observes == everything else agent
+            for agent in self.team.agents
+        )
+        self.__dict__["team"] = self.team.model_copy(update={"agents": agents})
+        return self
+
+
+class SMESpec(Setting):
+    """A task, whole: a setting of the axes and the seed of its draw.
+
+    Equal specs have equal digests, and equal digests are equal specs.
+    """
+
+    seed: Seed = 0
+
+    # What a file publishes of the drawn numbers; checked when the task is materialised. It
+    # travels with the spec that was read from that file and is no part of its identity.
+    _fingerprint: Any = PrivateAttr(default=None)
+
+    @property
+    def content_name(self) -> str:
+        """`sha256-` and the first 12 hex digits of the digest: the name by content."""
+        return self.digest.replace(":", "-")[: len("sha256-") + 12]
+
+    def derive(self, **overrides: Any) -> SMESpec:
+        """This spec with some fields changed: another task, with another digest.
+
+        Args:
+          **overrides: spec fields and their new values.
+
+        Raises:
+          SpecError: an unknown field, or a value outside its range.
+        """
+        return SMESpec.parse({**self.plain(), **overrides}) if overrides else self
+
+
+def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
+    """A spec given as itself or as plain data.
+
+    Raises:
+      SpecError: a field is wrong, missing or unknown, or `value` is neither.
+    """
+    if isinstance(value, SMESpec):
+        return value
+    if isinstance(value, dict):
+        return SMESpec.parse(value)
+    raise SpecError(f"{value!r:.80}: must be an SMESpec or a mapping of its fields.")

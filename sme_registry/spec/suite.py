@@ -1,0 +1,53 @@
+"""`Suite`: a list of classes; a class is one setting with its instances (seeds).
+
+A method is judged on a kind of task and not on one draw of it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sme_registry.spec.document import Document, Name, explained
+from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
+
+
+class SuiteClass(Document):
+    """One kind of task: a setting of the axes and the seeds of its instances."""
+
+    name: Name
+    setting: Setting
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1, max_length=10_000, strict=False)]
+
+    @model_validator(mode="after")
+    def _seeds_differ(self) -> Self:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise explained(f"seeds={list(self.seeds)!r:.70}: each may stand once. Remove repeats.")
+        return self
+
+    @property
+    def instances(self) -> tuple[SMESpec, ...]:
+        """The specs of this class, in the order of its seeds."""
+        fields = self.setting.plain()
+        return tuple(SMESpec.parse({**fields, "seed": seed}) for seed in self.seeds)
+
+
+class Suite(Document):
+    """Classes of tasks under different names."""
+
+    schema_version: Literal[1] = 1
+    classes: Annotated[tuple[SuiteClass, ...], Field(min_length=1, max_length=1000, strict=False)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        names = [member.name for member in self.classes]
+        for name in names:
+            if names.count(name) > 1:
+                raise explained(f"classes: the name {name!r} is given twice. Rename one of them.")
+        return self
+
+    @property
+    def instances(self) -> tuple[SMESpec, ...]:
+        """Every spec of the suite, class by class."""
+        return tuple(spec for member in self.classes for spec in member.instances)

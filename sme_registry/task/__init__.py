@@ -1,0 +1,6 @@
+"""From a spec to numbers and equations: the NumPy definition of every task."""
+
+from sme_registry.task.draw import Layer
+from sme_registry.task.task import Task, materialize
+
+__all__ = ["Layer", "Task", "materialize"]

@@ -1,0 +1,107 @@
+"""From a spec's seed to the numbers of a task: W, b, and the layers of each optimal policy.
+
+Source: METHOD, section 1. `S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.spec import AgentSpec, SMESpec
+from sme_registry.task.streams import gaussian, raw_bits, uniform
+
+Array = npt.NDArray[np.float64]
+
+GRID_BITS = 29  # 29 bits of W times 24 of a float32 action fit the 53 of a float64
+
+
+class Layer(NamedTuple):
+    """One uniform layer y = Φ(W x + b): `W [out, in]`, `b [out]`."""
+
+    W: Array
+    b: Array
+
+
+def transition_matrix(spec: SMESpec) -> Array:
+    """W `[A, S]`: U(0,1) entries, each row divided by its sum, on the grid 2⁻²⁹.
+
+    In exact integer arithmetic: each entry is rounded down to the grid, and what a row then
+    lacks of exactly 1 goes, a grid step each, to the entries that lost most.
+    """
+    shape = (spec.action_dim, spec.state_dim)
+    bits = raw_bits(spec.seed, "transition/W", math.prod(shape)).reshape(shape)
+    # Odd 32-bit numbers, the mid-points of 2³¹ bins. With at most 2²⁰ of them in a row, every
+    # product and sum below is an integer under 2⁶³.
+    weights = (bits >> np.uint64(33)) * np.uint64(2) + np.uint64(1)
+    scaled = weights << np.uint64(GRID_BITS)
+    totals = weights.sum(axis=1, keepdims=True, dtype=np.uint64)
+    units, lost = np.divmod(scaled, totals)
+    missing = np.uint64(2**GRID_BITS) - units.sum(axis=1, dtype=np.uint64)
+    most_lost_first = np.argsort(lost, axis=1, kind="stable")[:, ::-1]
+    for row, count in enumerate(missing):
+        units[row, most_lost_first[row, : int(count)]] += np.uint64(1)
+    return units.astype(np.float64) * 2.0**-GRID_BITS
+
+
+def transition_offset(spec: SMESpec) -> Array:
+    """b `[S]`, entries U(0,1)."""
+    return uniform(spec.seed, "transition/b", spec.state_dim)
+
+
+def optimal_policies(spec: SMESpec) -> tuple[tuple[Layer, ...], ...]:
+    """The layers of each agent's optimal policy; a single agent is a team of one."""
+    return tuple(
+        _optimal_policy(spec, f"policy/{index}", observed, agent.action_dim)
+        for index, (agent, observed) in enumerate(
+            zip(agents(spec), observed_channels(spec), strict=True)
+        )
+    )
+
+
+def agents(spec: SMESpec) -> tuple[AgentSpec, ...]:
+    """The agents of a spec; without a team, one that owns and observes everything."""
+    if spec.team is not None:
+        return spec.team.agents
+    return (AgentSpec(name="agent_0", action_dim=spec.action_dim),)
+
+
+def observed_channels(spec: SMESpec) -> tuple[tuple[int, ...], ...]:
+    """The state channels that each agent observes, as indices."""
+    everything = tuple(range(spec.state_dim))
+    return tuple(
+        everything if agent.observes == "all" else tuple(agent.observes) for agent in agents(spec)
+    )
+
+
+def _optimal_policy(
+    spec: SMESpec, stream: str, observed: tuple[int, ...], action_dim: int
+) -> tuple[Layer, ...]:
+    """A Deep Uniform Network of L layers: in → H → … → H → out; in → out where L = 1."""
+    inner = spec.complexity - 1
+    widths = [len(observed), *[spec.hidden_width] * inner, action_dim]
+    names = [f"{stream}/inner/{index}" for index in range(inner)] + [f"{stream}/output"]
+    return tuple(
+        _uniform_layer(spec, name, inputs, outputs)
+        for name, inputs, outputs in zip(names, widths[:-1], widths[1:], strict=True)
+    )
+
+
+def _uniform_layer(spec: SMESpec, name: str, inputs: int, outputs: int) -> Layer:
+    """W = √12 × semi-orthogonal, b = −½ W 1, so that Φ(W x + b) of uniform x is near uniform."""
+    tall = _haar(spec.seed, name, max(inputs, outputs), min(inputs, outputs))
+    semi_orthogonal = tall if outputs >= inputs else tall.T
+    if spec.policy_init == "unit_variance" and outputs > inputs:
+        semi_orthogonal /= np.linalg.norm(semi_orthogonal, axis=1, keepdims=True)
+    W = np.ascontiguousarray(math.sqrt(12.0) * semi_orthogonal)
+    return Layer(W, -0.5 * W.sum(axis=1))
+
+
+def _haar(seed: int | str, name: str, rows: int, columns: int) -> Array:
+    """Haar-distributed orthonormal columns `[rows, columns]`: QR with R's diagonal made positive."""
+    normal = gaussian(seed, name, rows * columns).reshape(rows, columns)
+    Q, R = np.linalg.qr(normal)
+    return Q * np.where(np.diag(R) < 0, -1.0, 1.0)

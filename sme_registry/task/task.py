@@ -1,0 +1,189 @@
+"""`Task`: a spec's numbers and the equations over them, batch-first. This is the definition.
+
+Source: METHOD, section 1. Axis letters: `B` batch, `S` state_dim, `A` action_dim.
+
+    π*(s)    = Φ(W_L Φ(… Φ(W_1 s + b_1) …) + b_L)      optimal policy, a Deep Uniform Network
+    T(s, a)  = ψ(s + a W + b),  ψ(x) = 2 |x − rint x|   transition
+    r̃(s, a)  = 1 − ‖a − π*(s)‖₁ / A                     similarity
+    r̂(s, a)  = max(0, 4 (r̃ − ¾))
+    r(s, a)  = r̂ if r̂ > r_min, else 0                   step reward; regret = 1 − r
+
+Every method takes one state `[S]` or a batch `[B, S]`, and answers in kind. States may lie outside
+the unit cube. Actions are clipped to [0, 1], as the environment clips them.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from sme_registry.errors import ActionError, StateError
+from sme_registry.spec import SMESpec
+from sme_registry.task import draw, fingerprint, memory
+from sme_registry.task.draw import Array, Layer
+
+_CACHED_BYTES = 2**24
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A drawn task: pure, read-only, safe to share between environments and threads.
+
+    Attributes:
+      spec: what it was drawn from.
+      W: `[A, S]` transition matrix; entries in [0, 1] on the grid 2⁻²⁹, each row sums to 1.
+      b: `[S]` transition offset in (0, 1).
+      policies: the layers of each agent's optimal policy; one entry where there is no team.
+      observed: the state channels that each agent observes.
+    """
+
+    spec: SMESpec
+    W: Array
+    b: Array
+    policies: tuple[tuple[Layer, ...], ...]
+    observed: tuple[tuple[int, ...], ...]
+
+    @property
+    def layers(self) -> list[Layer] | list[list[Layer]]:
+        """`(W [out, in], b [out])` of each layer of π*; for teams a list of such lists."""
+        if self.spec.team is None:
+            return list(self.policies[0])
+        return [list(policy) for policy in self.policies]
+
+    def transition(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """The next state, ψ(s + a W + b).
+
+        The sum runs in a fixed order (s + b, then W_i a_i for i = 1…A) over actions rounded to
+        float32, which makes each product exact: so every back-end gets the same bits.
+
+        Args:
+          s: `[B, S]` or `[S]` states.
+          a: `[B, A]` or `[A]` actions.
+
+        Returns:
+          `[B, S]` or `[S]` next states in [0, 1].
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        s, a = self._states(s), self._actions(a)
+        y = s + self.b
+        for i in range(self.spec.action_dim):
+            y = y + self.W[i] * a[..., i, None].astype(np.float32).astype(np.float64)
+        return np.asarray(2.0 * np.abs(y - np.rint(y)))
+
+    def optimal_action(self, s: npt.ArrayLike) -> Array:
+        """π*(s), the unique action of regret 0.
+
+        Args:
+          s: `[B, S]` or `[S]` states, any real numbers.
+
+        Returns:
+          `[B, A]` or `[A]` actions in [0, 1].
+
+        Raises:
+          StateError: wrong shape or not finite.
+        """
+        s = self._states(s)
+        actions = []
+        for channels, policy in zip(self.observed, self.policies, strict=True):
+            x = s if len(channels) == self.spec.state_dim else s[..., channels]
+            for W, b in policy:
+                x = ndtr(x @ W.T + b)
+            actions.append(x)
+        return np.concatenate(actions, axis=-1) if len(actions) > 1 else np.asarray(actions[0])
+
+    def similarity(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """r̃ = 1 − ‖a − π*(s)‖₁ / A, `[B]` or a scalar, in [0, 1]; exactly 1 at the optimum.
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        return self._similarity(self._actions(a), self.optimal_action(s))
+
+    def step_reward(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """r, `[B]` or a scalar, in [0, 1]: the step reward after the threshold r_min.
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        return self.reward_of(self.similarity(s, a))
+
+    def regret(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """1 − r, `[B]` or a scalar, in [0, 1]: what the optimum would have earned beyond this.
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        return 1.0 - self.step_reward(s, a)
+
+    def reward_of(self, similarity: npt.ArrayLike) -> Array:
+        """The step reward r of similarities r̃, of any shape."""
+        graded = np.maximum(0.0, 4.0 * (np.asarray(similarity) - 0.75))
+        return np.where(graded > self.spec.r_min, graded, 0.0)[()]
+
+    def _similarity(self, a: Array, optimal: Array) -> Array:
+        return 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim
+
+    def _states(self, s: npt.ArrayLike) -> Array:
+        return _checked(s, self.spec.state_dim, "state", StateError)
+
+    def _actions(self, a: npt.ArrayLike) -> Array:
+        return np.clip(_checked(a, self.spec.action_dim, "action", ActionError), 0.0, 1.0)
+
+
+def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception]) -> Array:
+    """`values` as float64 of shape `[..., width]`, finite."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise error(f"{what}={values!r:.80}: must be an array of {width} numbers.") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != width:
+        raise error(
+            f"{what} of shape {array.shape}: must be [{width}] or [B, {width}] "
+            f"(this task's {what}_dim is {width})."
+        )
+    if not np.isfinite(array).all():
+        raise error(f"{what}: has NaN or infinite entries. Every entry must be a finite number.")
+    return array
+
+
+def materialize(spec: SMESpec) -> Task:
+    """Draw the numbers of a spec. The same spec gives the same task, bit for bit on one machine.
+
+    Args:
+      spec: the spec; one read from a file carries that file's fingerprint.
+
+    Returns:
+      The task, its arrays read-only.
+
+    Raises:
+      ResourceLimitError: it would not fit in memory; the message says how much it needs.
+      FingerprintMismatchError: this machine draws other numbers than the file publishes.
+    """
+    memory.refuse_above_limit(
+        memory.peak_bytes(spec),
+        f"A task of state_dim={spec.state_dim}, action_dim={spec.action_dim}, "
+        f"complexity={spec.complexity}, hidden_width={spec.hidden_width}",
+        "Make one of these smaller.",
+    )
+    small = memory.parameter_bytes(spec) <= _CACHED_BYTES
+    task = _draw_cached(spec) if small else _draw(spec)
+    if spec._fingerprint is not None:
+        fingerprint.check(spec._fingerprint, task)
+    return task
+
+
+def _draw(spec: SMESpec) -> Task:
+    W, b = draw.transition_matrix(spec), draw.transition_offset(spec)
+    policies = draw.optimal_policies(spec)
+    for array in (W, b, *(part for policy in policies for layer in policy for part in layer)):
+        array.setflags(write=False)
+    return Task(spec, W, b, policies, draw.observed_channels(spec))
+
+
+_draw_cached = functools.lru_cache(maxsize=64)(_draw)
