@@ -48,9 +48,7 @@ def parse_json(text: str | bytes, source: str = "document") -> Any:
     try:
         if isinstance(text, bytes):
             text = text.decode("utf-8")
-        return json.loads(
-            text, parse_constant=refuse_constant, object_pairs_hook=refuse_duplicates
-        )
+        return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_duplicates)
     except UnicodeDecodeError as error:
         raise MalformedDocumentError(
             f"{source}: not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.files import read_json
-from sme_registry.spec.envelope import EnvFile, Envelope, ProtocolFile, SuiteFile
+from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, SuiteFile
 
 NAMESPACE = "SME"
 

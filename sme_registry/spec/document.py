@@ -145,7 +145,9 @@ def _explain(document: type[StrictModel], line: Any) -> str:
         return f"{path}: missing: must be {_allowed(field)}. Add it."
     fix = "Correct it."
     if not field.is_required() and len(location) == 1:
-        fix = f"Leave it out for the default, {_show(field.get_default(call_default_factory=True))}."
+        fix = (
+            f"Leave it out for the default, {_show(field.get_default(call_default_factory=True))}."
+        )
     allowed = f"must be {_allowed(field)}" if len(location) == 1 else str(line["msg"])
     return f"{path}={_show(value)}: {allowed}. {fix}"
 

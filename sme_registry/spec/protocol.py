@@ -6,6 +6,7 @@ region m the half-open shell X_{ε_m} \\ X_{ε_{m−1}} (OOD m); states uniform 
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -30,7 +31,7 @@ class EvaluationProtocol(Document):
     @model_validator(mode="after")
     def _shells_are_nested(self) -> Self:
         levels = (0.0, *self.epsilons)
-        if any(outer <= inner for inner, outer in zip(levels, levels[1:], strict=False)):
+        if any(outer <= inner for inner, outer in itertools.pairwise(levels)):
             raise explained(
                 f"epsilons={list(self.epsilons)!r:.70}: must increase, from above 0. "
                 "Sort them and remove repeats and zeros."
@@ -41,4 +42,4 @@ class EvaluationProtocol(Document):
     def edges(self) -> tuple[tuple[float, float], ...]:
         """`(ε_low, ε_high)` of each region, WD first: (0, 0), (0, ε_1), (ε_1, ε_2), …"""
         levels = (0.0, *self.epsilons)
-        return ((0.0, 0.0), *zip(levels, levels[1:], strict=False))
+        return ((0.0, 0.0), *itertools.pairwise(levels))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 
 from sme_registry.errors import OptionError, ResourceLimitError
@@ -62,5 +63,5 @@ def _shapes(spec: SMESpec) -> list[tuple[int, int]]:
     shapes = [(spec.state_dim, spec.action_dim)]
     for agent, observed in zip(agents(spec), observed_channels(spec), strict=True):
         widths = [len(observed), *[spec.hidden_width] * (spec.complexity - 1), agent.action_dim]
-        shapes += list(zip(widths[:-1], widths[1:], strict=True))
+        shapes += list(itertools.pairwise(widths))
     return shapes

@@ -88,14 +88,7 @@ class Task:
         Raises:
           StateError: wrong shape or not finite.
         """
-        s = self._states(s)
-        actions = []
-        for channels, policy in zip(self.observed, self.policies, strict=True):
-            x = s if len(channels) == self.spec.state_dim else s[..., channels]
-            for W, b in policy:
-                x = ndtr(x @ W.T + b)
-            actions.append(x)
-        return np.concatenate(actions, axis=-1) if len(actions) > 1 else np.asarray(actions[0])
+        return self.policy(self._states(s))
 
     def similarity(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """r̃ = 1 − ‖a − π*(s)‖₁ / A, `[B]` or a scalar, in [0, 1]; exactly 1 at the optimum.
@@ -103,7 +96,7 @@ class Task:
         Raises:
           StateError, ActionError: wrong shape or not finite.
         """
-        return self._similarity(self._actions(a), self.optimal_action(s))
+        return self.similarity_of(self._actions(a), self.optimal_action(s))
 
     def step_reward(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """r, `[B]` or a scalar, in [0, 1]: the step reward after the threshold r_min.
@@ -126,8 +119,19 @@ class Task:
         graded = np.maximum(0.0, 4.0 * (np.asarray(similarity) - 0.75))
         return np.where(graded > self.spec.r_min, graded, 0.0)[()]
 
-    def _similarity(self, a: Array, optimal: Array) -> Array:
+    def similarity_of(self, a: Array, optimal: Array) -> Array:
+        """r̃ of actions in [0, 1] beside the optimal ones, `[..., A]` each."""
         return 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim
+
+    def policy(self, s: Array) -> Array:
+        """π* of states `[..., S]`, unchecked: each agent's layers over what it observes."""
+        actions = []
+        for channels, layers in zip(self.observed, self.policies, strict=True):
+            x = s if len(channels) == self.spec.state_dim else s[..., channels]
+            for W, b in layers:
+                x = ndtr(x @ W.T + b)
+            actions.append(x)
+        return np.concatenate(actions, axis=-1) if len(actions) > 1 else actions[0]
 
     def _states(self, s: npt.ArrayLike) -> Array:
         return _checked(s, self.spec.state_dim, "state", StateError)

@@ -1,0 +1,169 @@
+"""`Engine`: the step of a task, by machine code where Numba is installed, else by NumPy.
+
+Both have the same functions with the same arguments (those of `kernels`), so that an environment
+does not know which it has. States are bit-equal between them; oracle and rewards to 1e-12.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.task import Task, observe, step
+from sme_registry.task.draw import Array
+
+Backend = Literal["numba", "numpy"]
+BACKEND_VARIABLE = "SME_BACKEND"
+_ROWS = 4096  # states per block of the oracle: 2 MiB a layer at the default width
+
+_StepOne = Callable[..., tuple[float, float, float, float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Engine:
+    """A task's step and oracle, ready to call.
+
+    Attributes:
+      backend: what runs it, "numba" or "numpy".
+      params: the first argument of the step functions.
+      lane_size: how many numbers a single lane's own array holds.
+      step_float32: one step of one lane, for a float32 action of shape `[A]`.
+      step_float64: the same for a float64 action.
+      step_many: one step of a batch of lanes.
+      optimal_action: π* of `[B, S]` states, any number of them, in blocks.
+    """
+
+    backend: Backend
+    params: Any
+    lane_size: int
+    step_float32: _StepOne
+    step_float64: _StepOne
+    step_many: Callable[..., None]
+    optimal_action: Callable[[Array], Array]
+
+
+def chosen_backend() -> Backend:
+    """What the environment variable SME_BACKEND says; by default Numba where it is installed.
+
+    Raises:
+      OptionError: the variable names no back-end.
+      MissingDependencyError: it asks for Numba, which is not installed.
+    """
+    asked = os.environ.get(BACKEND_VARIABLE, "auto")
+    if asked not in ("auto", "numba", "numpy"):
+        raise OptionError(f"{BACKEND_VARIABLE}={asked!r}: must be 'auto', 'numba' or 'numpy'.")
+    installed = importlib.util.find_spec("numba") is not None
+    if asked == "numba" and not installed:
+        raise MissingDependencyError(
+            f"{BACKEND_VARIABLE}='numba': Numba is not installed. "
+            "Run `pip install 'sme-registry[fast]'`, or unset the variable."
+        )
+    return "numba" if installed and asked != "numpy" else "numpy"
+
+
+_packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()
+
+
+def engine(task: Task, backend: Backend | None = None) -> Engine:
+    """The engine of a task. Cheap: what is large is shared by all engines of one task.
+
+    Args:
+      task: the task.
+      backend: "numba" or "numpy"; None takes `chosen_backend()`.
+
+    Raises:
+      OptionError, MissingDependencyError: see `chosen_backend`.
+    """
+    make = _numba_engine if (backend or chosen_backend()) == "numba" else _numpy_engine
+    return make(task)
+
+
+def _numba_engine(task: Task) -> Engine:
+    from sme_registry.compiled import kernels  # imports and loads Numba: 0.3 s of CPU
+
+    if task not in _packed:
+        _packed[task] = kernels.pack(task)
+
+    def optimal_action(s: Array) -> Array:
+        out = np.empty((len(s), task.spec.action_dim))
+        for first in range(0, len(s), _ROWS):
+            block, done = s[first : first + _ROWS], 0
+            for channels, layers in zip(task.observed, task.policies, strict=True):
+                x = block if len(channels) == task.spec.state_dim else block[:, channels]
+                for W, b in layers:
+                    x = x @ W.T  # BLAS for the product, compiled code for Φ, which is the cost
+                    kernels.add_and_normal_cdf(x, b)
+                out[first : first + _ROWS, done : done + x.shape[1]] = x
+                done += x.shape[1]
+        return out
+
+    # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
+    # must be given arrays of exactly these types and dimensions.
+    return Engine(
+        backend="numba",
+        params=_packed[task],
+        lane_size=kernels.lane_size(_packed[task]),
+        step_float32=kernels.step_one.get_overload(kernels.ONE_FLOAT32),
+        step_float64=kernels.step_one.get_overload(kernels.ONE_FLOAT64),
+        step_many=kernels.step_many,
+        optimal_action=optimal_action,
+    )
+
+
+def _numpy_engine(task: Task) -> Engine:
+    S = task.spec.state_dim
+
+    def step_one(
+        params: None,
+        lane: Array,
+        action: npt.NDArray[Any],
+        optimal: Array,
+        observation: npt.NDArray[np.float32],
+    ) -> tuple[float, float, float, float, float]:
+        if not np.isfinite(action).all():
+            return 0.0, 0.0, 0.0, 0.0, -1.0
+        rewards, ends = np.empty((4, 1)), np.empty((2, 1), dtype=bool)
+        s, moved = lane[2:, None], np.empty((S, 1))
+        t = lane[:1].astype(np.int64)
+        step_many(
+            params, s, t, lane[1:2], action.astype(np.float64)[None], moved,
+            observation[None], optimal[None], rewards, ends,
+        )  # fmt: skip
+        lane[0] += 1.0
+        lane[1] = rewards[3, 0]
+        lane[2:] = moved[:, 0]
+        similarity, step_reward, reward, accumulated = rewards[:, 0].tolist()
+        return similarity, step_reward, reward, accumulated, float(ends[0, 0] + 2 * ends[1, 0])
+
+    def step_many(
+        params: None,
+        s: Array,
+        t: npt.NDArray[np.int64],
+        accumulated: Array,
+        action: Array,
+        moved: Array,
+        observation: npt.NDArray[np.float32],
+        optimal: Array,
+        rewards: Array,
+        ends: npt.NDArray[np.bool_],
+    ) -> None:
+        done = step(task, np.ascontiguousarray(s.T), t, accumulated, action)
+        moved[:] = done.state.T
+        observation[:] = observe(task.spec, done.state, t + 1, done.accumulated_reward)
+        optimal[:] = done.optimal_action
+        rewards[:] = done.similarity, done.step_reward, done.reward, done.accumulated_reward
+        ends[:] = done.terminated, done.truncated
+
+    def optimal_action(s: Array) -> Array:
+        blocks = [task.policy(s[first : first + _ROWS]) for first in range(0, len(s), _ROWS)]
+        return np.concatenate(blocks) if blocks else np.empty((0, task.spec.action_dim))
+
+    return Engine("numpy", None, 2 + S, step_one, step_one, step_many, optimal_action)

@@ -1,0 +1,340 @@
+"""The step as machine code, for one lane and for a batch. Never different from the definition.
+
+Both kernels do the same floating-point operations in the same order for each lane (each sum runs
+over its inputs in ascending order, no fused or re-associated arithmetic), so a batch equals its
+singles bit for bit; and the transition's are those of `Task.transition`, so states do too.
+What differs is only where the loops are: a single lane runs over channels, a batch over blocks of
+lanes, channel by channel, so that the inner loop is long enough to fill vector registers.
+
+A task travels as one flat float64 array, because each array argument costs a call 40 ns:
+    S, A, k, T, r_min, D, agents, widest layer, W [A, S], b [S], then for each agent
+    inputs, L, observed channels [inputs], and for each layer  in, out, W transposed [in, out], b [out].
+
+Numba's disk cache does not know a function's flags: never compile one of these a second way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import boolean, float32, float64, int64, njit, types, void
+
+from sme_registry.compiled.normal_cdf import normal_cdf
+from sme_registry.task import Task
+
+LANES = 64  # lanes in a block: 512 bytes a channel, so that a block of 64 channels stays in cache
+_HEADER = 8
+_NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
+_LARGEST = 1e300  # a finite bound whose comparison is false for NaN too
+
+# One lane's own numbers: t, r_cum, s [S], then room for two layers [2 × widest].
+STEPS_DONE, ACCUMULATED, STATE = 0, 1, 2
+
+
+def pack(task: Task) -> npt.NDArray[np.float64]:
+    """A task as one flat array, in the order of this module's head."""
+    spec = task.spec
+    widest = max(spec.state_dim, *(max(W.shape) for layers in task.policies for W, _ in layers))
+    parts = [
+        [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
+        [spec.r_min, spec.D, len(task.policies), widest],
+        task.W.ravel(),
+        task.b,
+    ]
+    for observed, layers in zip(task.observed, task.policies, strict=True):
+        parts += [[len(observed), len(layers)], observed]
+        for W, b in layers:
+            parts += [W.shape[::-1], W.T.ravel(), b]
+    packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+    packed.setflags(write=False)
+    return packed
+
+
+def lane_size(packed: npt.NDArray[np.float64]) -> int:
+    """How many numbers one lane's own array holds."""
+    return STATE + int(packed[0]) + 2 * int(packed[7])
+
+
+_U0, _U1, _U2 = np.uint64(0), np.uint64(1), np.uint64(2)
+_PACKED = types.Array(float64, 1, "C", readonly=True)
+
+
+@njit(error_model="numpy")
+def _wide_layer(W, b, x, y):  # type: ignore[no-untyped-def]
+    """y = W x + b for W transposed `[in, out]`, eight inputs at a time, in ascending order."""
+    inputs, outputs = W.shape
+    for o in range(outputs):
+        y[o] = b[o]
+    i = 0
+    while i + 8 <= inputs:
+        w0, w1, w2, w3 = W[i], W[i + 1], W[i + 2], W[i + 3]
+        w4, w5, w6, w7 = W[i + 4], W[i + 5], W[i + 6], W[i + 7]
+        x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
+        x4, x5, x6, x7 = x[i + 4], x[i + 5], x[i + 6], x[i + 7]
+        for o in range(outputs):
+            total = y[o] + w0[o] * x0
+            total = total + w1[o] * x1
+            total = total + w2[o] * x2
+            total = total + w3[o] * x3
+            total = total + w4[o] * x4
+            total = total + w5[o] * x5
+            total = total + w6[o] * x6
+            y[o] = total + w7[o] * x7
+        i += 8
+    while i < inputs:
+        w, xi = W[i], x[i]
+        for o in range(outputs):
+            y[o] = y[o] + w[o] * xi
+        i += 1
+    for o in range(outputs):
+        y[o] = normal_cdf(y[o])
+
+
+_FIVE = types.UniTuple(float64, 5)
+ONE_FLOAT32 = _FIVE(_PACKED, float64[::1], float32[:], float64[::1], float32[::1])
+ONE_FLOAT64 = _FIVE(_PACKED, float64[::1], float64[:], float64[::1], float32[::1])
+
+
+@njit([ONE_FLOAT32, ONE_FLOAT64], error_model="numpy", cache=True)
+def step_one(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """One step of one lane.
+
+    Args:
+      p: the packed task.
+      lane: the lane's own numbers; advanced in place.
+      action: `[A]`; any numbers, clipped here.
+      optimal: `[A]`, written: π* of the state acted in.
+      observation: `[S + 2]`, written.
+
+    Returns:
+      `(similarity, step_reward, reward, accumulated_reward, end)`; end is 1 for terminated plus
+      2 for truncated, or −1 where an action was not finite and nothing has moved.
+    """
+    S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
+    r_min, D, agents, widest = p[4], p[5], np.uint64(p[6]), np.uint64(p[7])
+    for i in range(A):
+        if not abs(action[i]) < _LARGEST:
+            return 0.0, 0.0, 0.0, 0.0, -1.0
+
+    s = np.uint64(STATE)
+    at = np.uint64(_HEADER) + A * S + S
+    done = _U0
+    for _ in range(agents):
+        channels, layers = np.uint64(p[at]), np.uint64(p[at + _U1])
+        at += _U2
+        x, y = s + S, s + S + widest
+        for j in range(channels):
+            lane[x + j] = lane[s + np.uint64(p[at + j])]
+        at += channels
+        outputs = _U0
+        for _ in range(layers):
+            inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
+            at += _U2
+            b = at + inputs * outputs
+            if outputs < np.uint64(_NARROW):
+                for o in range(outputs):
+                    total = p[b + o]
+                    for i in range(inputs):
+                        total = total + p[at + i * outputs + o] * lane[x + i]
+                    lane[y + o] = normal_cdf(total)
+            else:
+                W = p[at:b].reshape(inputs, outputs)
+                _wide_layer(W, p[b : b + outputs], lane[x : x + inputs], lane[y : y + outputs])
+            at = b + outputs
+            x, y = y, x
+        for o in range(outputs):
+            optimal[done] = lane[x + o]
+            done += _U1
+
+    missed = 0.0
+    for i in range(A):
+        a = float64(action[i])
+        a = a if a > 0.0 else 0.0
+        a = a if a < 1.0 else 1.0
+        missed += abs(a - optimal[i])
+    similarity = 1.0 - missed / float64(A)
+    graded = 4.0 * (similarity - 0.75)
+    step_reward = graded if graded > 0.0 and graded > r_min else 0.0
+
+    b = np.uint64(_HEADER) + A * S
+    for j in range(S):
+        moved = lane[s + j] + p[b + j]
+        for i in range(A):
+            a = float64(float32(action[i]))
+            a = a if a > 0.0 else 0.0
+            a = a if a < 1.0 else 1.0
+            moved = moved + p[np.uint64(_HEADER) + i * S + j] * a
+        folded = 2.0 * abs(moved - np.rint(moved))
+        lane[s + j] = folded
+        observation[j] = folded
+
+    t = int(lane[STEPS_DONE]) + 1
+    accumulated = lane[ACCUMULATED] + step_reward
+    truncated = t >= T
+    end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
+    reward = 0.0
+    if truncated or t % k == 0:
+        reward, accumulated = accumulated, 0.0
+    lane[STEPS_DONE] = t
+    lane[ACCUMULATED] = accumulated
+    observation[S] = t / T
+    observation[S + _U1] = accumulated / k
+    return similarity, step_reward, reward, accumulated, end
+
+
+@njit(error_model="numpy")
+def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
+    """y = Φ(W x + b) for `count` lanes: x `[in, LANES]`, y `[out, LANES]`, W transposed."""
+    inputs, outputs = W.shape
+    for o in range(outputs):
+        total = y[o]
+        bias = b[o]
+        for lane in range(count):
+            total[lane] = bias
+        i = 0
+        while i + 8 <= inputs:
+            w0, w1, w2, w3 = W[i, o], W[i + 1, o], W[i + 2, o], W[i + 3, o]
+            w4, w5, w6, w7 = W[i + 4, o], W[i + 5, o], W[i + 6, o], W[i + 7, o]
+            x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
+            x4, x5, x6, x7 = x[i + 4], x[i + 5], x[i + 6], x[i + 7]
+            for lane in range(count):
+                z = total[lane] + w0 * x0[lane]
+                z = z + w1 * x1[lane]
+                z = z + w2 * x2[lane]
+                z = z + w3 * x3[lane]
+                z = z + w4 * x4[lane]
+                z = z + w5 * x5[lane]
+                z = z + w6 * x6[lane]
+                total[lane] = z + w7 * x7[lane]
+            i += 8
+        while i < inputs:
+            w, xi = W[i, o], x[i]
+            for lane in range(count):
+                total[lane] = total[lane] + w * xi[lane]
+            i += 1
+        for lane in range(count):
+            total[lane] = normal_cdf(total[lane])
+
+
+@njit(
+    void(
+        _PACKED,
+        float64[:, ::1],
+        int64[::1],
+        float64[::1],
+        float64[:, ::1],
+        float64[:, ::1],
+        float32[:, ::1],
+        float64[:, ::1],
+        float64[:, ::1],
+        boolean[:, ::1],
+    ),
+    error_model="numpy",
+    cache=True,
+)
+def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards, ends):  # type: ignore[no-untyped-def]
+    """One step of `B` lanes.
+
+    Args:
+      p: the packed task.
+      s: `[S, B]` states, channel by channel.
+      t: `[B]` steps done before this one.
+      accumulated: `[B]` r_cum before this step.
+      action: `[B, A]`, finite; clipped here.
+      moved: `[S, B]`, written: the next states.
+      observation: `[B, S + 2]`, written.
+      optimal: `[B, A]`, written: π* of the states acted in.
+      rewards: `[4, B]`, written: similarity, step reward, reward, r_cum after a payout.
+      ends: `[2, B]`, written: terminated, truncated.
+    """
+    S, A, k, T = int(p[0]), int(p[1]), int(p[2]), int(p[3])
+    r_min, D, agents, widest = p[4], p[5], int(p[6]), int(p[7])
+    W = p[_HEADER : _HEADER + A * S].reshape(A, S)
+    b = p[_HEADER + A * S : _HEADER + A * S + S]
+    x, y = np.empty((widest, LANES)), np.empty((widest, LANES))
+    best = np.empty((A, LANES))
+    acted = np.empty((A, LANES))
+    missed = np.empty(LANES)
+    batch = t.size
+    for first in range(0, batch, LANES):
+        count = min(LANES, batch - first)
+        at = _HEADER + A * S + S
+        done = 0
+        for _ in range(agents):
+            channels, layers = int(p[at]), int(p[at + 1])
+            at += 2
+            for j in range(channels):
+                row, source = x[j], s[int(p[at + j])]
+                for lane in range(count):
+                    row[lane] = source[first + lane]
+            at += channels
+            outputs = 0
+            for _ in range(layers):
+                inputs, outputs = int(p[at]), int(p[at + 1])
+                at += 2
+                end = at + inputs * outputs
+                _block_layer(
+                    p[at:end].reshape(inputs, outputs), p[end : end + outputs], x, y, count
+                )
+                at = end + outputs
+                x, y = y, x
+            for o in range(outputs):
+                for lane in range(count):
+                    best[done, lane] = x[o, lane]
+                done += 1
+
+        for lane in range(count):
+            missed[lane] = 0.0
+        for i in range(A):
+            chosen, target = acted[i], best[i]
+            for lane in range(count):
+                a = action[first + lane, i]
+                a = a if a > 0.0 else 0.0
+                a = a if a < 1.0 else 1.0
+                missed[lane] += abs(a - target[lane])
+                chosen[lane] = float64(float32(a))
+                optimal[first + lane, i] = target[lane]
+
+        for j in range(S):
+            before, after, offset = s[j], moved[j], b[j]
+            for lane in range(count):
+                after[first + lane] = before[first + lane] + offset
+            for i in range(A):
+                w, chosen = W[i, j], acted[i]
+                for lane in range(count):
+                    after[first + lane] = after[first + lane] + w * chosen[lane]
+            for lane in range(count):
+                z = after[first + lane]
+                after[first + lane] = 2.0 * abs(z - np.rint(z))
+        for lane in range(count):
+            for j in range(S):
+                observation[first + lane, j] = moved[j, first + lane]
+
+        for lane in range(count):
+            i = first + lane
+            similarity = 1.0 - missed[lane] / float64(A)
+            graded = 4.0 * (similarity - 0.75)
+            step_reward = graded if graded > 0.0 and graded > r_min else 0.0
+            steps = t[i] + 1
+            total = accumulated[i] + step_reward
+            truncated = steps >= T
+            reward = 0.0
+            if truncated or steps % k == 0:
+                reward, total = total, 0.0
+            rewards[0, i] = similarity
+            rewards[1, i] = step_reward
+            rewards[2, i] = reward
+            rewards[3, i] = total
+            ends[0, i] = step_reward < D
+            ends[1, i] = truncated
+            observation[i, S] = steps / T
+            observation[i, S + 1] = total / k
+
+
+@njit(void(float64[:, ::1], float64[::1]), error_model="numpy", cache=True)
+def add_and_normal_cdf(x, b):  # type: ignore[no-untyped-def]
+    """x ← Φ(x + b) in place, `[B, out]` and `[out]`: what follows a matrix product of the oracle."""
+    for i in range(x.shape[0]):
+        row = x[i]
+        for o in range(row.size):
+            row[o] = normal_cdf(row[o] + b[o])

@@ -1,0 +1,314 @@
+"""`SMEVectorEnv`: a batch of one task's environments, stepped as one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from sme_registry.compiled import engine
+from sme_registry.envs import actions as action_ranges
+from sme_registry.envs.naming import renamed_by_content
+from sme_registry.envs.options import initial_states, refuse_unknown
+from sme_registry.envs.single import Observation
+from sme_registry.errors import EpisodeError, OptionError, WrapperError
+from sme_registry.spec import SMESpec
+from sme_registry.spec.resolve import resolve
+from sme_registry.task import Task, materialize
+from sme_registry.task.memory import refuse_above_limit
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Gymnasium's enum, given as itself or as its string.
+
+    Raises:
+      OptionError: neither.
+    """
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = ", ".join(repr(known.value) for known in AutoresetMode)
+        raise OptionError(f"autoreset_mode={mode!r}: must be one of {known}.") from None
+
+
+class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
+    """`num_envs` lanes of one task, bit-equal to as many `SMEEnv`s with the same seeds.
+
+    Spaces, rewards and `info` are those of `SMEEnv` with a leading axis `[B]`; as in Gymnasium each
+    info `key` comes with a mask `_key`. A seed n seeds lane i with n + i.
+
+    Args:
+      spec: the task: a spec, its fields, an id, a digest or a path.
+      num_envs: B, the lanes, at least 1.
+      action_range: "unit" or "symmetric".
+      autoreset_mode: Gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
+      render_mode: only None; render a single environment.
+      max_episode_steps: refused below the horizon (Gymnasium passes it on).
+      **overrides: spec fields to change.
+
+    Raises:
+      SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
+      WrapperError: `max_episode_steps` is below the horizon.
+    """
+
+    def __init__(
+        self,
+        spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Default-v1",
+        num_envs: int = 1,
+        *,
+        action_range: Literal["unit", "symmetric"] = "unit",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
+        if render_mode is not None:
+            raise OptionError(
+                f"render_mode={render_mode!r}: a batch is not rendered. Make a single "
+                "environment to look at an episode."
+            )
+        self.mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
+        self.render_mode = None
+        self._task = materialize(resolve(spec).derive(**overrides))
+        sme = self._task.spec
+        if max_episode_steps is not None and max_episode_steps < sme.horizon:
+            raise WrapperError(
+                f"max_episode_steps={max_episode_steps}: must be at least the horizon, "
+                f"{sme.horizon}. Make the task itself shorter: horizon={max_episode_steps}."
+            )
+        refuse_above_limit(
+            num_envs * 8 * (4 * sme.state_dim + 4 * sme.action_dim + 64),
+            f"num_envs={num_envs}: a batch this large",
+            "Use fewer lanes.",
+        )
+        self.num_envs = num_envs
+        S, A = sme.state_dim, sme.action_dim
+        self.single_action_space, self._rescaled = action_ranges.space(action_range, A)
+        self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (S + 2,), np.float32)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+        # Channel by channel, [S, B], as the compiled step reads it.
+        self._s = np.zeros((S, num_envs))
+        self._t = np.zeros(num_envs, np.int64)
+        self._accumulated = np.zeros(num_envs)
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._begun = np.zeros(num_envs, bool)
+        self._ended = np.zeros(num_envs, bool)
+        self._observation = np.zeros((num_envs, S + 2), np.float32)
+        self._load_engine()
+
+    def _load_engine(self) -> None:
+        made = engine(self._task)
+        self._params, self._step_many = made.params, made.step_many
+
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = ("_params", "_step_many")
+        return {name: value for name, value in self.__dict__.items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._load_engine()
+
+    @property
+    def task(self) -> Task:
+        """The drawn task: W, b, layers and the equations."""
+        return self._task
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """The spec of the task that is really run, overrides included."""
+        return self._task.spec
+
+    @property
+    def state(self) -> Array:
+        """The states, `[B, S]` float64 in [0, 1] (a copy)."""
+        return np.ascontiguousarray(self._s.T)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """Gymnasium's spec; a derived task goes by its content, never by the name it came from."""
+        return self.__dict__.get("_env_spec")
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._env_spec = renamed_by_content(value, self.sme_spec)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in every lane, or in those of `options["reset_mask"]`.
+
+        Args:
+          seed: n seeds lane i with n + i; a list seeds each lane; None goes on.
+          options: `{"state": s}` begins at s, `[S]` or `[B, S]`; `{"reset_mask": mask}` resets
+            the lanes where `mask` `[B]` is True and leaves the others.
+
+        Returns:
+          Observations `[B, S + 2]` and an empty dict.
+
+        Raises:
+          StateError, OptionError: as `SMEEnv.reset`.
+        """
+        refuse_unknown(options, ("state", "reset_mask"))
+        options = options or {}
+        mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
+        lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
+        for lane, lane_seed in zip(lanes, self._seeds(seed)[lanes], strict=True):
+            if lane_seed is not None:
+                self._generators[lane] = seeding.np_random(int(lane_seed))[0]
+        states = None
+        if "state" in options:
+            S = self.sme_spec.state_dim
+            given = np.asarray(options["state"], dtype=object)
+            one_for_all = given.ndim == 1
+            states = initial_states(options["state"], (S,) if one_for_all else (self.num_envs, S))
+            states = np.broadcast_to(states, (self.num_envs, S))[lanes]
+        self._begin(lanes, self._observation, states)
+        self._begun[lanes] = True
+        return self._observation.copy(), {}
+
+    def step(self, actions: Any) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
+        """One step of every lane.
+
+        Args:
+          actions: `[B, A]`, finite; clipped to the action range.
+
+        Returns:
+          Observations `[B, S + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]`, infos.
+
+        Raises:
+          ActionError: wrong shape, not numbers, or not finite; nothing has moved then.
+          EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
+        """
+        B, S, A = self.num_envs, self.sme_spec.state_dim, self.sme_spec.action_dim
+        if not self._begun.all():
+            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
+        resting = self._ended
+        any_resting = bool(resting.any())
+        if any_resting and self.mode is AutoresetMode.DISABLED:
+            ended = np.flatnonzero(resting)
+            raise EpisodeError(
+                f"step: the episodes of {ended.size} lanes have ended (the first is lane "
+                f"{ended[0]}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
+            )
+        if any_resting:  # mode NEXT_STEP: what is passed for these lanes is ignored
+            actions = np.where(resting[:, None], self.action_space.low, actions)
+        acted = action_ranges.checked(actions, (B, A), self._rescaled)
+
+        moved, observation = np.empty((S, B)), np.empty((B, S + 2), np.float32)
+        optimal, values, ends = np.empty((B, A)), np.empty((4, B)), np.empty((2, B), bool)
+        self._step_many(
+            self._params, self._s, self._t, self._accumulated, acted,
+            moved, observation, optimal, values, ends,
+        )  # fmt: skip
+        similarity, step_reward, reward, accumulated = values
+        terminated, truncated = ends
+        if self._rescaled:
+            optimal = 2.0 * optimal - 1.0
+        info = {
+            "optimal_action": optimal,
+            "similarity": similarity,
+            "step_reward": step_reward,
+            "regret": 1.0 - step_reward,
+            "accumulated_reward": accumulated,
+        }
+        self._s = moved
+        self._t += 1
+        self._accumulated = accumulated.copy()
+
+        if any_resting:
+            for array in (reward, terminated, truncated):
+                array[resting] = 0
+            infos = _masked(info, ~resting)
+            self._begin(np.flatnonzero(resting), observation)
+        else:
+            infos = _masked(info, np.ones(B, bool))
+        ended = terminated | truncated
+        if self.mode is AutoresetMode.SAME_STEP:
+            if ended.any():
+                infos = _masked(info, ~ended)
+                final = np.full(B, None, dtype=object)
+                for lane in np.flatnonzero(ended):
+                    final[lane] = observation[lane].copy()
+                infos |= _masked({"final_obs": final, "final_info": _masked(info, ended)}, ended)
+                self._begin(np.flatnonzero(ended), observation)
+        else:
+            self._ended = ended
+        self._observation = observation
+        return observation.copy(), reward, terminated, truncated, infos
+
+    def _begin(
+        self, lanes: npt.NDArray[np.int64], observation: Observation, states: Array | None = None
+    ) -> None:
+        """Put lanes at the start of an episode, and write what they observe."""
+        S = self.sme_spec.state_dim
+        if states is None:
+            states = np.array([self._generator(lane).random(S) for lane in lanes])
+        self._s[:, lanes] = states.T
+        self._t[lanes] = 0
+        self._accumulated[lanes] = 0.0
+        self._ended[lanes] = False
+        observation[lanes, :S] = states
+        observation[lanes, S:] = 0.0
+
+    def _generator(self, lane: int) -> np.random.Generator:
+        generator = self._generators[lane]
+        if generator is None:
+            generator = self._generators[lane] = seeding.np_random(None)[0]
+        return generator
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
+        """One seed or None for each lane, `[B]`."""
+        seeds = np.full(self.num_envs, None, dtype=object)
+        if seed is None:
+            return seeds
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
+            seeds[:] = [int(seed) + lane for lane in range(self.num_envs)]
+            return seeds
+        given = list(seed) if isinstance(seed, Sequence | np.ndarray) else None
+        if given is None or len(given) != self.num_envs:
+            raise OptionError(
+                f"seed={seed!r:.60}: must be an integer, None, or a list of one for each of the "
+                f"{self.num_envs} lanes."
+            )
+        seeds[:] = given
+        return seeds
+
+    def _mask(self, mask: Any) -> Mask:
+        if not (isinstance(mask, np.ndarray) and mask.dtype == bool):
+            raise OptionError("reset_mask: must be a NumPy array of dtype bool.")
+        if mask.shape != (self.num_envs,):
+            raise OptionError(f"reset_mask of shape {mask.shape}: must be ({self.num_envs},).")
+        if not mask.any():
+            raise OptionError("reset_mask: must be True for at least one lane.")
+        return mask
+
+
+def _masked(info: dict[str, Any], mask: Mask) -> dict[str, Any]:
+    """Gymnasium's form of batched info: each key with its mask; zero where the mask is False."""
+    masked: dict[str, Any] = {}
+    whole = bool(mask.all())
+    for key, value in info.items():
+        if not whole and isinstance(value, np.ndarray) and value.dtype != object:
+            value = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, 0.0)
+        masked[key] = value
+        masked[f"_{key}"] = mask.copy()
+    return masked

@@ -1,0 +1,207 @@
+"""Names → environments: the catalogue in Gymnasium's registry, and `make` for any spec."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+from sme_registry.errors import NameTakenError, OptionError
+
+if TYPE_CHECKING:
+    from sme_registry.spec import SMESpec
+
+_ENTRY_POINT = "sme_registry.envs:SMEEnv"
+_VECTOR_ENTRY_POINT = "sme_registry.envs:SMEVectorEnv"
+
+
+def _register(env_id: str, spec: dict[str, Any] | str) -> None:
+    gymnasium.register(
+        env_id,
+        entry_point=_ENTRY_POINT,
+        vector_entry_point=_VECTOR_ENTRY_POINT,
+        kwargs={"spec": spec},
+    )
+
+
+def register_catalogue() -> None:
+    """Register every file of `specs/envs` by its name and by its content; reads no more than that.
+
+    Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
+    """
+    from sme_registry.spec.catalogue import NAMESPACE, released
+
+    for versioned_name, content_name in released():
+        version = versioned_name.rsplit("-v", 1)[1]
+        for name in (versioned_name, f"{content_name}-v{version}"):
+            if f"{NAMESPACE}/{name}" not in gymnasium.registry:
+                _register(f"{NAMESPACE}/{name}", versioned_name)
+
+
+def register(spec: SMESpec, name: str) -> str:
+    """Register a spec of your own in this process.
+
+    Args:
+      spec: the spec, or its fields as a mapping.
+      name: letters, digits, '_' and '-', as in `MyTask` or `MyTask-v1`.
+
+    Returns:
+      The id, such as `SME/MyTask-v1`.
+
+    Raises:
+      OptionError: the name has other characters.
+      NameTakenError: the id stands for another spec; a released id never changes its numbers.
+    """
+    from sme_registry.spec import as_spec
+    from sme_registry.spec.catalogue import NAMESPACE
+    from sme_registry.spec.resolve import registered, resolve
+    from sme_registry.task.streams import DYNAMICS_VERSION
+
+    spec = as_spec(spec)
+    short = name.removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):
+        raise OptionError(
+            f"name={name!r}: must be 1 to 64 letters, digits, '_' and '-', with the version "
+            f"-v{DYNAMICS_VERSION} or none."
+        )
+    env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
+    if env_id in gymnasium.registry:
+        if resolve(env_id) == spec:
+            return env_id
+        raise NameTakenError(
+            f"{env_id!r} stands for another spec ({resolve(env_id).digest[:19]}…). Choose another "
+            "name: a released id never changes its numbers."
+        )
+    _register(env_id, spec.plain())
+    registered[env_id] = spec
+    return env_id
+
+
+def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec:
+    """The spec of an id, a file's path, or a digest; see `sme_registry.spec.resolve.resolve`.
+
+    Raises:
+      UnknownNameError: nothing has this name; says what is near.
+      MalformedDocumentError, SpecError, DigestMismatchError: the file is not a valid one.
+    """
+    from sme_registry.spec.resolve import resolve
+
+    return resolve(id_or_path_or_digest)
+
+
+def save(
+    spec: SMESpec,
+    path: str | os.PathLike[str],
+    name: str | None = None,
+    *,
+    description: str = "",
+    tags: tuple[str, ...] = (),
+) -> Path:
+    """Write a spec as a file that a colleague can `load`, with digest and fingerprint.
+
+    Args:
+      spec: the spec.
+      path: where to; the folder is made. An existing file is replaced, whole or not at all.
+      name: letters, digits, '_' and '-'; by default the file's name without its ending.
+      description: one or two sentences.
+      tags: words to find it by.
+
+    Returns:
+      The path written.
+
+    Raises:
+      SpecError: the name or a tag has other characters.
+      ResourceLimitError: the task would not fit in memory.
+      OptionError: the file cannot be written; what stood there is untouched.
+    """
+    from sme_registry.spec import as_spec
+    from sme_registry.spec.envelope import EnvFile
+    from sme_registry.task import fingerprint, materialize
+
+    spec = as_spec(spec)
+    file = EnvFile.parse(
+        {
+            "name": Path(path).stem.removesuffix("-v1") if name is None else name,
+            "description": description,
+            "tags": tags,
+            "spec": spec.plain(),
+            "digest": spec.digest,
+            "fingerprint": fingerprint.take(materialize(spec)).plain(),
+        },
+        str(path),
+    )
+    file.write(path)
+    return Path(path)
+
+
+def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
+    """Gymnasium's `EnvSpec` of any spec, unregistered; its kwargs are plain JSON.
+
+    Args:
+      spec: the spec, or whatever `load` takes.
+      **kwargs: arguments of the environment, such as `action_range`.
+
+    Returns:
+      What `gymnasium.make` and `gymnasium.make_vec` take in place of an id.
+    """
+    from sme_registry.envs.naming import content_id
+    from sme_registry.spec.resolve import resolve
+
+    resolved = resolve(spec)
+    return EnvSpec(
+        id=content_id(resolved),
+        entry_point=_ENTRY_POINT,
+        vector_entry_point=_VECTOR_ENTRY_POINT,
+        kwargs={"spec": resolved.plain(), **kwargs},
+    )
+
+
+def make(
+    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
+) -> gymnasium.Env[Any, Any]:
+    """`gymnasium.make` for an id, a digest, a path or a spec.
+
+    Args:
+      spec_or_id: the task.
+      **kwargs: spec fields to override (`complexity=10`), `action_range`, `render_mode`, and
+        what else `gymnasium.make` takes.
+
+    Returns:
+      The environment with Gymnasium's default wrappers.
+
+    Raises:
+      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEEnv`.
+    """
+    return gymnasium.make(_makeable(spec_or_id), **kwargs)
+
+
+def make_vec(
+    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str],
+    num_envs: int = 1,
+    **kwargs: Any,
+) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+    """`gymnasium.make_vec` for an id, a digest, a path or a spec; native batch by default.
+
+    Args:
+      spec_or_id: the task.
+      num_envs: the lanes.
+      **kwargs: spec fields to override, `action_range`, `autoreset_mode`, and what else
+        `gymnasium.make_vec` takes.
+
+    Raises:
+      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
+    """
+    return gymnasium.make_vec(_makeable(spec_or_id), num_envs=num_envs, **kwargs)
+
+
+def _makeable(spec_or_id: Any) -> str | EnvSpec:
+    """An id as it is registered, so that `env.spec.id` is the name; else an `EnvSpec`."""
+    if isinstance(spec_or_id, str):
+        for env_id in (spec_or_id, f"SME/{spec_or_id}", f"SME/{spec_or_id}-v1", f"{spec_or_id}-v1"):
+            if env_id in gymnasium.registry and env_id.startswith("SME/"):
+                return env_id
+    return env_spec(spec_or_id)

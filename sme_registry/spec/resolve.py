@@ -1,0 +1,98 @@
+"""`resolve`: whatever names a task (an id, a path, a digest, a spec) to its `SMESpec`."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+from typing import Any
+
+from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.files import read_json
+from sme_registry.spec import catalogue
+from sme_registry.spec.envelope import EnvFile, SuiteFile
+from sme_registry.spec.sme_spec import SMESpec, as_spec
+
+# Specs that this process registered under ids of its own; `registration.register` fills it.
+registered: dict[str, SMESpec] = {}
+
+
+def resolve(task: SMESpec | dict[str, Any] | str | os.PathLike[str]) -> SMESpec:
+    """The spec that is meant.
+
+    Args:
+      task: a spec; its fields as a mapping; an id (`SME/Default-v1`, `Default-v1`, `Default`);
+        a name by content (`SME/sha256-<12 hex>-v1`); a digest (`sha256:<64 hex>`, or any prefix
+        that only one known spec has, of 12 digits or more); or the path of a file.
+
+    Returns:
+      The spec. One read from a file carries that file's fingerprint, which `materialize` checks.
+
+    Raises:
+      UnknownNameError: nothing has this name; says what is near.
+      SpecError: a file or mapping is not a valid spec.
+    """
+    if isinstance(task, SMESpec | dict):
+        return as_spec(task)
+    name = os.fspath(task)
+    if name.endswith(".json") or (os.sep in name and Path(name).is_file()):
+        return with_fingerprint(read_env_file(name))
+    short = name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
+    full = f"{catalogue.NAMESPACE}/{short}"
+    if full in registered:
+        return registered[full]
+    if short.startswith(("sha256:", "sha256-")):
+        return _by_content(short)
+    try:
+        return with_fingerprint(catalogue.find(EnvFile, short))
+    except UnknownNameError:
+        hint = did_you_mean(full, registered)
+        if not hint:
+            raise
+        raise UnknownNameError(f"{name!r}: no task of this name is registered.{hint}") from None
+
+
+def read_env_file(path: str | os.PathLike[str]) -> EnvFile:
+    """Read a task's file; a bare spec without an envelope is refused with the way out.
+
+    Raises:
+      MalformedDocumentError, SpecError, DigestMismatchError: see `EnvFile.read`.
+    """
+    return EnvFile.open(read_json(path), str(path))
+
+
+def with_fingerprint(file: EnvFile) -> SMESpec:
+    """A file's spec, carrying its fingerprint."""
+    spec = file.spec.model_copy()
+    spec._fingerprint = file.fingerprint
+    return spec
+
+
+def known_specs() -> dict[str, SMESpec]:
+    """Digest → spec of everything named: registered here, catalogue, then suites' instances."""
+    known: dict[str, SMESpec] = {}
+    for file in catalogue.entries(EnvFile):
+        known.setdefault(file.digest, with_fingerprint(file))
+    for spec in registered.values():
+        known.setdefault(spec.digest, spec)
+    for suite in catalogue.entries(SuiteFile):
+        for spec in suite.suite.instances:
+            known.setdefault(spec.digest, spec)
+    return known
+
+
+def _by_content(name: str) -> SMESpec:
+    digits = name[len("sha256:") :].split("-", 1)[0].lower()
+    known = known_specs()
+    found = [spec for digest, spec in known.items() if digest[len("sha256:") :].startswith(digits)]
+    if len(found) == 1 and len(digits) >= 12:
+        return found[0]
+    if len(digits) < 12:
+        raise UnknownNameError(f"{name!r}: give at least 12 hex digits of the digest.")
+    prefixes = [digest[len("sha256:") :][: len(digits)] for digest in known]
+    near = difflib.get_close_matches(digits, prefixes, n=1, cutoff=0.8)
+    hint = f" Did you mean 'sha256:{near[0]}'?" if near else ""
+    raise UnknownNameError(
+        f"{name!r}: no task in the catalogue or its suites has this digest.{hint} "
+        "A digest cannot be turned back into a spec: load its file instead."
+    )

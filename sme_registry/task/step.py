@@ -1,0 +1,91 @@
+"""One step of a batch of episodes, in NumPy: the definition that every back-end must equal.
+
+Source: METHOD, section 1. `B` batch, `S` state_dim, `A` action_dim, T horizon, t completed steps.
+
+    r_cum ← r_cum + r(s, a);  s ← T(s, a);  t ← t + 1
+    terminated = r < D        truncated = t ≥ T
+    R = r_cum where k divides t or truncated, else 0;  r_cum ← 0 after a payout
+    observation = (s, t/T, r_cum/k), after the step
+
+On termination alone nothing extra is paid; what is lost stays visible as r_cum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.spec import SMESpec
+from sme_registry.task.draw import Array
+from sme_registry.task.task import Task
+
+
+class Step(NamedTuple):
+    """What one step gives, for each lane.
+
+    Attributes:
+      state: `[B, S]` next states.
+      optimal_action: `[B, A]` π* of the states acted in.
+      similarity: `[B]` r̃.
+      step_reward: `[B]` r.
+      reward: `[B]` R, what is paid.
+      accumulated_reward: `[B]` r_cum, after a payout's reset.
+      terminated: `[B]`.
+      truncated: `[B]`.
+    """
+
+    state: Array
+    optimal_action: Array
+    similarity: Array
+    step_reward: Array
+    reward: Array
+    accumulated_reward: Array
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+
+
+def step(
+    task: Task, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array, a: Array
+) -> Step:
+    """One step of every lane.
+
+    Each lane is a matrix of one row to the oracle: a product of all lanes at once would sum in
+    an order that depends on B, and then a batch would not equal its singles bit for bit.
+
+    Args:
+      task: the task.
+      s: `[B, S]` states.
+      t: `[B]` steps completed before this one.
+      accumulated_reward: `[B]` r_cum before this step.
+      a: `[B, A]` actions, finite; clipped to [0, 1].
+    """
+    spec = task.spec
+    a = np.clip(a, 0.0, 1.0)
+    optimal = task.policy(s[:, None, :])[:, 0, :]
+    similarity = task.similarity_of(a, optimal)
+    step_reward = task.reward_of(similarity)
+
+    total = accumulated_reward + step_reward
+    t = t + 1
+    truncated = t >= spec.horizon
+    paid = truncated | (t % spec.k == 0)
+    return Step(
+        state=task.transition(s, a),
+        optimal_action=optimal,
+        similarity=similarity,
+        step_reward=step_reward,
+        reward=np.where(paid, total, 0.0),
+        accumulated_reward=np.where(paid, 0.0, total),
+        terminated=step_reward < spec.D,
+        truncated=truncated,
+    )
+
+
+def observe(
+    spec: SMESpec, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array
+) -> npt.NDArray[np.float32]:
+    """The observations (s, t/T, r_cum/k), `[B, S + 2]` float32 in [0, 1]."""
+    auxiliary = np.stack([t / spec.horizon, accumulated_reward / spec.k], axis=-1)
+    return np.concatenate([s, auxiliary], axis=-1).astype(np.float32)
