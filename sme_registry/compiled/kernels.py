@@ -7,11 +7,8 @@ What differs is only where the loops are: a single lane runs over channels, a ba
 lanes, channel by channel, so that the inner loop is long enough to fill vector registers.
 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
-    S, A, k, T, r_min, D, agents, widest layer, size of all this, W [A, S], b [S], then for each agent
+    S, A, k, T, r_min, D, agents, widest layer, W [A, S], b [S], then for each agent
     inputs, L, observed channels [inputs], and for each layer  in, out, W transposed [in, out], b [out].
-A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
-stand alone where it is not, so that lanes can share it:
-    t, r_cum, s [S], room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
 """
@@ -26,9 +23,12 @@ from sme_registry.compiled.normal_cdf import normal_cdf
 from sme_registry.task import Task
 
 LANES = 64  # lanes in a block: 512 bytes a channel, so that a block of 64 channels stays in cache
-_HEADER = 9
+_HEADER = 8
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
 _LARGEST = 1e300  # a finite bound whose comparison is false for NaN too
+
+# One lane's own numbers: t, r_cum, s [S], then room for two layers [2 × widest].
+STEPS_DONE, ACCUMULATED, STATE = 0, 1, 2
 
 
 def pack(task: Task) -> npt.NDArray[np.float64]:
@@ -37,7 +37,7 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
     widest = max(spec.state_dim, *(max(W.shape) for layers in task.policies for W, _ in layers))
     parts = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
-        [spec.r_min, spec.D, len(task.policies), widest, 0.0],
+        [spec.r_min, spec.D, len(task.policies), widest],
         task.W.ravel(),
         task.b,
     ]
@@ -46,13 +46,13 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
         for W, b in layers:
             parts += [W.shape[::-1], W.T.ravel(), b]
     packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-    packed[8] = packed.size
+    packed.setflags(write=False)
     return packed
 
 
 def lane_size(packed: npt.NDArray[np.float64]) -> int:
-    """How many numbers one lane's own part holds."""
-    return 2 + int(packed[0]) + 2 * int(packed[7])
+    """How many numbers one lane's own array holds."""
+    return STATE + int(packed[0]) + 2 * int(packed[7])
 
 
 _U0, _U1, _U2 = np.uint64(0), np.uint64(1), np.uint64(2)
