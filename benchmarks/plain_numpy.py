@@ -1,7 +1,7 @@
 """The baseline: the same environment as a researcher would write it, in plain NumPy.
 
-The paper's formulas as they stand, one operation a line, no tuning and no compiled code; Φ is SciPy's
-`ndtr` (`scipy.stats.norm.cdf` would make the baseline three times as slow and flatter us).
+The paper's formulas as they stand, one operation a line, no tuning and no compiled code; Φ is
+SciPy's `ndtr` (`scipy.stats.norm.cdf` would make the baseline three times as slow, and flatter us).
 """
 
 from __future__ import annotations

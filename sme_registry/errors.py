@@ -1,15 +1,15 @@
 """Everything that `sme_registry` raises on bad input.
 
     SMEError
-    ├── SpecError                 a document's field: wrong, missing, unknown or impossible (also a ValueError)
+    ├── SpecError                 a document's field wrong, missing or unknown (also a ValueError)
     │   ├── MalformedDocumentError    not JSON at all, or not the JSON of this kind of document
     │   ├── DigestMismatchError       a file's digest is not that of its spec
     │   └── FingerprintMismatchError  a drawn task's numbers are not the published ones
-    ├── UnknownNameError          no such environment, suite, protocol, algorithm (also a LookupError)
+    ├── UnknownNameError          no environment, suite, … of this name (also a LookupError)
     ├── NameTakenError            a released name would change its meaning
     ├── ResourceLimitError        the task would not fit in memory (also a MemoryError)
     ├── ActionError               an action of the wrong shape or not finite (also a ValueError)
-    ├── StateError                a state of the wrong shape, or outside where it may be (also a ValueError)
+    ├── StateError                a state of the wrong shape or out of bounds (also a ValueError)
     ├── EpisodeError              a step before `reset`, or after the end of an episode
     ├── WrapperError              an outer wrapper that would change the task
     ├── PolicyError               a policy that cannot be loaded, or whose actions cannot be used

@@ -140,7 +140,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         return np.ascontiguousarray(self._s.T)
 
     @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+    def spec(self) -> EnvSpec | None:
         """Gymnasium's spec; a derived task goes by its content, never by the name it came from."""
         return self.__dict__.get("_env_spec")
 
@@ -185,7 +185,9 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self._begun[lanes] = True
         return self._observation.copy(), {}
 
-    def step(self, actions: Any) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
+    def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
+        self, actions: Any
+    ) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
         """One step of every lane.
 
         Args:
@@ -204,13 +206,13 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         resting = self._ended
         any_resting = bool(resting.any())
         if any_resting and self.mode is AutoresetMode.DISABLED:
-            ended = np.flatnonzero(resting)
+            first = np.flatnonzero(resting)[0]
             raise EpisodeError(
-                f"step: the episodes of {ended.size} lanes have ended (the first is lane "
-                f"{ended[0]}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
+                f"step: the episodes of {resting.sum()} lanes have ended (the first is lane "
+                f"{first}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
             )
         if any_resting:  # mode NEXT_STEP: what is passed for these lanes is ignored
-            actions = np.where(resting[:, None], self.action_space.low, actions)
+            actions = np.where(resting[:, None], 0.0, actions)
         acted = action_ranges.checked(actions, (B, A), self._rescaled)
 
         moved, observation = np.empty((S, B)), np.empty((B, S + 2), np.float32)
@@ -241,7 +243,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             self._begin(np.flatnonzero(resting), observation)
         else:
             infos = _masked(info, np.ones(B, bool))
-        ended = terminated | truncated
+        ended: Mask = terminated | truncated
         if self.mode is AutoresetMode.SAME_STEP:
             if ended.any():
                 infos = _masked(info, ~ended)

@@ -9,7 +9,7 @@ import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.files import read_json
@@ -65,7 +65,7 @@ def find(kind: type[_E], name: str) -> _E:
     """
     known = names(kind)
     if name in known:
-        return _read(kind, spec_folder() / _FOLDERS[kind] / f"{name}.json")
+        return cast(_E, _read(kind, spec_folder() / _FOLDERS[kind] / f"{name}.json"))
     versions = [
         (int(match[1]), full)
         for full in known

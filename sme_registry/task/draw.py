@@ -101,7 +101,7 @@ def _uniform_layer(spec: SMESpec, name: str, inputs: int, outputs: int) -> Layer
 
 
 def _haar(seed: int | str, name: str, rows: int, columns: int) -> Array:
-    """Haar-distributed orthonormal columns `[rows, columns]`: QR with R's diagonal made positive."""
+    """Haar-distributed orthonormal columns `[rows, columns]`: QR, R's diagonal made positive."""
     normal = gaussian(seed, name, rows * columns).reshape(rows, columns)
     Q, R = np.linalg.qr(normal)
     return Q * np.where(np.diag(R) < 0, -1.0, 1.0)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -117,11 +118,11 @@ class Task:
     def reward_of(self, similarity: npt.ArrayLike) -> Array:
         """The step reward r of similarities r̃, of any shape."""
         graded = np.maximum(0.0, 4.0 * (np.asarray(similarity) - 0.75))
-        return np.where(graded > self.spec.r_min, graded, 0.0)[()]
+        return cast(Array, np.where(graded > self.spec.r_min, graded, 0.0)[()])
 
     def similarity_of(self, a: Array, optimal: Array) -> Array:
         """r̃ of actions in [0, 1] beside the optimal ones, `[..., A]` each."""
-        return 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim
+        return cast(Array, 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim)
 
     def policy(self, s: Array) -> Array:
         """π* of states `[..., S]`, unchecked: each agent's layers over what it observes."""
