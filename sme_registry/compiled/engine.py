@@ -6,6 +6,7 @@ does not know which it has. States are bit-equal between them; oracle and reward
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import weakref
@@ -22,9 +23,10 @@ from sme_registry.task.draw import Array
 
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"
+_SMALL = 8192  # numbers of a packed task that each lane may hold a copy of: 64 KiB
 _ROWS = 4096  # states per block of the oracle: 2 MiB a layer at the default width
 
-_StepOne = Callable[..., tuple[float, float, float, float, float]]
+_StepOne = Callable[..., tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +35,18 @@ class Engine:
 
     Attributes:
       backend: what runs it, "numba" or "numpy".
-      params: the first argument of the step functions.
-      lane_size: how many numbers a single lane's own array holds.
-      step_float32: one step of one lane, for a float32 action of shape `[A]`.
+      params: the first argument of `step_many`.
+      new_lane: makes what a single lane needs, at t = 0: a buffer to pass to the step, and the
+        view of it that holds t, r_cum and s, `[2 + S]`.
+      step_float32: `(buffer, action [A] float32, optimal, observation)`, one step of one lane.
       step_float64: the same for a float64 action.
-      step_many: one step of a batch of lanes.
+      step_many: one step of a batch of lanes, as `kernels.step_many`.
       optimal_action: π* of `[B, S]` states, any number of them, in blocks.
     """
 
     backend: Backend
     params: Any
-    lane_size: int
+    new_lane: Callable[[], tuple[Array, Array]]
     step_float32: _StepOne
     step_float64: _StepOne
     step_many: Callable[..., None]
@@ -107,41 +110,54 @@ def _numba_engine(task: Task) -> Engine:
 
     # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
     # must be given arrays of exactly these types and dimensions.
-    return Engine(
-        backend="numba",
-        params=_packed[task],
-        lane_size=kernels.lane_size(_packed[task]),
-        step_float32=kernels.step_one.get_overload(kernels.ONE_FLOAT32),
-        step_float64=kernels.step_one.get_overload(kernels.ONE_FLOAT64),
-        step_many=kernels.step_many,
-        optimal_action=optimal_action,
-    )
+    packed = _packed[task]
+    if packed.size <= _SMALL:
+        prefix = packed
+        entry, shared = kernels.step_packed_lane, ()
+        signatures = kernels.PACKED_LANE_FLOAT32, kernels.PACKED_LANE_FLOAT64
+    else:
+        prefix = packed[:0]
+        entry, shared = kernels.step_lane, (packed,)
+        signatures = kernels.LANE_FLOAT32, kernels.LANE_FLOAT64
+    steps = [entry.get_overload(signature) for signature in signatures]
+    if shared:
+        steps = [functools.partial(step_one, *shared) for step_one in steps]
+
+    def new_lane() -> tuple[Array, Array]:
+        buffer = np.concatenate([prefix, np.zeros(kernels.lane_size(packed))])
+        return buffer, buffer[prefix.size : prefix.size + 2 + task.spec.state_dim]
+
+    return Engine("numba", packed, new_lane, steps[0], steps[1], kernels.step_many, optimal_action)
 
 
 def _numpy_engine(task: Task) -> Engine:
     S = task.spec.state_dim
 
+    def new_lane() -> tuple[Array, Array]:
+        lane = np.zeros(2 + S)
+        return lane, lane
+
     def step_one(
-        params: None,
         lane: Array,
         action: npt.NDArray[Any],
         optimal: Array,
         observation: npt.NDArray[np.float32],
-    ) -> tuple[float, float, float, float, float]:
+    ) -> tuple[float, ...]:
         if not np.isfinite(action).all():
-            return 0.0, 0.0, 0.0, 0.0, -1.0
+            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
         rewards, ends = np.empty((4, 1)), np.empty((2, 1), dtype=bool)
         s, moved = lane[2:, None], np.empty((S, 1))
         t = lane[:1].astype(np.int64)
         step_many(
-            params, s, t, lane[1:2], action.astype(np.float64)[None], moved,
+            None, s, t, lane[1:2], action.astype(np.float64)[None], moved,
             observation[None], optimal[None], rewards, ends,
         )  # fmt: skip
         lane[0] += 1.0
         lane[1] = rewards[3, 0]
         lane[2:] = moved[:, 0]
         similarity, step_reward, reward, accumulated = rewards[:, 0].tolist()
-        return similarity, step_reward, reward, accumulated, float(ends[0, 0] + 2 * ends[1, 0])
+        end = float(ends[0, 0] + 2 * ends[1, 0])
+        return similarity, step_reward, 1.0 - step_reward, reward, accumulated, end
 
     def step_many(
         params: None,
@@ -166,4 +182,4 @@ def _numpy_engine(task: Task) -> Engine:
         blocks = [task.policy(s[first : first + _ROWS]) for first in range(0, len(s), _ROWS)]
         return np.concatenate(blocks) if blocks else np.empty((0, task.spec.action_dim))
 
-    return Engine("numpy", None, 2 + S, step_one, step_one, step_many, optimal_action)
+    return Engine("numpy", None, new_lane, step_one, step_one, step_many, optimal_action)

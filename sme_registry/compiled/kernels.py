@@ -7,8 +7,11 @@ What differs is only where the loops are: a single lane runs over channels, a ba
 lanes, channel by channel, so that the inner loop is long enough to fill vector registers.
 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
-    S, A, k, T, r_min, D, agents, widest layer, W [A, S], b [S], then for each agent
-    inputs, L, observed channels [inputs], and for each layer  in, out, W transposed [in, out], b [out].
+    S, A, k, T, r_min, D, agents, widest layer, size of all this, W [A, S], b [S], for each agent
+    inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
+A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
+stand alone where it is not, so that lanes can share it:
+    t, r_cum, s [S], room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
 """
@@ -23,12 +26,8 @@ from sme_registry.compiled.normal_cdf import normal_cdf
 from sme_registry.task import Task
 
 LANES = 64  # lanes in a block: 512 bytes a channel, so that a block of 64 channels stays in cache
-_HEADER = 8
+_HEADER = 9
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
-_LARGEST = 1e300  # a finite bound whose comparison is false for NaN too
-
-# One lane's own numbers: t, r_cum, s [S], then room for two layers [2 × widest].
-STEPS_DONE, ACCUMULATED, STATE = 0, 1, 2
 
 
 def pack(task: Task) -> npt.NDArray[np.float64]:
@@ -37,7 +36,7 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
     widest = max(spec.state_dim, *(max(W.shape) for layers in task.policies for W, _ in layers))
     parts = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
-        [spec.r_min, spec.D, len(task.policies), widest],
+        [spec.r_min, spec.D, len(task.policies), widest, 0.0],
         task.W.ravel(),
         task.b,
     ]
@@ -46,13 +45,13 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
         for W, b in layers:
             parts += [W.shape[::-1], W.T.ravel(), b]
     packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-    packed.setflags(write=False)
+    packed[8] = packed.size
     return packed
 
 
 def lane_size(packed: npt.NDArray[np.float64]) -> int:
-    """How many numbers one lane's own array holds."""
-    return STATE + int(packed[0]) + 2 * int(packed[7])
+    """How many numbers one lane's own part holds."""
+    return 2 + int(packed[0]) + 2 * int(packed[7])
 
 
 _U0, _U1, _U2 = np.uint64(0), np.uint64(1), np.uint64(2)
@@ -90,33 +89,18 @@ def _wide_layer(W, b, x, y):  # type: ignore[no-untyped-def]
         y[o] = normal_cdf(y[o])
 
 
-_FIVE = types.UniTuple(float64, 5)
-ONE_FLOAT32 = _FIVE(_PACKED, float64[::1], float32[:], float64[::1], float32[::1])
-ONE_FLOAT64 = _FIVE(_PACKED, float64[::1], float64[:], float64[::1], float32[::1])
-
-
-@njit([ONE_FLOAT32, ONE_FLOAT64], error_model="numpy", cache=True)
-def step_one(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
-    """One step of one lane.
-
-    Args:
-      p: the packed task.
-      lane: the lane's own numbers; advanced in place.
-      action: `[A]`; any numbers, clipped here.
-      optimal: `[A]`, written: π* of the state acted in.
-      observation: `[S + 2]`, written.
-
-    Returns:
-      `(similarity, step_reward, reward, accumulated_reward, end)`; end is 1 for terminated plus
-      2 for truncated, or −1 where an action was not finite and nothing has moved.
-    """
+@njit(error_model="numpy")
+def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """One step of the lane whose own numbers begin at `lane[start]`; see `step_lane`."""
     S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
     r_min, D, agents, widest = p[4], p[5], np.uint64(p[6]), np.uint64(p[7])
+    if np.uint64(action.size) != A:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
     for i in range(A):
-        if not abs(action[i]) < _LARGEST:
-            return 0.0, 0.0, 0.0, 0.0, -1.0
+        if action[i] - action[i] != 0.0:  # NaN for NaN and for infinities
+            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
 
-    s = np.uint64(STATE)
+    s = start + _U2
     at = np.uint64(_HEADER) + A * S + S
     done = _U0
     for _ in range(agents):
@@ -168,18 +152,51 @@ def step_one(p, lane, action, optimal, observation):  # type: ignore[no-untyped-
         lane[s + j] = folded
         observation[j] = folded
 
-    t = int(lane[STEPS_DONE]) + 1
-    accumulated = lane[ACCUMULATED] + step_reward
+    t = int(lane[start]) + 1
+    accumulated = lane[start + _U1] + step_reward
     truncated = t >= T
     end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
     reward = 0.0
     if truncated or t % k == 0:
         reward, accumulated = accumulated, 0.0
-    lane[STEPS_DONE] = t
-    lane[ACCUMULATED] = accumulated
+    lane[start] = t
+    lane[start + _U1] = accumulated
     observation[S] = t / T
     observation[S + _U1] = accumulated / k
-    return similarity, step_reward, reward, accumulated, end
+    return similarity, step_reward, 1.0 - step_reward, reward, accumulated, end
+
+
+_RESULT = types.UniTuple(float64, 6)
+_REST = (float64[::1], float32[::1])
+LANE_FLOAT32 = _RESULT(_PACKED, float64[::1], float32[:], *_REST)
+LANE_FLOAT64 = _RESULT(_PACKED, float64[::1], float64[:], *_REST)
+PACKED_LANE_FLOAT32 = _RESULT(float64[::1], float32[:], *_REST)
+PACKED_LANE_FLOAT64 = _RESULT(float64[::1], float64[:], *_REST)
+
+
+@njit([LANE_FLOAT32, LANE_FLOAT64], error_model="numpy", cache=True)
+def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """One step of one lane.
+
+    Args:
+      p: the packed task.
+      lane: the lane's own numbers; advanced in place.
+      action: `[A]`; any numbers, clipped here.
+      optimal: `[A]`, written: π* of the state acted in.
+      observation: `[S + 2]`, written.
+
+    Returns:
+      `(similarity, step_reward, regret, reward, accumulated_reward, end)`; end is 1 for
+      terminated plus 2 for truncated, or −1 where the action is of another size or not finite:
+      nothing has moved then.
+    """
+    return _step_lane(p, lane, _U0, action, optimal, observation)
+
+
+@njit([PACKED_LANE_FLOAT32, PACKED_LANE_FLOAT64], error_model="numpy", cache=True)
+def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """`step_lane` for a lane whose own numbers follow its packed task in one array."""
+    return _step_lane(lane, lane, np.uint64(lane[8]), action, optimal, observation)
 
 
 @njit(error_model="numpy")
@@ -333,7 +350,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
 
 @njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)
 def add_and_normal_cdf(x, b):  # type: ignore[no-untyped-def]
-    """x ← Φ(x + b) in place, `[B, out]` and `[out]`: what follows a matrix product of the oracle."""
+    """x ← Φ(x + b) in place, `[B, out]` and `[out]`: what follows a matrix product."""
     for i in range(x.shape[0]):
         row = x[i]
         for o in range(row.size):
