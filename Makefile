@@ -1,0 +1,53 @@
+# Two commands on a machine with Python 3.11, make and pip:  make demo   and   make test
+# Everything is installed into .venv, in the versions of constraints.txt.
+
+VENV := .venv
+PY := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+
+# The first interpreter that is new enough; `make PYTHON=/path/to/python3.11 test` chooses one.
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for python in python3 python3.11 python; do \
+	$$python -c '$(NEW_ENOUGH)' 2>/dev/null && echo $$python && break; done)
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test check bench docs clean
+
+help:            ## show this list
+	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+
+install: $(INSTALLED)  ## the virtual environment, with everything in it
+
+demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, draw the figures
+	$(VENV)/bin/sme demo
+
+test: $(INSTALLED)     ## the whole test suite, as CI runs it
+	$(PY) -m pytest -n auto
+
+check: $(INSTALLED)    ## style, formatting, types, and which module may import which
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+bench: $(INSTALLED)    ## speed beside peers measured in the same run
+	$(PY) -m benchmarks
+
+docs: $(INSTALLED)     ## write the generated pages of docs/ anew
+	$(PY) docs/generate.py
+
+clean:                 ## remove the virtual environment, caches and built packages
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp is written last, so an installation that was cut short is done again.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(if $(PYTHON),,echo "Python 3.11 or newer is needed, and neither python3, python3.11 nor python\
+	is. Install it, or name it: make PYTHON=/path/to/python3.11"; exit 1)
+	@$(PYTHON) -c '$(NEW_ENOUGH)' || { echo "PYTHON=$(PYTHON): must be Python 3.11 or newer and\
+	start; it is: $$($(PYTHON) --version 2>&1 | tail -n 1)"; exit 1; }
+	@$(PY) -c '$(NEW_ENOUGH)' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV);\
+	echo "No virtual environment could be made: this Python lacks its venv module or pip. On Debian\
+	and Ubuntu: apt-get install python3-venv"; exit 1; }
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
