@@ -27,11 +27,18 @@ def space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.Box, boo
     return gymnasium.spaces.Box(low, 1.0, (action_dim,), np.float32), low < 0.0
 
 
-def checked(action: Any, shape: tuple[int, ...], rescaled: bool) -> npt.NDArray[np.float64]:
-    """Actions as contiguous float64 of the unit range, `shape`.
+def checked(
+    action: Any,
+    shape: tuple[int, ...],
+    rescaled: bool,
+    ignored: npt.NDArray[np.bool_] | None = None,
+) -> npt.NDArray[np.float64]:
+    """Actions as contiguous float64 of the unit range, `shape`; zero in the rows to ignore.
+
+    Whether they are finite is seen by the step itself, which reads each of them anyway.
 
     Raises:
-      ActionError: not numbers, of another shape, or not finite.
+      ActionError: not numbers, or of another shape.
     """
     try:
         array = np.asarray(action)
@@ -42,11 +49,16 @@ def checked(action: Any, shape: tuple[int, ...], rescaled: bool) -> npt.NDArray[
     if array.shape != shape:
         raise ActionError(f"action of shape {array.shape}: must be of shape {shape}.")
     array = np.array(array, dtype=np.float64, order="C")
-    if not np.isfinite(array).all():
-        raise ActionError("action: has NaN or infinite entries. Give finite numbers.")
+    if ignored is not None:
+        array[ignored] = 0.0
     return (array + 1.0) / 2.0 if rescaled else array
 
 
-def to_range(unit: npt.NDArray[np.float64], rescaled: bool) -> npt.NDArray[np.float64]:
+def not_finite() -> ActionError:
+    """What to raise where a step refused its actions."""
+    return ActionError("action: has NaN or infinite entries. Give finite numbers.")
+
+
+def to_range(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:
     """Actions of the unit range in the environment's own."""
     return 2.0 * unit - 1.0 if rescaled else unit

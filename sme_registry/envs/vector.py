@@ -22,7 +22,7 @@ from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, materialize, observe
 from sme_registry.task.memory import refuse_above_limit
 
 Array = npt.NDArray[np.float64]
@@ -109,7 +109,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
-        self._observation = np.zeros((num_envs, S + 2), np.float32)
+        self._all_begun, self._any_ended = False, False
         self._load_engine()
 
     def _load_engine(self) -> None:
@@ -181,9 +181,11 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             one_for_all = given.ndim == 1
             states = initial_states(options["state"], (S,) if one_for_all else (self.num_envs, S))
             states = np.broadcast_to(states, (self.num_envs, S))[lanes]
-        self._begin(lanes, self._observation, states)
+        observation = observe(self.sme_spec, self.state, self._t, self._accumulated)
+        self._begin(lanes, observation, states)
         self._begun[lanes] = True
-        return self._observation.copy(), {}
+        self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
+        return observation, {}
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
@@ -201,35 +203,34 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
           EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
         """
         B, S, A = self.num_envs, self.sme_spec.state_dim, self.sme_spec.action_dim
-        if not self._begun.all():
+        if not self._all_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
-        resting = self._ended
-        any_resting = bool(resting.any())
+        resting, any_resting = self._ended, self._any_ended
         if any_resting and self.mode is AutoresetMode.DISABLED:
             first = np.flatnonzero(resting)[0]
             raise EpisodeError(
                 f"step: the episodes of {resting.sum()} lanes have ended (the first is lane "
                 f"{first}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
             )
-        if any_resting:  # mode NEXT_STEP: what is passed for these lanes is ignored
-            actions = np.where(resting[:, None], 0.0, actions)
-        acted = action_ranges.checked(actions, (B, A), self._rescaled)
+        # In mode NEXT_STEP what is passed for the resting lanes is ignored.
+        acted = action_ranges.checked(
+            actions, (B, A), self._rescaled, ignored=resting if any_resting else None
+        )
 
         moved, observation = np.empty((S, B)), np.empty((B, S + 2), np.float32)
-        optimal, values, ends = np.empty((B, A)), np.empty((4, B)), np.empty((2, B), bool)
-        self._step_many(
+        optimal, values, ends = np.empty((B, A)), np.empty((5, B)), np.empty((2, B), bool)
+        if not self._step_many(
             self._params, self._s, self._t, self._accumulated, acted,
             moved, observation, optimal, values, ends,
-        )  # fmt: skip
-        similarity, step_reward, reward, accumulated = values
+        ):  # fmt: skip
+            raise action_ranges.not_finite()
+        similarity, step_reward, regret, reward, accumulated = values
         terminated, truncated = ends
-        if self._rescaled:
-            optimal = 2.0 * optimal - 1.0
         info = {
-            "optimal_action": optimal,
+            "optimal_action": action_ranges.to_range(optimal, self._rescaled),
             "similarity": similarity,
             "step_reward": step_reward,
-            "regret": 1.0 - step_reward,
+            "regret": regret,
             "accumulated_reward": accumulated,
         }
         self._s = moved
@@ -239,23 +240,22 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         if any_resting:
             for array in (reward, terminated, truncated):
                 array[resting] = 0
-            infos = _masked(info, ~resting)
             self._begin(np.flatnonzero(resting), observation)
-        else:
-            infos = _masked(info, np.ones(B, bool))
         ended: Mask = terminated | truncated
-        if self.mode is AutoresetMode.SAME_STEP:
-            if ended.any():
-                infos = _masked(info, ~ended)
-                final = np.full(B, None, dtype=object)
-                for lane in np.flatnonzero(ended):
-                    final[lane] = observation[lane].copy()
-                infos |= _masked({"final_obs": final, "final_info": _masked(info, ended)}, ended)
-                self._begin(np.flatnonzero(ended), observation)
+        any_ended = bool(ended.any())
+        if any_ended and self.mode is AutoresetMode.SAME_STEP:
+            infos = _masked(info, ~ended)
+            final = np.full(B, None, dtype=object)
+            for lane in np.flatnonzero(ended):
+                final[lane] = observation[lane].copy()
+            everyone = {"final_obs": final, "final_info": _masked(info, ended)}
+            infos |= {**everyone, "_final_obs": ended.copy(), "_final_info": ended.copy()}
+            self._begin(np.flatnonzero(ended), observation)
         else:
-            self._ended = ended
-        self._observation = observation
-        return observation.copy(), reward, terminated, truncated, infos
+            infos = _masked(info, ~resting if any_resting else None)
+            if self.mode is not AutoresetMode.SAME_STEP:
+                self._ended, self._any_ended = ended, any_ended
+        return observation, reward, terminated, truncated, infos
 
     def _begin(
         self, lanes: npt.NDArray[np.int64], observation: Observation, states: Array | None = None
@@ -304,13 +304,13 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         return mask
 
 
-def _masked(info: dict[str, Any], mask: Mask) -> dict[str, Any]:
+def _masked(info: dict[str, Array], mask: Mask | None) -> dict[str, Any]:
     """Gymnasium's form of batched info: each key with its mask; zero where the mask is False."""
     masked: dict[str, Any] = {}
-    whole = bool(mask.all())
     for key, value in info.items():
-        if not whole and isinstance(value, np.ndarray) and value.dtype != object:
-            value = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, 0.0)
-        masked[key] = value
-        masked[f"_{key}"] = mask.copy()
+        if mask is None:
+            masked[key], masked[f"_{key}"] = value, np.ones(len(value), bool)
+        else:
+            columns = mask.reshape(-1, *[1] * (value.ndim - 1))
+            masked[key], masked[f"_{key}"] = np.where(columns, value, 0.0), mask.copy()
     return masked

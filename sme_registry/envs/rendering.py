@@ -1,0 +1,291 @@
+"""`Renderer`: what an SME looks like, one frame per step.
+
+The state and the action beside the optimal one, channel by channel; below them the episode so far:
+similarity of each step and the regret that has added up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
+from sme_registry.spec import SMESpec
+
+if TYPE_CHECKING:
+    import pygame
+
+    from sme_registry.envs.single import SMEEnv
+
+Frame = npt.NDArray[np.uint8]
+
+WIDTH, HEIGHT = 800, 520
+_MARGIN = 24
+_CHANNELS_SHOWN = 128  # of each kind; more would be narrower than two pixels
+
+# Colours that the colour-blind can tell apart (Okabe and Ito's), on white.
+_PAPER, _INK, _FAINT, _TRACK = (255, 255, 255), (40, 44, 52), (120, 126, 136), (228, 231, 236)
+_OPTIMAL, _ACTION, _REGRET, _STATE = (0, 158, 115), (0, 114, 178), (213, 94, 0), (110, 128, 160)
+
+
+def _import_pygame() -> Any:
+    try:
+        # Its greeting would land in the output of every script that renders, and with some
+        # versions of setuptools its import warns of what is no fault of the user's.
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import pygame
+            import pygame.font
+    except ImportError:
+        raise MissingDependencyError(
+            "render_mode: pygame draws the frames and is not installed. "
+            "Run `pip install 'sme-registry[render]'`."
+        ) from None
+    return pygame
+
+
+class Renderer:
+    """Draws the episode under way. Recording is cheap; a frame is drawn when it is asked for.
+
+    Args:
+      spec: the task.
+      mode: "rgb_array" or "human" (a window, shown as each step is recorded).
+      metadata: the environment's; `render_fps` paces the window.
+
+    Raises:
+      MissingDependencyError: pygame is not installed.
+      OptionError: "human" where no window can be opened.
+    """
+
+    def __init__(self, spec: SMESpec, mode: str, metadata: dict[str, Any]) -> None:
+        self._pygame = pg = _import_pygame()
+        self._spec, self._mode = spec, mode
+        self._fps: int = metadata["render_fps"]
+        self._title = _title(spec)
+        self._window: pygame.Surface | None = None
+        if mode == "human":
+            try:
+                pg.display.init()
+                self._window = pg.display.set_mode((WIDTH, HEIGHT))
+            except pg.error as error:
+                raise OptionError(
+                    f"render_mode='human': no window can be opened here ({error}). "
+                    "Use render_mode='rgb_array'."
+                ) from None
+            pg.display.set_caption(f"SME {spec.content_name}")
+            self._clock = pg.time.Clock()
+        pg.font.init()
+        self._small, self._normal = pg.font.Font(None, 18), pg.font.Font(None, 22)
+        self._begun = False
+
+    def record(self, env: SMEEnv, last: tuple[Any, dict[str, Any]] | None) -> None:
+        """Take in a reset or a step.
+
+        Args:
+          env: the environment, after it.
+          last: None at a reset; else the action, in the environment's range, and the step's info.
+        """
+        self._state = env.state
+        if last is None:
+            self._begun = True
+            self._similarities: list[float] = []
+            self._regrets: list[float] = [0.0]
+            self._earned = self._pending = self._payout = 0.0
+            self._action: npt.NDArray[np.float64] | None = None
+            self._optimal: npt.NDArray[np.float64] | None = None
+        else:
+            action, info = last
+            space: Any = env.action_space
+            self._low = float(space.low[0])
+            self._action = np.clip(np.asarray(action, np.float64), space.low, space.high)
+            self._optimal = info["optimal_action"].copy()
+            self._similarities.append(info["similarity"])
+            self._regrets.append(self._regrets[-1] + info["regret"])
+            self._earned += info["step_reward"]
+            self._payout = self._pending + info["step_reward"] - info["accumulated_reward"]
+            self._pending = info["accumulated_reward"]
+        if self._window is not None:
+            self._show(self._window)
+
+    def frame(self) -> Frame | None:
+        """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
+
+        Raises:
+          EpisodeError: nothing is recorded yet.
+        """
+        if not self._begun:
+            raise EpisodeError("render: the episode has not begun. Call reset() first.")
+        if self._mode == "human":
+            return None
+        surface = self._pygame.Surface((WIDTH, HEIGHT))
+        self._draw(surface)
+        # pygame's arrays are [W, H, 3].
+        return np.ascontiguousarray(self._pygame.surfarray.pixels3d(surface).swapaxes(0, 1))
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window = None
+            self._pygame.display.quit()
+
+    def _show(self, window: pygame.Surface) -> None:
+        self._draw(window)
+        self._pygame.event.pump()
+        self._pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def _draw(self, surface: pygame.Surface) -> None:
+        surface.fill(_PAPER)
+        right, half = WIDTH - _MARGIN, WIDTH // 2
+        self._text(surface, self._title, (_MARGIN, 18), _INK, self._normal)
+        self._progress(surface, _MARGIN, 44, right)
+        self._states(surface, _MARGIN, 96, half - 20, 250)
+        self._actions(surface, half + 20, 96, right, 250)
+        self._numbers(surface, 288)
+        self._curve(
+            surface, (_MARGIN, 374, half - 20, 492), "similarity", self._similarities, 1.0, _ACTION
+        )
+        top = max(self._regrets[-1], 1.0)
+        self._curve(surface, (half + 20, 374, right, 492), "regret", self._regrets, top, _REGRET)
+
+    def _progress(self, surface: pygame.Surface, left: int, y: int, right: int) -> None:
+        T, t = self._spec.horizon, len(self._similarities)
+        rect, width = self._pygame.draw.rect, right - left - 90
+        rect(surface, _TRACK, (left, y, width, 6), border_radius=3)
+        if t:
+            rect(surface, _INK, (left, y, max(6, width * t // T), 6), border_radius=3)
+        self._text(surface, f"t = {t} / {T}", (right, y - 3), _INK, self._small, align=1.0)
+
+    def _states(
+        self, surface: pygame.Surface, left: int, top: int, right: int, bottom: int
+    ) -> None:
+        S = self._spec.state_dim
+        self._heading(surface, "state", S, left, top)
+        for x, width, value in _columns(self._state[:_CHANNELS_SHOWN].tolist(), left, right):
+            height = bottom - top - 22
+            filled = round(height * value)
+            rect = self._pygame.draw.rect
+            rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
+            rect(surface, _STATE, (x, bottom - filled, width, filled), border_radius=2)
+        self._text(surface, "0 … 1", (right, top), _FAINT, self._small, align=1.0)
+
+    def _actions(
+        self, surface: pygame.Surface, left: int, top: int, right: int, bottom: int
+    ) -> None:
+        """Each action as a dot, the optimal one as a bar across; what lies between is the error."""
+        A, rect = self._spec.action_dim, self._pygame.draw.rect
+        self._heading(surface, "last action", A, left, top)
+        height = bottom - top - 22
+        tracks = [0.0] * min(A, _CHANNELS_SHOWN)
+        for x, width, _ in _columns(tracks, left, right):
+            rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
+        if self._action is None or self._optimal is None:
+            return
+        x = right
+        for word, colour in (
+            (f"{self._low:.0f} … 1", _FAINT), ("optimal", _OPTIMAL), ("taken", _ACTION)
+        ):  # fmt: skip
+            x -= self._text(surface, word, (x, top), colour, self._small, align=1.0) + 10
+        scale = height / (1.0 - self._low)
+        actions = self._action[:_CHANNELS_SHOWN].tolist()
+        optimal = self._optimal[:_CHANNELS_SHOWN].tolist()
+        for (x, width, a), best in zip(_columns(actions, left, right), optimal, strict=True):
+            middle = x + width // 2
+            y = bottom - round((a - self._low) * scale)
+            y_best = bottom - round((best - self._low) * scale)
+            wide = max(1, min(6, width // 2))
+            rect(surface, _REGRET, (middle - wide // 2, min(y, y_best), wide, abs(y - y_best)))
+            rect(surface, _OPTIMAL, (x, y_best - 2, width, 4))
+            self._pygame.draw.circle(surface, _ACTION, (middle, y), max(2, min(6, width // 2)))
+
+    def _heading(self, surface: pygame.Surface, what: str, count: int, left: int, top: int) -> None:
+        shown = f"{count} channels" if count > 1 else "1 channel"
+        if count > _CHANNELS_SHOWN:
+            shown = f"the first {_CHANNELS_SHOWN} of {count} channels"
+        width = self._text(surface, what, (left, top), _INK, self._normal)
+        self._text(surface, shown, (left + width + 8, top + 2), _FAINT, self._small)
+
+    def _numbers(self, surface: pygame.Surface, y: int) -> None:
+        last = self._similarities[-1] if self._similarities else None
+        regret = self._regrets[-1] - self._regrets[-2] if self._similarities else None
+        columns: Sequence[tuple[str, float | None, tuple[int, int, int]]] = (
+            ("similarity", last, _ACTION),
+            ("step reward", None if regret is None else 1.0 - regret, _INK),
+            ("regret", regret, _REGRET),
+            ("payout", self._payout if self._similarities else None, _INK),
+            ("not yet paid", self._pending, _INK),
+            ("return", self._earned - self._pending, _INK),
+        )
+        step = (WIDTH - 2 * _MARGIN) / len(columns)
+        for i, (name, value, colour) in enumerate(columns):
+            x = round(_MARGIN + i * step)
+            self._text(surface, name, (x, y), _FAINT, self._small)
+            shown = "–" if value is None else f"{value:.3f}"
+            self._text(surface, shown, (x, y + 18), colour, self._normal)
+
+    def _curve(
+        self,
+        surface: pygame.Surface,
+        box: tuple[int, int, int, int],
+        name: str,
+        values: Sequence[float],
+        top_value: float,
+        colour: tuple[int, int, int],
+    ) -> None:
+        left, top, right, bottom = box
+        self._text(surface, f"{name} so far", (left, top - 26), _INK, self._normal)
+        self._text(surface, f"0 … {top_value:.3g}", (right, top - 24), _FAINT, self._small, 1.0)
+        draw = self._pygame.draw
+        draw.line(surface, _TRACK, (left, top), (right, top))
+        draw.line(surface, _FAINT, (left, bottom), (right, bottom))
+        # One point a pixel at most, on the scale of the whole episode.
+        stride = max(1, len(values) // (right - left))
+        reach = (right - left) / max(1, self._spec.horizon)
+        first = 0 if values is self._regrets else 1
+        points = [
+            (
+                left + (i * stride + first) * reach,
+                bottom - (bottom - top) * min(value / top_value, 1.0),
+            )
+            for i, value in enumerate(values[::stride])
+        ]
+        for start, end in itertools.pairwise(points):
+            draw.line(surface, colour, start, end, 2)
+        if points:
+            draw.circle(surface, colour, points[-1], 4)
+
+    def _text(
+        self,
+        surface: pygame.Surface,
+        text: str,
+        place: tuple[int, int],
+        colour: tuple[int, int, int],
+        font: pygame.font.Font,
+        align: float = 0.0,
+    ) -> int:
+        """Write a line whose top left (`align` 0) or top right (1) is `place`; its width."""
+        image = font.render(text, True, colour)
+        surface.blit(image, (round(place[0] - align * image.get_width()), place[1]))
+        return image.get_width()
+
+
+def _title(spec: SMESpec) -> str:
+    """The axes by their symbols; those at their default go without saying, but for the first."""
+    shown = [f"SME   S = {spec.state_dim}", f"A = {spec.action_dim}", f"L = {spec.complexity}"]
+    rest = {"k": spec.k, "r_min": spec.r_min, "D": spec.D}
+    shown += [f"{name} = {value:g}" for name, value in rest.items()]
+    return "   ".join([*shown, spec.content_name])
+
+
+def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, int, float]]:
+    """`(x, width, value)` of each channel's column, shared out over the pixels of a panel."""
+    pitch = min((right - left) / len(values), 44.0)
+    width = max(1, round(pitch - min(8.0, pitch / 4)))
+    return [(round(left + i * pitch), width, value) for i, value in enumerate(values)]
