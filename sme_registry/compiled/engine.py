@@ -49,7 +49,7 @@ class Engine:
     new_lane: Callable[[], tuple[Array, Array]]
     step_float32: _StepOne
     step_float64: _StepOne
-    step_many: Callable[..., None]
+    step_many: Callable[..., bool]
     optimal_action: Callable[[Array], Array]
 
 
@@ -111,17 +111,16 @@ def _numba_engine(task: Task) -> Engine:
     # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
     # must be given arrays of exactly these types and dimensions.
     packed = _packed[task]
+    steps: list[_StepOne]
     if packed.size <= _SMALL:
         prefix = packed
-        entry, shared = kernels.step_packed_lane, ()
         signatures = kernels.PACKED_LANE_FLOAT32, kernels.PACKED_LANE_FLOAT64
+        steps = [kernels.step_packed_lane.get_overload(types) for types in signatures]
     else:
         prefix = packed[:0]
-        entry, shared = kernels.step_lane, (packed,)
         signatures = kernels.LANE_FLOAT32, kernels.LANE_FLOAT64
-    steps = [entry.get_overload(signature) for signature in signatures]
-    if shared:
-        steps = [functools.partial(step_one, *shared) for step_one in steps]
+        entries = [kernels.step_lane.get_overload(types) for types in signatures]
+        steps = [functools.partial(entry, packed) for entry in entries]
 
     def new_lane() -> tuple[Array, Array]:
         buffer = np.concatenate([prefix, np.zeros(kernels.lane_size(packed))])
@@ -143,21 +142,19 @@ def _numpy_engine(task: Task) -> Engine:
         optimal: Array,
         observation: npt.NDArray[np.float32],
     ) -> tuple[float, ...]:
-        if not np.isfinite(action).all():
-            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
-        rewards, ends = np.empty((4, 1)), np.empty((2, 1), dtype=bool)
+        rewards, ends = np.empty((5, 1)), np.empty((2, 1), dtype=bool)
         s, moved = lane[2:, None], np.empty((S, 1))
         t = lane[:1].astype(np.int64)
-        step_many(
+        if action.size != task.spec.action_dim or not step_many(
             None, s, t, lane[1:2], action.astype(np.float64)[None], moved,
             observation[None], optimal[None], rewards, ends,
-        )  # fmt: skip
+        ):  # fmt: skip
+            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
         lane[0] += 1.0
-        lane[1] = rewards[3, 0]
+        lane[1] = rewards[4, 0]
         lane[2:] = moved[:, 0]
-        similarity, step_reward, reward, accumulated = rewards[:, 0].tolist()
         end = float(ends[0, 0] + 2 * ends[1, 0])
-        return similarity, step_reward, 1.0 - step_reward, reward, accumulated, end
+        return (*rewards[:, 0].tolist(), end)
 
     def step_many(
         params: None,
@@ -170,13 +167,22 @@ def _numpy_engine(task: Task) -> Engine:
         optimal: Array,
         rewards: Array,
         ends: npt.NDArray[np.bool_],
-    ) -> None:
+    ) -> bool:
+        if not np.isfinite(action).all():
+            return False
         done = step(task, np.ascontiguousarray(s.T), t, accumulated, action)
         moved[:] = done.state.T
         observation[:] = observe(task.spec, done.state, t + 1, done.accumulated_reward)
         optimal[:] = done.optimal_action
-        rewards[:] = done.similarity, done.step_reward, done.reward, done.accumulated_reward
+        rewards[:] = (
+            done.similarity,
+            done.step_reward,
+            1.0 - done.step_reward,
+            done.reward,
+            done.accumulated_reward,
+        )
         ends[:] = done.terminated, done.truncated
+        return True
 
     def optimal_action(s: Array) -> Array:
         blocks = [task.policy(s[first : first + _ROWS]) for first in range(0, len(s), _ROWS)]

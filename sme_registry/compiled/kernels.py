@@ -234,7 +234,7 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
 
 
 @njit(
-    void(
+    boolean(
         _PACKED,
         float64[:, ::1],
         int64[::1],
@@ -257,15 +257,22 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
       s: `[S, B]` states, channel by channel.
       t: `[B]` steps done before this one.
       accumulated: `[B]` r_cum before this step.
-      action: `[B, A]`, finite; clipped here.
+      action: `[B, A]`, clipped here.
       moved: `[S, B]`, written: the next states.
       observation: `[B, S + 2]`, written.
       optimal: `[B, A]`, written: π* of the states acted in.
-      rewards: `[4, B]`, written: similarity, step reward, reward, r_cum after a payout.
+      rewards: `[5, B]`, written: similarity, step reward, regret, reward, r_cum after a payout.
       ends: `[2, B]`, written: terminated, truncated.
+
+    Returns:
+      False where an action was not finite; nothing is of use then.
     """
-    S, A, k, T = int(p[0]), int(p[1]), int(p[2]), int(p[3])
+    S, A, k, T = int(p[0]), int(p[1]), p[2], p[3]
     r_min, D, agents, widest = p[4], p[5], int(p[6]), int(p[7])
+    for i in range(action.shape[0]):
+        for j in range(A):
+            if action[i, j] - action[i, j] != 0.0:  # NaN for NaN and for infinities
+                return False
     W = p[_HEADER : _HEADER + A * S].reshape(A, S)
     b = p[_HEADER + A * S : _HEADER + A * S + S]
     x, y = np.empty((widest, LANES)), np.empty((widest, LANES))
@@ -324,28 +331,38 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
                 z = after[first + lane]
                 after[first + lane] = 2.0 * abs(z - np.rint(z))
         for lane in range(count):
+            row = observation[first + lane]
             for j in range(S):
-                observation[first + lane, j] = moved[j, first + lane]
+                row[j] = moved[j, first + lane]
 
+        # Three short loops rather than one long one: the first two fill vector registers.
         for lane in range(count):
             i = first + lane
             similarity = 1.0 - missed[lane] / float64(A)
             graded = 4.0 * (similarity - 0.75)
-            step_reward = graded if graded > 0.0 and graded > r_min else 0.0
-            steps = t[i] + 1
-            total = accumulated[i] + step_reward
-            truncated = steps >= T
-            reward = 0.0
-            if truncated or steps % k == 0:
-                reward, total = total, 0.0
+            graded = graded if graded > 0.0 else 0.0
+            step_reward = graded if graded > r_min else 0.0
             rewards[0, i] = similarity
             rewards[1, i] = step_reward
-            rewards[2, i] = reward
-            rewards[3, i] = total
+            rewards[2, i] = 1.0 - step_reward
             ends[0, i] = step_reward < D
+        for lane in range(count):
+            i = first + lane
+            steps = float64(t[i] + 1)
+            total = accumulated[i] + rewards[1, i]
+            truncated = steps >= T
+            # Exact: no quotient of integers below 2³¹ rounds to a whole number that it is not.
+            paid = truncated | (np.floor(steps / k) * k == steps)
+            rewards[3, i] = total if paid else 0.0
+            kept = 0.0 if paid else total
+            rewards[4, i] = kept
             ends[1, i] = truncated
-            observation[i, S] = steps / T
-            observation[i, S + 1] = total / k
+            best[0, lane] = steps / T
+            missed[lane] = kept / k
+        for lane in range(count):
+            observation[first + lane, S] = best[0, lane]
+            observation[first + lane, S + 1] = missed[lane]
+    return True
 
 
 @njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)

@@ -227,7 +227,8 @@ class SMEEnv(gymnasium.Env[Observation, Action]):
     def _after(self, end: float, action: Action, info: dict[str, Any]) -> None:
         """What the plain step has no need of: refusals, the end, other ranges, frames."""
         if end < 0.0:
-            self._checked(action)
+            self._checked(action)  # says so where it is of another size
+            raise actions.not_finite()
         if end:
             self._state = "ended"
             self._arm()

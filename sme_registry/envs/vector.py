@@ -237,7 +237,9 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self._t += 1
         self._accumulated = accumulated.copy()
 
+        live = None
         if any_resting:
+            live = ~resting
             for array in (reward, terminated, truncated):
                 array[resting] = 0
             self._begin(np.flatnonzero(resting), observation)
@@ -252,7 +254,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             infos |= {**everyone, "_final_obs": ended.copy(), "_final_info": ended.copy()}
             self._begin(np.flatnonzero(ended), observation)
         else:
-            infos = _masked(info, ~resting if any_resting else None)
+            infos = _masked(info, live)
             if self.mode is not AutoresetMode.SAME_STEP:
                 self._ended, self._any_ended = ended, any_ended
         return observation, reward, terminated, truncated, infos
