@@ -100,11 +100,11 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
       OptionError: the folder cannot be made or written to; what stood there is untouched.
     """
     path = Path(path)
-    data = content.encode("utf-8") if isinstance(content, str) else content
     temporary: str | None = None
     try:
+        data = content.encode("utf-8") if isinstance(content, str) else content
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:64]}.", dir=path.parent)
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
             stream.flush()
@@ -114,10 +114,10 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
         os.chmod(temporary, 0o666 & ~umask)  # mkstemp's 0600 would hide results from colleagues
         os.replace(temporary, path)
         temporary = None
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
+        reason = getattr(error, "strerror", None) or str(error)
         raise OptionError(
-            f"{path}: cannot be written: {error.strerror or error}. "
-            "Give a path in a folder that you may write to."
+            f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
         ) from None
     finally:
         if temporary is not None:

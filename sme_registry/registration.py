@@ -55,14 +55,15 @@ def register(spec: SMESpec, name: str) -> str:
     Raises:
       OptionError: the name has other characters.
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
+      FingerprintMismatchError: the spec is of a file whose numbers are not the ones drawn here.
     """
     from sme_registry.spec import as_spec
     from sme_registry.spec.catalogue import NAMESPACE
     from sme_registry.spec.resolve import registered, resolve
     from sme_registry.task.streams import DYNAMICS_VERSION
 
-    spec = as_spec(spec)
-    short = name.removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
+    spec = _verified(as_spec(spec))
+    short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):
         raise OptionError(
             f"name={name!r}: must be 1 to 64 letters, digits, '_' and '-', with the version "
@@ -79,6 +80,15 @@ def register(spec: SMESpec, name: str) -> str:
     _register(env_id, spec.plain())
     registered[env_id] = spec
     return env_id
+
+
+def _verified(spec: SMESpec) -> SMESpec:
+    """The spec, checked against its file's fingerprint, which an EnvSpec's kwargs cannot carry."""
+    if spec._fingerprint is not None:
+        from sme_registry.task import materialize
+
+        materialize(spec)
+    return spec
 
 
 def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec:
@@ -147,11 +157,15 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
 
     Returns:
       What `gymnasium.make` and `gymnasium.make_vec` take in place of an id.
+
+    Raises:
+      UnknownNameError, SpecError: see `load`.
+      FingerprintMismatchError: the spec is of a file whose numbers are not the ones drawn here.
     """
     from sme_registry.envs.naming import content_id
     from sme_registry.spec.resolve import resolve
 
-    resolved = resolve(spec)
+    resolved = _verified(resolve(spec))
     return EnvSpec(
         id=content_id(resolved),
         entry_point=_ENTRY_POINT,

@@ -11,7 +11,7 @@ import types
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 import rfc8785
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -28,10 +28,11 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sme_registry.errors import SpecError, did_you_mean
 
 _EXPLAINED = "document"  # the error type of lines that already are in our words
+_NOT_AN_OBJECT = ": must be an object of named fields"
 _SHOWN = 60  # characters of a bad value that an error repeats
 
 
-def _plain_number(value: Any) -> Any:
+def plain_number(value: Any) -> Any:
     """NumPy's scalars as Python's, so that a sweep over `np.arange` needs no casts; no booleans."""
     if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:
         kind = value.dtype.kind
@@ -40,17 +41,26 @@ def _plain_number(value: Any) -> Any:
     return value
 
 
+def _integer_only(value: Any) -> Any:
+    """Refuse what Python calls equal to an integer: `Literal[1]` takes True and 1.0 for 1."""
+    number = plain_number(value)
+    if type(number) is not int:
+        raise ValueError("not an integer")
+    return number
+
+
 def _no_negative_zero(value: float) -> float:
     return value + 0.0
 
 
-Integer = Annotated[int, BeforeValidator(_plain_number)]
+Integer = Annotated[int, BeforeValidator(plain_number)]
 Real = Annotated[
     float,
     Field(allow_inf_nan=False),
-    BeforeValidator(_plain_number),
+    BeforeValidator(plain_number),
     AfterValidator(_no_negative_zero),
 ]
+SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", min_length=1, max_length=64)]
 
 
@@ -62,7 +72,14 @@ def explained(message: str) -> PydanticCustomError:
 class StrictModel(BaseModel):
     """Frozen and strict; unknown fields are refused, in words that say what to do."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_default=False)
+    # An instance of a subclass has more fields than its place: equal digests, unequal documents.
+    model_config = ConfigDict(
+        frozen=True,
+        strict=True,
+        extra="forbid",
+        validate_default=False,
+        revalidate_instances="subclass-instances",
+    )
 
     @model_validator(mode="wrap")
     @classmethod
@@ -74,7 +91,7 @@ class StrictModel(BaseModel):
                 InitErrorDetails(
                     type=explained(_explain(cls, line)), loc=line["loc"], input=line["input"]
                 )
-                for line in error.errors()
+                for line in _without_echoes(error.errors())
             ]
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
 
@@ -127,50 +144,76 @@ class Document(StrictModel):
         return "sha256:" + hashlib.sha256(self.canonical_json()).hexdigest()
 
 
+def _without_echoes(lines: list[Any]) -> list[Any]:
+    """Drop "too short" where entries were wrong: Pydantic counts only those that were right."""
+    return [
+        line
+        for line in lines
+        if line["type"] != "too_short"
+        or not any(
+            len(other["loc"]) > len(line["loc"]) and other["loc"][: len(line["loc"])] == line["loc"]
+            for other in lines
+        )
+    ]
+
+
 def _explain(document: type[StrictModel], line: Any) -> str:
     """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
     location, value = line["loc"], line["input"]
     if line["type"] == _EXPLAINED:
         return _from_the_root(str(line["msg"]), location)
     if not location:
-        return f"{document.__name__}: must be an object of named fields, got {_show(value)}."
+        return f"{document.__name__}{_NOT_AN_OBJECT}, got {show(value)}."
     path = ".".join(str(part) for part in location)
     fields = document.model_fields
     name = str(location[0])
     if line["type"] == "extra_forbidden":
         hint = did_you_mean(name, fields) or f" Known fields: {', '.join(fields)}."
-        return f"{path}={_show(value)}: unknown field.{hint} Rename or remove it."
+        return f"{path}={show(value)}: unknown field.{hint} Rename or remove it."
+    if name not in fields:  # a key that is not a string
+        return f"{path}: field names must be strings. Known fields: {', '.join(fields)}."
     field = fields[name]
     if line["type"] == "missing":
         return f"{path}: missing: must be {_allowed(field)}. Add it."
     fix = "Correct it."
     if not field.is_required() and len(location) == 1:
-        fix = (
-            f"Leave it out for the default, {_show(field.get_default(call_default_factory=True))}."
-        )
+        fix = f"Leave it out for the default, {show(field.get_default(call_default_factory=True))}."
     allowed = f"must be {_allowed(field)}" if len(location) == 1 else str(line["msg"])
-    return f"{path}={_show(value)}: {allowed}. {fix}"
+    return f"{path}={show(value)}: {allowed}. {fix}"
 
 
 def _from_the_root(message: str, location: tuple[int | str, ...]) -> str:
     """A nested document's line with its field's whole path: `team.agents.1.observes=…`."""
     parts = [str(part) for part in location]
+    path = ".".join(parts)
     for start in range(len(parts)):
         tail = ".".join(parts[start:])
         if message.startswith((f"{tail}=", f"{tail}:")):
-            return ".".join(parts) + message[len(tail) :]
-    return message
+            return path + message[len(tail) :]
+    if not parts:
+        return message
+    if _NOT_AN_OBJECT in message:
+        return path + message[message.index(_NOT_AN_OBJECT) :]
+    if isinstance(location[-1], int) and "=" in message:  # one entry of a list of scalars
+        return path + message[message.index("=") :]
+    return f"{path}.{message}"
 
 
-def _show(value: Any) -> str:
-    text = repr(value)
+def show(value: Any) -> str:
+    """A bad value as an error repeats it: cut to a length that fits a line."""
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply"
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
 
 
 def _allowed(field: FieldInfo) -> str:
     """The values a field takes, in words."""
     low, high = "", ""
+    shortest, longest, pattern = 0, 0, None
     for bound in field.metadata:
+        pattern = getattr(bound, "pattern", None) or pattern
         match bound:
             case Ge(ge=limit):
                 low = f"[{limit}"
@@ -180,7 +223,18 @@ def _allowed(field: FieldInfo) -> str:
                 high = f"{limit}]"
             case Lt(lt=limit):
                 high = f"{limit})"
+            case MinLen(min_length=shortest):
+                pass
+            case MaxLen(max_length=longest):
+                pass
+    if field.annotation is str:
+        if pattern is not None and field.description:
+            return field.description
+        letters = "letters, digits, '_' and '-'" if pattern is not None else "characters"
+        return f"a string of {shortest} to {longest} {letters}"
     span = f"in {low or '(−∞'}, {high or '∞)'}" if low or high else ""
+    if longest:
+        span = f"of {shortest} to {longest} entries"
     kind = _kind(field.annotation)
     return f"{kind} {span}".strip() if kind else (span or field.description or "of another form")
 
@@ -191,8 +245,6 @@ def _kind(annotation: Any) -> str:
         return "an integer"
     if annotation is float:
         return "a finite number"
-    if annotation is str:
-        return "a string of letters, digits, '_' and '-'"
     if origin is Literal:
         return " or ".join(repr(choice) for choice in get_args(annotation))
     if origin is tuple:

@@ -38,7 +38,12 @@ class Envelope(StrictModel):
     version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
     description: Annotated[str, Field(max_length=2000)] = ""
     tags: Annotated[tuple[Name, ...], Field(strict=False, max_length=64)] = ()
-    digest: Annotated[str, Field(pattern=r"^sha256:[0-9a-f]{64}$")]
+    digest: Annotated[
+        str,
+        Field(
+            pattern=r"^sha256:[0-9a-f]{64}$", description="'sha256:' and 64 lower-case hex digits"
+        ),
+    ]
 
     @property
     def versioned_name(self) -> str:

@@ -11,13 +11,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sme_registry.spec.document import Document, Integer, Real, explained
+from sme_registry.spec.document import Document, Integer, Real, SchemaVersion, explained, show
 
 
 class EvaluationProtocol(Document):
     """How many states, in which regions, with which auxiliary inputs, from which seed."""
 
-    schema_version: Literal[1] = 1
+    schema_version: SchemaVersion = 1
     states_per_region: Annotated[Integer, Field(ge=2, le=10**8)] = 50_000
     epsilons: Annotated[
         tuple[Real, ...],
@@ -33,7 +33,7 @@ class EvaluationProtocol(Document):
         levels = (0.0, *self.epsilons)
         if any(outer <= inner for inner, outer in itertools.pairwise(levels)):
             raise explained(
-                f"epsilons={list(self.epsilons)!r:.70}: must increase, from above 0. "
+                f"epsilons={show(list(self.epsilons))}: must increase, from above 0. "
                 "Sort them and remove repeats and zeros."
             )
         return self

@@ -32,15 +32,20 @@ def resolve(task: SMESpec | dict[str, Any] | str | os.PathLike[str]) -> SMESpec:
       UnknownNameError: nothing has this name; says what is near.
       SpecError: a file or mapping is not a valid spec.
     """
-    if isinstance(task, SMESpec | dict):
+    if not isinstance(task, str | os.PathLike):
         return as_spec(task)
-    name = os.fspath(task)
-    if name.endswith(".json") or (os.sep in name and Path(name).is_file()):
+    name = str(task)
+    if (
+        isinstance(task, os.PathLike)
+        or name.endswith(".json")
+        or (os.sep in name and Path(name).is_file())
+    ):
         return with_fingerprint(read_env_file(name))
     short = name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
     full = f"{catalogue.NAMESPACE}/{short}"
-    if full in registered:
-        return registered[full]
+    for env_id in registered:
+        if full in (env_id, env_id.rsplit("-v", 1)[0]):
+            return registered[env_id]
     if short.startswith(("sha256:", "sha256-")):
         return _by_content(short)
     try:
@@ -82,7 +87,13 @@ def known_specs() -> dict[str, SMESpec]:
 
 
 def _by_content(name: str) -> SMESpec:
-    digits = name[len("sha256:") :].split("-", 1)[0].lower()
+    digits, _, version = name[len("sha256:") :].lower().partition("-v")
+    versions = {str(file.version) for file in catalogue.entries(EnvFile)}
+    if version and version not in versions:
+        raise UnknownNameError(
+            f"{name!r}: no task has version {version} of the dynamics. "
+            f"Known: {', '.join(sorted(versions))}."
+        )
     known = known_specs()
     found = [spec for digest, spec in known.items() if digest[len("sha256:") :].startswith(digits)]
     if len(found) == 1 and len(digits) >= 12:

@@ -19,7 +19,15 @@ from pydantic import (
 )
 
 from sme_registry.errors import SpecError
-from sme_registry.spec.document import Document, Integer, Real, explained
+from sme_registry.spec.document import (
+    Document,
+    Integer,
+    Real,
+    SchemaVersion,
+    explained,
+    plain_number,
+    show,
+)
 
 MAX_DIM = 2**20
 MAX_SEED = 2**53  # above it not every integer is a JSON number that all readers agree on
@@ -30,11 +38,11 @@ _AGENT_NAME = r"^[A-Za-z][A-Za-z0-9-]*_(0|[1-9][0-9]*)$"
 def _seed(value: Any) -> int | str:
     if isinstance(value, str) and _HEX_SEED.fullmatch(value):
         return f"0x{int(value, 16):x}"
-    number = value.item() if type(value).__module__ == "numpy" and value.ndim == 0 else value
+    number = plain_number(value)
     if isinstance(number, int) and not isinstance(number, bool) and 0 <= number < MAX_SEED:
         return number
     raise explained(
-        f"seed={value!r:.70}: must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
+        f"seed={show(value)}: must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
         "'0x…' of 1 to 64 hex digits. Leave it out for the default, 0."
     )
 
@@ -54,18 +62,18 @@ Seed = Annotated[
 
 
 def _observed(value: Any) -> Any:
-    if value == "all":
+    if isinstance(value, str) and value == "all":
         return value
-    channels = list(value) if isinstance(value, list | tuple) else None
+    channels = [plain_number(c) for c in value] if isinstance(value, list | tuple) else None
     if not channels or any(type(c) is not int or c < 0 for c in channels):
         raise explained(
-            f"observes={value!r:.70}: must be 'all' or a list of state channels, each an integer "
+            f"observes={show(value)}: must be 'all' or a list of state channels, each an integer "
             "in [0, state_dim). Leave it out for 'all'."
         )
     if sorted(set(channels)) != channels:
         raise explained(
-            f"observes={value!r:.70}: channels must be in increasing order, each once. "
-            f"Write {sorted(set(channels))!r:.70}."
+            f"observes={show(value)}: channels must be in increasing order, each once. "
+            f"Write {show(sorted(set(channels)))}."
         )
     return tuple(channels)
 
@@ -88,7 +96,14 @@ Observed = Annotated[
 class AgentSpec(Document):
     """One agent of a team: the action channels it owns and the state channels it observes."""
 
-    name: Annotated[str, Field(pattern=_AGENT_NAME, max_length=64)]
+    name: Annotated[
+        str,
+        Field(
+            pattern=_AGENT_NAME,
+            max_length=64,
+            description="a word, '_' and a number, such as 'agent_0', of at most 64 characters",
+        ),
+    ]
     action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)]
     observes: Observed = "all"
 
@@ -126,7 +141,7 @@ class Setting(Document):
     Defaults are the paper's (METHOD, section 1), and ours where it gives none.
     """
 
-    schema_version: Literal[1] = 1
+    schema_version: SchemaVersion = 1
     state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="S, state channels")] = 8
     action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="A, action channels")] = 4
     k: Annotated[Integer, Field(ge=1, le=2**31 - 1, description="reward interval, steps")] = 1
@@ -155,7 +170,7 @@ class Setting(Document):
         for agent in self.team.agents:
             if agent.observes != "all" and agent.observes[-1] >= self.state_dim:
                 raise explained(
-                    f"team.agents.{agent.name}.observes={list(agent.observes)!r:.70}: must be in "
+                    f"team.agents.{agent.name}.observes={show(list(agent.observes))}: must be in "
                     f"[0, state_dim={self.state_dim}). Remove channel {agent.observes[-1]}, or "
                     "raise state_dim."
                 )
@@ -208,4 +223,4 @@ def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
         return value
     if isinstance(value, dict):
         return SMESpec.parse(value)
-    raise SpecError(f"{value!r:.80}: must be an SMESpec or a mapping of its fields.")
+    raise SpecError(f"{show(value)}: must be an SMESpec or a mapping of its fields.")

@@ -5,11 +5,11 @@ A method is judged on a kind of task and not on one draw of it.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from sme_registry.spec.document import Document, Name, explained
+from sme_registry.spec.document import Document, Name, SchemaVersion, explained, show
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
 
 
@@ -23,7 +23,7 @@ class SuiteClass(Document):
     @model_validator(mode="after")
     def _seeds_differ(self) -> Self:
         if len(set(self.seeds)) != len(self.seeds):
-            raise explained(f"seeds={list(self.seeds)!r:.70}: each may stand once. Remove repeats.")
+            raise explained(f"seeds={show(list(self.seeds))}: each may stand once. Remove repeats.")
         return self
 
     @property
@@ -36,7 +36,7 @@ class SuiteClass(Document):
 class Suite(Document):
     """Classes of tasks under different names."""
 
-    schema_version: Literal[1] = 1
+    schema_version: SchemaVersion = 1
     classes: Annotated[tuple[SuiteClass, ...], Field(min_length=1, max_length=1000, strict=False)]
 
     @model_validator(mode="after")

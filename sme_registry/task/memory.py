@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import os
+from collections.abc import Iterator
 
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import SMESpec
@@ -11,17 +11,17 @@ from sme_registry.task.draw import agents, observed_channels
 
 LIMIT_VARIABLE = "SME_MEMORY_LIMIT_GIB"
 DEFAULT_LIMIT_GIB = 4.0
-_WORKSPACE = 5  # of the largest matrix: raw bits, normals, Q, R's and LAPACK's copies at once
+_WORKSPACE = 10  # of the largest matrix: raw bits, W's integers, normals, Q, R, LAPACK's copies
 
 
 def parameter_bytes(spec: SMESpec) -> int:
     """The bytes of a task's arrays once it is drawn, float64."""
-    return 8 * sum(out * (inputs + 1) for inputs, out in _shapes(spec))
+    return 8 * sum(count * out * (inputs + 1) for inputs, out, count in _shapes(spec))
 
 
 def peak_bytes(spec: SMESpec) -> int:
     """An upper estimate of the bytes needed while a task is drawn."""
-    largest = max(out * inputs for inputs, out in _shapes(spec))
+    largest = max(out * inputs for inputs, out, _ in _shapes(spec))
     return parameter_bytes(spec) + 8 * _WORKSPACE * largest
 
 
@@ -58,10 +58,15 @@ def refuse_above_limit(needed: int, what: str, remedy: str) -> None:
         )
 
 
-def _shapes(spec: SMESpec) -> list[tuple[int, int]]:
-    """`(inputs, outputs)` of every matrix of a task; inner layers of one agent only once each."""
-    shapes = [(spec.state_dim, spec.action_dim)]
+def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
+    """`(inputs, outputs, how many)` of every matrix of a task, without a list of its layers."""
+    H, inner = spec.hidden_width, spec.complexity - 1
+    yield spec.state_dim, spec.action_dim, 1
     for agent, observed in zip(agents(spec), observed_channels(spec), strict=True):
-        widths = [len(observed), *[spec.hidden_width] * (spec.complexity - 1), agent.action_dim]
-        shapes += list(itertools.pairwise(widths))
-    return shapes
+        if inner == 0:
+            yield len(observed), agent.action_dim, 1
+        else:
+            yield len(observed), H, 1
+            if inner > 1:
+                yield H, H, inner - 1
+            yield H, agent.action_dim, 1

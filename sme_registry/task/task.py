@@ -23,11 +23,12 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from sme_registry.errors import ActionError, StateError
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, as_spec
 from sme_registry.task import draw, fingerprint, memory
 from sme_registry.task.draw import Array, Layer
 
 _CACHED_BYTES = 2**24
+_LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class Task:
         Raises:
           StateError, ActionError: wrong shape or not finite.
         """
-        s, a = self._states(s), self._actions(a)
+        s, a = self._pairs(s, a)
         y = s + self.b
         for i in range(self.spec.action_dim):
             y = y + self.W[i] * a[..., i, None].astype(np.float32).astype(np.float64)
@@ -97,7 +98,8 @@ class Task:
         Raises:
           StateError, ActionError: wrong shape or not finite.
         """
-        return self.similarity_of(self._actions(a), self.optimal_action(s))
+        s, a = self._pairs(s, a)
+        return self.similarity_of(a, self.policy(s))
 
     def step_reward(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """r, `[B]` or a scalar, in [0, 1]: the step reward after the threshold r_min.
@@ -134,6 +136,16 @@ class Task:
             actions.append(x)
         return np.concatenate(actions, axis=-1) if len(actions) > 1 else actions[0]
 
+    def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
+        """States and actions that belong together; one of them may be single beside a batch."""
+        s, a = self._states(s), self._actions(a)
+        if s.ndim == a.ndim == 2 and len(s) != len(a):
+            raise ActionError(
+                f"action of shape {a.shape}: must be [{len(s)}, {a.shape[1]}], one action for each "
+                f"of the {len(s)} states."
+            )
+        return s, a
+
     def _states(self, s: npt.ArrayLike) -> Array:
         return _checked(s, self.spec.state_dim, "state", StateError)
 
@@ -144,7 +156,10 @@ class Task:
 def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception]) -> Array:
     """`values` as float64 of shape `[..., width]`, finite."""
     try:
-        array = np.asarray(values, dtype=np.float64)
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
+            raise TypeError
+        array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError):
         raise error(f"{what}={values!r:.80}: must be an array of {width} numbers.") from None
     if array.ndim not in (1, 2) or array.shape[-1] != width:
@@ -152,8 +167,11 @@ def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception
             f"{what} of shape {array.shape}: must be [{width}] or [B, {width}] "
             f"(this task's {what}_dim is {width})."
         )
-    if not np.isfinite(array).all():
-        raise error(f"{what}: has NaN or infinite entries. Every entry must be a finite number.")
+    if not (np.abs(array) < _LARGEST).all():
+        raise error(
+            f"{what}: has NaN or infinite entries. Every entry must be a finite number, and below "
+            f"{_LARGEST:g} in size."
+        )
     return array
 
 
@@ -167,19 +185,26 @@ def materialize(spec: SMESpec) -> Task:
       The task, its arrays read-only.
 
     Raises:
+      SpecError: `spec` is not an SMESpec or a mapping of its fields.
       ResourceLimitError: it would not fit in memory; the message says how much it needs.
       FingerprintMismatchError: this machine draws other numbers than the file publishes.
     """
+    spec = as_spec(spec)
     memory.refuse_above_limit(
         memory.peak_bytes(spec),
         f"A task of state_dim={spec.state_dim}, action_dim={spec.action_dim}, "
         f"complexity={spec.complexity}, hidden_width={spec.hidden_width}",
         "Make one of these smaller.",
     )
+    published = spec._fingerprint
+    if published is not None:
+        # Equal specs share one drawn task, so it must not carry what one file says of it.
+        spec = spec.model_copy()
+        spec._fingerprint = None
     small = memory.parameter_bytes(spec) <= _CACHED_BYTES
     task = _draw_cached(spec) if small else _draw(spec)
-    if spec._fingerprint is not None:
-        fingerprint.check(spec._fingerprint, task)
+    if published is not None:
+        fingerprint.check(published, task)
     return task
 
 
