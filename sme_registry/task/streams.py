@@ -16,19 +16,29 @@ from scipy.special import ndtri
 DYNAMICS_VERSION = 1
 
 
-def raw_bits(seed: int | str, name: str, count: int) -> npt.NDArray[np.uint64]:
-    """The first `count` 64-bit words of a stream, `[count]`."""
+def bit_generator(seed: int | str, name: str) -> np.random.Philox:
+    """A stream at its beginning, to be read on as far as it is needed."""
     label = f"sme-v{DYNAMICS_VERSION}/{seed}/{name}"
     key = int.from_bytes(hashlib.sha256(label.encode()).digest()[:16], "little")
-    return np.random.Philox(key=key).random_raw(count)
+    return np.random.Philox(key=key)
 
 
-def uniform(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:
-    """Uniform numbers of a stream in the open interval (0, 1), `[count]`.
+def raw_bits(seed: int | str, name: str, count: int) -> npt.NDArray[np.uint64]:
+    """The first `count` 64-bit words of a stream, `[count]`."""
+    return bit_generator(seed, name).random_raw(count)
+
+
+def to_uniform(bits: npt.NDArray[np.uint64]) -> npt.NDArray[np.float64]:
+    """64-bit words as uniform numbers in the open interval (0, 1), of the same shape.
 
     u = (⌊bits / 2¹²⌋ + ½) · 2⁻⁵², which is exact, symmetric about ½ and never 0 or 1.
     """
-    return ((raw_bits(seed, name, count) >> np.uint64(12)).astype(np.float64) + 0.5) * 2.0**-52
+    return ((bits >> np.uint64(12)).astype(np.float64) + 0.5) * 2.0**-52
+
+
+def uniform(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:
+    """The first `count` uniform numbers of a stream, `[count]`; see `to_uniform`."""
+    return to_uniform(raw_bits(seed, name, count))
 
 
 def gaussian(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:

@@ -1,0 +1,177 @@
+"""`evaluate`: a policy, a task and a protocol to a report. One pass of the oracle, batch by batch.
+
+Source: METHOD, section 3. What is held at once is a batch and the states of WD that the reference
+policies are fitted on, however many states a protocol asks for.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sme_registry.compiled import Engine, engine
+from sme_registry.errors import SpecError
+from sme_registry.evaluation import references
+from sme_registry.evaluation.policies import as_policy
+from sme_registry.evaluation.regions import Observations, Uniform, observations
+from sme_registry.evaluation.report import EvaluationReport
+from sme_registry.evaluation.score import Score
+from sme_registry.spec import EvaluationProtocol, ProtocolFile, SMESpec, catalogue
+from sme_registry.spec.resolve import resolve
+from sme_registry.task import Task, materialize
+from sme_registry.task.draw import Array
+
+Progress = Callable[[int, int], None]
+
+
+def evaluate(
+    policy: Any,
+    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str],
+    protocol: EvaluationProtocol | dict[str, Any] | str | os.PathLike[str] = "paper-v1",
+    *,
+    action_range: str | None = None,
+    name: str | None = None,
+    progress: Progress | None = None,
+) -> EvaluationReport:
+    """Judge a policy within and out of distribution, exactly.
+
+    Args:
+      policy: a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, a
+        Stable-Baselines3 model, or the path of such a model's .zip (which can run code of whoever
+        made it). Models act deterministically. Actions are clipped as the environment clips them.
+      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
+      protocol: a protocol, its fields, its name in the catalogue, or the path of its file.
+      action_range: what the policy's actions are in, "unit" for [0, 1] or "symmetric" for
+        [−1, 1]; None takes an SB3 model's own action space, and "unit" for a callable.
+      name: what the report calls the policy.
+      progress: called after each batch with the states done and the states in all.
+
+    Returns:
+      The report, with the reference policies on the same states.
+
+    Raises:
+      UnknownNameError, SpecError: no such task or protocol, or a field out of range.
+      PolicyError: the policy cannot be loaded, or its actions cannot be used.
+      OptionError: `action_range` is none, or a shell is too thin for float32 observations.
+      ResourceLimitError: the task would not fit in memory.
+    """
+    spec = resolve(spec_or_id)
+    protocol = resolve_protocol(protocol)
+    asked = as_policy(policy, spec, action_range=action_range, name=name)
+    task = materialize(spec)
+    fast = engine(task)
+
+    regions = []
+    fitted: references.References | None = None
+    total, done = protocol.states_per_region * len(protocol.edges), 0
+    for region in range(len(protocol.edges)):
+        batches = _solved(task, fast, protocol, region)
+        if fitted is None:
+            fitted, batches = _fitted_on(batches, spec)
+        scores = {who: Score(spec.action_dim) for who in (_POLICY, *references.NAMES)}
+        random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
+        for batch in batches:
+            acted = asked(batch.observations)
+            a = np.clip(acted, 0.0, 1.0)
+            scores[_POLICY].add(a, batch.optimal, int(np.count_nonzero(a != acted)))
+            others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
+            for who, a in others.items():
+                scores[who].add(a, batch.optimal)
+            done += len(batch.s)
+            if progress is not None:
+                progress(done, total)
+        regions.append(scores)
+
+    reports = {
+        who: tuple(
+            scores[who].report(region, edges, scores["constant_half"], regions[0][who])
+            for region, (edges, scores) in enumerate(zip(protocol.edges, regions, strict=True))
+        )
+        for who in regions[0]
+    }
+    return EvaluationReport(
+        policy=asked.name,
+        action_range=asked.action_range,
+        spec=spec,
+        spec_digest=spec.digest,
+        protocol=protocol,
+        protocol_digest=protocol.digest,
+        regions=reports.pop(_POLICY),
+        references=reports,
+        versions=_versions(fast),
+    )
+
+
+def resolve_protocol(
+    protocol: EvaluationProtocol | dict[str, Any] | str | os.PathLike[str],
+) -> EvaluationProtocol:
+    """The protocol that is meant: itself, its fields, its name in the catalogue, or a file's path.
+
+    Raises:
+      UnknownNameError: nothing has this name; says what is near.
+      SpecError: a file or mapping is not a valid protocol.
+    """
+    if isinstance(protocol, EvaluationProtocol):
+        return protocol
+    if isinstance(protocol, dict):
+        return EvaluationProtocol.parse(protocol)
+    if not isinstance(protocol, str | os.PathLike):
+        raise SpecError(f"protocol={protocol!r:.80}: must be a protocol, its name or its path.")
+    path = os.fspath(protocol)
+    if path.endswith(".json") or (os.sep in path and os.path.isfile(path)):
+        return ProtocolFile.read(path).protocol
+    return catalogue.find(ProtocolFile, path).protocol
+
+
+_POLICY = ""  # the key of the policy in question among the references' names
+
+
+class _Batch(NamedTuple):
+    """States and their optimal actions: `[B, S + 2]` float32, `[B, S]`, `[B, A]`."""
+
+    observations: Observations
+    s: Array
+    optimal: Array
+
+
+def _solved(
+    task: Task, fast: Engine, protocol: EvaluationProtocol, region: int
+) -> Iterator[_Batch]:
+    for batch in observations(protocol, region, task.spec):
+        # A copy, which a policy that writes into its observations cannot reach.
+        s = batch[:, : task.spec.state_dim].astype(np.float64)
+        yield _Batch(batch, s, fast.optimal_action(s))
+
+
+def _fitted_on(
+    batches: Iterator[_Batch], spec: SMESpec
+) -> tuple[references.References, Iterator[_Batch]]:
+    """The references fitted on the first states, and all batches again from the first one."""
+    wanted = references.fit_states(spec)
+    kept: list[_Batch] = []
+    while sum(len(batch.s) for batch in kept) < wanted and (batch := next(batches, None)):
+        kept.append(batch)
+    s = np.concatenate([batch.s for batch in kept])[:wanted]
+    optimal = np.concatenate([batch.optimal for batch in kept])[:wanted]
+    return references.fit(s, optimal), itertools.chain(kept, batches)
+
+
+def _versions(fast: Engine) -> dict[str, str]:
+    """What the numbers depend on; a policy's own libraries only where it brought them in."""
+    from sme_registry import __version__
+
+    packages = ["numpy", "scipy", "gymnasium"]
+    packages += ["numba"] if fast.backend == "numba" else []
+    packages += [name for name in ("torch", "stable_baselines3") if name in sys.modules]
+    return {
+        "sme_registry": __version__,
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in packages},
+    }
