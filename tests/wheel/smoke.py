@@ -1,7 +1,7 @@
 """Does the installed wheel work, away from its source tree? `.ci/run` runs this; pytest does not.
 
-    python smoke.py numba        where the extra `fast` is installed
-    python smoke.py numpy        where only the core is
+python smoke.py numba        where the extra `fast` is installed
+python smoke.py numpy        where only the core is
 """
 
 from __future__ import annotations

@@ -1,0 +1,87 @@
+"""The documentation is true: its code runs, its links lead somewhere, its lists are complete."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sme_registry.spec import EnvFile, SMESpec, SuiteFile
+from sme_registry.spec.catalogue import names
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/specs.md"])
+def test_the_python_of_a_page_runs_from_top_to_bottom(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
+    assert blocks
+    namespace: dict[str, Any] = {"__name__": "page"}
+    for block in blocks:
+        exec(compile(block, page, "exec"), namespace)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_relative_link_leads_to_a_file(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
+    missing = [link for link in links if not (page.parent / link).exists()]
+    assert not missing
+
+
+def test_the_catalogue_page_is_what_make_docs_writes() -> None:
+    generate = runpy.run_path(str(ROOT / "docs" / "generate.py"))
+    assert generate["PAGE"].read_text() == generate["catalogue"](), "run `make docs`"
+
+
+def test_the_readme_names_every_environment_and_suite() -> None:
+    readme = (ROOT / "README.md").read_text()
+    table = readme.split("| `SME/…-v1` |")[1].split("\n\n")[0]
+    named = {
+        f"{expanded}-v1"
+        for pattern in re.findall(r"`([A-Za-z0-9{},]+)`", "\n".join(first_column(table)))
+        for expanded in expand(pattern)
+    }
+    assert named == set(names(EnvFile))
+    assert all(f"`{suite}`" in readme for suite in names(SuiteFile))
+
+
+def test_the_table_of_fields_has_every_field_and_its_default() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| .* \|$", specs_page(), re.M)
+    documented = {name: default.strip("`") for name, default in rows}
+    fields = {
+        name: str(field.default)
+        for name, field in SMESpec.model_fields.items()
+        if name not in ("schema_version", "team")
+    }
+    assert {name: number(text) for name, text in documented.items()} == {
+        name: number(text) for name, text in fields.items()
+    }
+
+
+def specs_page() -> str:
+    return (ROOT / "docs" / "specs.md").read_text()
+
+
+def number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def first_column(table: str) -> list[str]:
+    return [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+
+
+def expand(pattern: str) -> list[str]:
+    """`Plane{1,10}` to `Plane1` and `Plane10`, as a shell does."""
+    parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
+    return ["".join(combination) for combination in product(*parts)]
