@@ -306,9 +306,8 @@ def _mixed(optimal: npt.NDArray[Any], rng: np.random.Generator) -> npt.NDArray[n
 
 def _action(env: Any, rng: np.random.Generator) -> npt.NDArray[np.float32]:
     action = _mixed(env.task.optimal_action(env.state), rng)
-    if env.action_space.low[0] < 0.0:
-        action = np.float32(2.0) * action - np.float32(1.0)
-    return action
+    symmetric = bool(env.action_space.low[0] < 0.0)
+    return (2.0 * action - 1.0).astype(np.float32) if symmetric else action
 
 
 def _record(env: Any, reset_seed: int, seed: int) -> list[Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+from enum import Enum
 
+import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from sme_registry.spec import SMESpec
@@ -17,18 +19,34 @@ def content_id(spec: SMESpec) -> str:
 
 
 def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | None:
-    """Gymnasium's spec of an environment; one with overridden fields takes its content's id.
+    """Gymnasium's spec of an environment, all JSON; a derived task takes its content's id.
 
     Whoever makes `SME/Default-v1` with `complexity=10` has another task, and it must not be
     recorded under the name it was derived from.
+
+    Args:
+      env_spec: what Gymnasium says the environment was made from.
+      spec: the spec that is run.
     """
-    if env_spec is None or not SMESpec.model_fields.keys() & env_spec.kwargs.keys():
-        return env_spec
-    derived = copy.deepcopy(env_spec)
-    kept = {k: v for k, v in env_spec.kwargs.items() if k not in SMESpec.model_fields}
-    derived.kwargs = {**kept, "spec": spec.plain()}
-    derived.id = content_id(spec)
-    # EnvSpec splits the id into these once, when it is made.
-    derived.name = derived.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
-    derived.version = DYNAMICS_VERSION
-    return derived
+    if env_spec is None:
+        return None
+    fields = SMESpec.model_fields.keys()
+    registered = gymnasium.registry.get(env_spec.id)
+    task = env_spec.kwargs.get("spec")
+    is_named = registered is None or registered.kwargs.get("spec") == task
+    named = is_named and not fields & env_spec.kwargs.keys()
+
+    plain = copy.deepcopy(env_spec)
+    plain.kwargs = {
+        key: value.value if isinstance(value, Enum) else value
+        for key, value in plain.kwargs.items()
+        if key not in fields
+    }
+    if not named or not isinstance(task, str | dict):
+        plain.kwargs["spec"] = spec.plain()
+    if not named:
+        plain.id = content_id(spec)
+        # EnvSpec splits the id into these once, when it is made.
+        plain.name = plain.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
+        plain.version = DYNAMICS_VERSION
+    return plain

@@ -1,0 +1,151 @@
+"""What an environment is called: ids, EnvSpecs, and that nothing pretends to be a named task."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+import sme_registry
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+
+ROOT = Path(sme_registry.__file__).resolve().parents[1]
+
+
+def fresh_python(code: str) -> str:
+    """What a new interpreter prints that imports nothing beforehand; warnings are errors."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_module_and_id_make_the_task_in_a_fresh_process() -> None:
+    digest = fresh_python(
+        "import gymnasium\n"
+        "env = gymnasium.make('sme_registry:SME/Complexity2-v1')\n"
+        "print(env.unwrapped.sme_spec.digest, end='')"
+    )
+    assert digest == sme_registry.load("Complexity2").digest
+
+
+def test_a_json_env_spec_makes_the_task_in_a_process_that_never_heard_of_it() -> None:
+    sent = sme_registry.env_spec(SMESpec(complexity=3, seed=11), action_range="symmetric").to_json()
+    answer = fresh_python(
+        "import gymnasium, json\n"
+        f"spec = gymnasium.envs.registration.EnvSpec.from_json({sent!r})\n"
+        "env = gymnasium.make(spec)\n"
+        "print(json.dumps([env.unwrapped.sme_spec.digest, float(env.action_space.low[0])]), end='')"
+    )
+    assert json.loads(answer) == [SMESpec(complexity=3, seed=11).digest, -1.0]
+
+
+def test_overrides_give_the_derived_digest_and_do_not_keep_the_name() -> None:
+    env = gymnasium.make("SME/Default-v1", complexity=10, seed=3)
+    derived = sme_registry.load("Default").derive(complexity=10, seed=3)
+    assert env.unwrapped.sme_spec == derived
+    assert env.spec is not None
+    assert env.spec.id == f"SME/{derived.content_name}-v1"
+    assert env.spec.name == derived.content_name
+    again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.sme_spec.digest == derived.digest
+    assert again.spec is not None
+    assert again.spec.id == env.spec.id
+
+
+def test_arguments_that_do_not_change_the_task_keep_its_name() -> None:
+    env = gymnasium.make("SME/Default-v1", action_range="symmetric", render_mode="rgb_array")
+    assert env.spec is not None
+    assert env.spec.id == "SME/Default-v1"
+
+
+def test_a_native_batch_with_overrides_does_not_keep_the_name_either() -> None:
+    env = gymnasium.make_vec("SME/Default-v1", num_envs=2, horizon=5)
+    assert env.spec is not None
+    assert env.spec.id == f"SME/{env.unwrapped.sme_spec.content_name}-v1"
+    again = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.num_envs == 2
+    assert again.unwrapped.sme_spec == env.unwrapped.sme_spec
+
+
+def test_a_batch_in_any_mode_has_an_env_spec_that_is_json() -> None:
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    env = gymnasium.make_vec("SME/Default-v1", num_envs=2, autoreset_mode=mode)
+    assert env.spec is not None
+    again: Any = gymnasium.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.metadata["autoreset_mode"] is mode
+
+
+def test_another_spec_given_to_a_named_id_does_not_take_its_name(tmp_path: Path) -> None:
+    other = SMESpec(seed=9)
+    path = sme_registry.save(other, tmp_path / "Mine.json")
+    for given in (other, other.plain(), str(path), path):
+        env = gymnasium.make("SME/Default-v1", spec=given)
+        assert env.spec is not None
+        assert env.spec.id == f"SME/{other.content_name}-v1"
+        path.unlink(missing_ok=True)  # what is sent must not need the sender's files
+        again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+        assert again.unwrapped.sme_spec == other
+        sme_registry.save(other, path)
+
+
+def test_an_unregistered_spec_goes_by_its_content() -> None:
+    spec = SMESpec(k=4, seed=5)
+    env = sme_registry.make(spec)
+    assert env.spec is not None
+    assert env.spec.id == f"SME/{spec.content_name}-v1"
+    assert env.spec.id not in gymnasium.registry
+
+
+def test_the_registry_is_not_changed_by_making_a_derived_task() -> None:
+    before = copy.deepcopy(gymnasium.registry["SME/Default-v1"])
+    gymnasium.make("SME/Default-v1", seed=8)
+    assert gymnasium.registry["SME/Default-v1"] == before
+
+
+def test_no_catalogue_id_carries_a_time_limit() -> None:
+    limits = {
+        registered.max_episode_steps
+        for env_id, registered in gymnasium.registry.items()
+        if env_id.startswith("SME/")
+    }
+    assert limits == {None}
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "words"),
+    [
+        ({"complexity": 0}, SpecError, "complexity=0"),
+        ({"complexty": 2}, SpecError, "complexity"),
+        ({"action_range": "centred"}, OptionError, "'unit' or 'symmetric'"),
+        ({"render_mode": "ansi"}, OptionError, "'rgb_array'"),
+    ],
+)
+def test_making_with_a_bad_argument_is_a_typed_error(
+    kwargs: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        sme_registry.envs.SMEEnv("Default", **kwargs)
+    if "render_mode" not in kwargs:
+        with pytest.raises(error, match=words):
+            sme_registry.envs.SMEVectorEnv("Default", 2, **kwargs)
+
+
+def test_an_unknown_name_says_what_is_near() -> None:
+    with pytest.raises(UnknownNameError, match="Complexity10"):
+        sme_registry.make("Complexty10")

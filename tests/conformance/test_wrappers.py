@@ -1,0 +1,170 @@
+"""The wrappers that people put around environments work on these, and none changes the task."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.wrappers import vector as vector_wrappers
+
+import sme_registry
+from sme_registry.errors import WrapperError
+
+T = 8
+LOW, HIGH = np.float32(-1.0), np.float32(1.0)
+AROUND_SINGLES = {
+    "Autoreset": wrappers.Autoreset,
+    "ClipAction": wrappers.ClipAction,
+    "ClipReward": lambda env: wrappers.ClipReward(env, 0.0, 1.0),
+    "DelayObservation": lambda env: wrappers.DelayObservation(env, 1),
+    "FlattenObservation": wrappers.FlattenObservation,
+    "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
+    "NormalizeObservation": wrappers.NormalizeObservation,
+    "NormalizeReward": wrappers.NormalizeReward,
+    "OrderEnforcing": wrappers.OrderEnforcing,
+    "PassiveEnvChecker": wrappers.PassiveEnvChecker,
+    "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
+    "RescaleAction": lambda env: wrappers.RescaleAction(env, LOW, HIGH),
+    "RescaleObservation": lambda env: wrappers.RescaleObservation(env, LOW, HIGH),
+    "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
+    "TimeAwareObservation": lambda env: wrappers.TimeAwareObservation(wrappers.TimeLimit(env, T)),
+    "TimeLimit": lambda env: wrappers.TimeLimit(env, T),
+    "TransformAction": lambda env: wrappers.TransformAction(env, np.sqrt, env.action_space),
+    "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: 2.0 * reward),
+}
+AROUND_BATCHES = {
+    "ClipAction": vector_wrappers.ClipAction,
+    "FlattenObservation": vector_wrappers.FlattenObservation,
+    "NormalizeObservation": vector_wrappers.NormalizeObservation,
+    "NormalizeReward": vector_wrappers.NormalizeReward,
+    "RecordEpisodeStatistics": vector_wrappers.RecordEpisodeStatistics,
+    "RescaleAction": lambda env: vector_wrappers.RescaleAction(env, LOW, HIGH),
+    "TransformReward": lambda env: vector_wrappers.TransformReward(env, lambda reward: -reward),
+    "DictInfoToList": vector_wrappers.DictInfoToList,
+}
+
+
+@pytest.mark.parametrize("name", AROUND_SINGLES)
+def test_an_episode_runs_whole_within_a_common_wrapper(name: str) -> None:
+    env = AROUND_SINGLES[name](sme_registry.make("Default", horizon=T, k=3))
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    env.action_space.seed(0)
+    for t in range(1, T + 1):
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(reward)
+        assert not terminated
+        assert truncated == (t == T)
+        assert 0.0 <= info["regret"] <= 1.0
+
+
+def test_recorded_statistics_are_the_payouts_return() -> None:
+    env = wrappers.RecordEpisodeStatistics(sme_registry.make("Default", horizon=T, k=3))
+    env.reset(seed=0)
+    earned = 0.0
+    for _ in range(T):
+        _, _, _, _, info = env.step(np.full(4, 0.5, np.float32))
+        earned += info["step_reward"]
+    assert info["episode"]["r"] == pytest.approx(earned, abs=1e-9)
+    assert info["episode"]["l"] == T
+
+
+@pytest.mark.parametrize("name", AROUND_BATCHES)
+def test_a_batch_runs_on_over_episodes_within_a_common_wrapper(name: str) -> None:
+    env = AROUND_BATCHES[name](sme_registry.make_vec("Default", 3, horizon=T, k=3))
+    observation, _ = env.reset(seed=0)
+    env.action_space.seed(0)
+    ends = 0
+    for _ in range(3 * T):
+        observation, _, _, truncated, _ = env.step(env.action_space.sample())
+        assert observation.shape == env.observation_space.shape
+        ends += int(truncated.sum())
+    assert ends == 6
+
+
+def test_recorded_statistics_of_a_batch_are_those_of_its_singles() -> None:
+    batch = vector_wrappers.RecordEpisodeStatistics(
+        sme_registry.make_vec("Default", 2, horizon=T, autoreset_mode="SameStep")
+    )
+    batch.reset(seed=5)
+    single = wrappers.RecordEpisodeStatistics(sme_registry.make("Default", horizon=T))
+    single.reset(seed=6)
+    action = np.full((2, 4), 0.25, np.float32)
+    for _ in range(T):
+        _, _, _, _, infos = batch.step(action)
+        _, _, _, _, info = single.step(action[0])
+    assert infos["episode"]["r"][1] == pytest.approx(info["episode"]["r"], abs=1e-6)
+    assert infos["episode"]["l"].tolist() == [T, T]
+
+
+def test_a_time_limit_of_the_horizon_or_more_changes_nothing() -> None:
+    for limit in (T, 10 * T):
+        env = gymnasium.make("SME/Default-v1", horizon=T, k=5, max_episode_steps=limit)
+        env.reset(seed=0)
+        returned, steps, ended = 0.0, 0, False
+        while not ended:
+            action = env.unwrapped.task.optimal_action(env.unwrapped.state)
+            _, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
+            returned, steps, ended = returned + float(reward), steps + 1, terminated or truncated
+        assert steps == T
+        assert returned == pytest.approx(T, abs=1e-3)
+
+
+@pytest.mark.parametrize("outside", [None, wrappers.Autoreset, wrappers.RecordEpisodeStatistics])
+def test_a_time_limit_below_the_horizon_is_refused_at_reset(outside: Any) -> None:
+    made = gymnasium.make("SME/Default-v1", horizon=T, max_episode_steps=T - 1)
+    by_hand = wrappers.TimeLimit(sme_registry.make("Default", horizon=T), T - 1)
+    bare = wrappers.TimeLimit(sme_registry.envs.SMEEnv("Default", horizon=T), T - 1)
+    for env in (made, by_hand, bare):
+        wrapped = env if outside is None else outside(env)
+        with pytest.raises(WrapperError, match=rf"max_episode_steps={T - 1}.*horizon={T - 1}"):
+            wrapped.reset(seed=0)
+
+
+@pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
+def test_a_time_limit_below_the_horizon_is_refused_in_a_batch(mode: str) -> None:
+    with pytest.raises(WrapperError, match=f"max_episode_steps={T - 1}"):
+        gymnasium.make_vec(
+            "SME/Default-v1", 2, vectorization_mode=mode, horizon=T, max_episode_steps=T - 1
+        ).reset()
+
+
+def test_a_time_limit_of_the_horizon_is_taken_by_a_native_batch() -> None:
+    env = gymnasium.make_vec("SME/Default-v1", 2, horizon=T, max_episode_steps=T)
+    env.reset(seed=0)
+    for _ in range(T):
+        truncated = env.step(np.zeros((2, 4), np.float32))[3]
+    assert truncated.all()
+
+
+def test_frames_are_collected_and_can_be_observed() -> None:
+    pytest.importorskip("pygame")
+    collected = wrappers.RenderCollection(
+        sme_registry.make("Default", horizon=T, render_mode="rgb_array")
+    )
+    collected.reset(seed=0)
+    collected.step(np.zeros(4, np.float32))
+    frames = collected.render()
+    assert len(frames) == 2
+    assert not np.array_equal(frames[0], frames[1])
+    pixels = wrappers.AddRenderObservation(
+        sme_registry.make("Default", horizon=T, render_mode="rgb_array"), render_only=True
+    )
+    assert pixels.observation_space.contains(pixels.reset(seed=0)[0])
+
+
+def test_a_video_is_recorded(tmp_path: Any) -> None:
+    pytest.importorskip("moviepy")
+    pytest.importorskip("pygame")
+    env = wrappers.RecordVideo(
+        sme_registry.make("Default", horizon=T, render_mode="rgb_array"), str(tmp_path)
+    )
+    env.reset(seed=0)
+    for _ in range(T):
+        env.step(np.zeros(4, np.float32))
+    env.close()
+    assert list(tmp_path.glob("*.mp4"))
