@@ -1,0 +1,253 @@
+"""`evaluate`: exact at both ends of the scale, reproducible, the same on every back-end."""
+
+from __future__ import annotations
+
+import inspect
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import sme_registry
+from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
+from sme_registry.errors import (
+    DigestMismatchError,
+    MalformedDocumentError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.evaluation import references, regions
+from sme_registry.spec import EvaluationProtocol, ProtocolFile
+
+SPEC = SMESpec(state_dim=4, action_dim=3, complexity=3)
+PROTOCOL = EvaluationProtocol(states_per_region=3_000)
+
+
+def half(observations):
+    return np.full((len(observations), 3), 0.5)
+
+
+def linear(observations):
+    return 0.2 + 0.6 * observations[:, :3]
+
+
+def optimal_of(spec):
+    task = materialize(spec)
+    return lambda observations: task.optimal_action(observations[:, : spec.state_dim])
+
+
+@pytest.fixture(scope="module")
+def report():
+    return evaluate(linear, SPEC, PROTOCOL)
+
+
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+@pytest.mark.parametrize("complexity", [1, 3, 10])
+def test_optimal_policy_has_similarity_1_and_regret_0(monkeypatch, backend, complexity):
+    if backend == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", backend)
+    spec = SPEC.derive(complexity=complexity)
+    for region in evaluate(optimal_of(spec), spec, PROTOCOL).regions:
+        assert region.similarity == pytest.approx(1.0, abs=1e-9)
+        assert region.normalised_regret == pytest.approx(0.0, abs=1e-9)
+        assert region.similarity_sd < 1e-9
+        assert region.decay == pytest.approx(0.0, abs=1e-9)
+
+
+def test_constant_half_has_normalised_regret_of_exactly_1():
+    for region in evaluate(half, SPEC, PROTOCOL).regions:
+        assert region.normalised_regret == 1.0
+        assert [channel.normalised_regret for channel in region.channels] == [1.0] * 3
+
+
+def test_numbers_are_those_of_the_definition(report):
+    task = materialize(SPEC)
+    inside = None
+    for index, region in enumerate(report.regions):
+        o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
+        s, a = o[:, :4].astype(np.float64), np.clip(linear(o), 0.0, 1.0).astype(np.float64)
+        optimal = task.optimal_action(s)
+        similarity = task.similarity(s, a)
+        inside = similarity.mean() if inside is None else inside
+        missed = np.abs(a - optimal)
+        floor = np.abs(0.5 - optimal)
+        assert (region.epsilon_low, region.epsilon_high) == PROTOCOL.edges[index]
+        assert region.states == 3_000
+        assert region.similarity == pytest.approx(similarity.mean(), abs=1e-12)
+        assert region.similarity_sd == pytest.approx(similarity.std(ddof=1), abs=1e-12)
+        assert region.mae == pytest.approx(missed.mean(), abs=1e-12)
+        assert region.normalised_regret == pytest.approx(missed.mean() / floor.mean(), abs=1e-12)
+        assert region.decay == pytest.approx((inside - similarity.mean()) / inside, abs=1e-12)
+        assert region.decay_points == pytest.approx(100 * (inside - similarity.mean()), abs=1e-9)
+        assert region.clipped_share == np.mean((linear(o) < 0) | (linear(o) > 1))
+        for channel, mae, half_mae in zip(
+            region.channels, missed.mean(axis=0), floor.mean(axis=0), strict=True
+        ):
+            assert channel.mae == pytest.approx(mae, abs=1e-12)
+            assert channel.normalised_regret == pytest.approx(mae / half_mae, abs=1e-12)
+
+
+def test_references_stand_in_their_known_order_within_distribution(report):
+    inside = {name: rows[0].normalised_regret for name, rows in report.references.items()}
+    assert tuple(inside) == references.NAMES
+    assert inside["optimal"] == 0.0
+    assert 0.0 < inside["linear_least_squares"] < inside["best_constant"] <= 1.0
+    assert inside["constant_half"] == 1.0 < inside["uniform_random"]
+
+
+def test_references_have_every_region(report):
+    edges = [(region.epsilon_low, region.epsilon_high) for region in report.regions]
+    for rows in report.references.values():
+        assert [(row.epsilon_low, row.epsilon_high) for row in rows] == edges
+        assert all(row.clipped_share == 0.0 for row in rows)
+
+
+def test_the_same_seed_gives_the_same_report_and_another_seed_another(report):
+    assert evaluate(linear, SPEC, PROTOCOL) == report
+    other = evaluate(linear, SPEC, EvaluationProtocol(states_per_region=3_000, seed=1))
+    assert other.regions[0].similarity != report.regions[0].similarity
+    assert other.regions[0].similarity == pytest.approx(report.regions[0].similarity, abs=0.02)
+
+
+def numbers(report):
+    for rows in (report.regions, *report.references.values()):
+        for row in rows:
+            plain = row.plain()
+            yield from (plain[key] for key in plain if key not in ("name", "channels"))
+            for channel in plain["channels"]:
+                yield from channel.values()
+
+
+@pytest.mark.parametrize("rows", [1_000, 997, 100_000])
+def test_batches_of_any_size_give_the_same_numbers(monkeypatch, report, rows):
+    monkeypatch.setattr(regions, "BATCH_ROWS", rows)
+    monkeypatch.setattr(references, "FIT_STATES", 2**16)
+    other = evaluate(linear, SPEC, PROTOCOL)
+    assert list(numbers(other)) == pytest.approx(list(numbers(report)), abs=1e-11)
+
+
+def test_the_fit_sees_as_many_states_whatever_the_batches(monkeypatch):
+    monkeypatch.setattr(references, "FIT_STATES", 1_500)
+    expected = list(numbers(evaluate(linear, SPEC, PROTOCOL)))
+    monkeypatch.setattr(regions, "BATCH_ROWS", 400)
+    assert list(numbers(evaluate(linear, SPEC, PROTOCOL))) == pytest.approx(expected, abs=1e-11)
+
+
+def test_back_ends_agree(monkeypatch, report):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", "numpy")
+    plain = evaluate(linear, SPEC, PROTOCOL)
+    assert "numba" not in plain.versions
+    assert "numba" in report.versions
+    assert list(numbers(plain)) == pytest.approx(list(numbers(report)), abs=1e-11)
+
+
+def test_teams_are_judged_by_their_joint_action():
+    agents = [{"action_dim": 1, "observes": [0, 1]}, {"action_dim": 2}]
+    spec = SMESpec(state_dim=4, action_dim=3, team={"agents": agents})
+    for region in evaluate(optimal_of(spec), spec, PROTOCOL).regions:
+        assert region.similarity == pytest.approx(1.0, abs=1e-9)
+
+
+def test_progress_runs_from_the_first_batch_to_all_states(monkeypatch):
+    monkeypatch.setattr(regions, "BATCH_ROWS", 1_000)
+    seen = []
+    evaluate(half, SPEC, PROTOCOL, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(done, 18_000) for done in range(1_000, 18_001, 1_000)]
+
+
+def test_memory_does_not_grow_with_the_number_of_states(monkeypatch):
+    import tracemalloc
+
+    def peak(states):
+        protocol = EvaluationProtocol(states_per_region=states, epsilons=(0.5,))
+        tracemalloc.start()
+        evaluate(half, SPEC, protocol)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    monkeypatch.setattr(regions, "BATCH_ROWS", 500)
+    monkeypatch.setattr(references, "FIT_STATES", 500)
+    peak(2_000)  # what is allocated once
+    assert peak(20_000) < 1.1 * peak(2_000)
+
+
+@pytest.mark.parametrize("given", ["quick-v1", "quick", "specs/protocols/quick-v1.json"])
+def test_a_protocol_goes_by_its_name_or_its_path(given):
+    quick = ProtocolFile.read("specs/protocols/quick-v1.json").protocol
+    assert evaluate(half, SPEC, given).protocol == quick
+
+
+def test_the_default_protocol_is_the_papers():
+    default = inspect.signature(evaluate).parameters["protocol"].default
+    paper = sme_registry.evaluation.resolve_protocol(default)
+    assert paper == EvaluationProtocol(states_per_region=50_000, epsilons=(0.2, 0.4, 0.6, 0.8, 1.0))
+
+
+def test_an_unknown_protocol_is_refused_with_the_nearest_name():
+    with pytest.raises(UnknownNameError, match="Did you mean 'paper-v1'"):
+        evaluate(half, SPEC, "papper-v1")
+    with pytest.raises(MalformedDocumentError, match="cannot be read"):
+        evaluate(half, SPEC, "nowhere/protocol.json")
+    with pytest.raises(SpecError, match="must be a protocol, its name or its path"):
+        evaluate(half, SPEC, 7)
+
+
+def test_a_report_survives_being_written_and_read(report, tmp_path):
+    path = report.write(tmp_path / "made" / "report.json")
+    again = EvaluationReport.read(path)
+    assert again == report
+    assert again.plain() == report.plain()
+
+
+def test_a_report_holds_task_and_protocol_whole_with_their_digests(report):
+    plain = report.plain()
+    assert plain["spec"] == SPEC.plain()
+    assert plain["spec_digest"] == SPEC.digest
+    assert plain["protocol"] == PROTOCOL.plain()
+    assert plain["protocol_digest"] == PROTOCOL.digest
+    assert [region["name"] for region in plain["regions"]] == [
+        "WD", "OOD 1", "OOD 2", "OOD 3", "OOD 4", "OOD 5",
+    ]  # fmt: skip
+    assert {"python", "numpy", "scipy", "gymnasium", "sme_registry"} <= plain["versions"].keys()
+
+
+@pytest.mark.parametrize("what", ["spec", "protocol"])
+def test_a_report_whose_digest_is_of_something_else_is_refused(report, tmp_path, what):
+    path = tmp_path / "report.json"
+    changed = report.model_copy(update={f"{what}_digest": "sha256:" + "0" * 64})
+    changed.write(path)
+    with pytest.raises(DigestMismatchError, match=f"{what}_digest"):
+        EvaluationReport.read(path)
+
+
+def test_a_report_with_an_unknown_or_missing_field_is_refused(report):
+    with pytest.raises(SpecError, match="unknown field"):
+        EvaluationReport.parse({**report.plain(), "extra": 1})
+    plain = report.plain()
+    del plain["regions"][0]["mae"]
+    with pytest.raises(SpecError, match="mae: missing"):
+        EvaluationReport.parse(plain)
+
+
+def rendered(report):
+    console = Console(width=80, file=io.StringIO())
+    console.print(report.table())
+    return console.file.getvalue()
+
+
+def test_the_table_fits_80_columns_and_shows_references_beside_the_policy(report):
+    text = rendered(report)
+    assert "…" not in text
+    for wanted in ("OOD 5", "linear (LSQ)", "constant ½", "random", "not comparable"):
+        assert wanted in text
+    assert f"{report.regions[0].similarity:.3f}" in text
+    assert f"{report.references['linear_least_squares'][5].normalised_regret:.3f}" in text
+
+
+def test_a_policys_name_is_not_read_as_markup(report):
+    text = rendered(evaluate(half, SPEC, "quick-v1", name="[red]x[/blue]"))
+    assert "[red]x[/blue]" in text

@@ -1,0 +1,204 @@
+"""Policies: callables, SB3 models and files, and what is refused of each."""
+
+from __future__ import annotations
+
+import zipfile
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.evaluation import as_policy, evaluate
+from sme_registry.spec import SMESpec
+
+SPEC = SMESpec(state_dim=3, action_dim=2)
+PROTOCOL = {"states_per_region": 200, "epsilons": [0.5, 1.0]}
+
+
+def constant(*action):
+    return lambda observations: np.tile(action, (len(observations), 1))
+
+
+def judged(policy, **kw):
+    return evaluate(policy, SPEC, PROTOCOL, **kw)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda o: np.zeros((len(o), 3)), r"shape \(200, 3\): must be of shape \(200, 2\)"),
+        (lambda o: np.zeros(len(o)), r"shape \(200,\): must be of shape \(200, 2\)"),
+        (lambda o: np.zeros((2, len(o))), r"must be of shape \(200, 2\)"),
+        (lambda o: 0.5, r"must be of shape \(200, 2\)"),
+        (lambda o: None, "must be numbers"),
+        (lambda o: np.full((len(o), 2), "a"), "must be numbers"),
+        (lambda o: [[0.0], [0.0, 1.0]], "must be an array of shape"),
+        (lambda o: np.full((len(o), 2), np.nan), "NaN or infinite"),
+        (lambda o: np.full((len(o), 2), np.inf), "NaN or infinite"),
+        (lambda o: 1 / 0, "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_unusable_actions_are_refused_by_what_is_wrong_with_them(returned, message):
+    with pytest.raises(PolicyError, match=message):
+        judged(returned)
+
+
+@pytest.mark.parametrize("policy", [None, 3, [0.5, 0.5], {"a": 1}])
+def test_what_is_no_policy_is_refused(policy):
+    with pytest.raises(PolicyError, match=r"must be a callable from observations \[B, 5\]"):
+        judged(policy)
+
+
+def test_a_policy_is_given_float32_observations_of_its_task():
+    seen = []
+
+    def policy(observations):
+        seen.append((observations.dtype, observations.shape))
+        return np.full((len(observations), 2), 0.5)
+
+    judged(policy)
+    assert seen == [(np.float32, (200, 5))] * 3
+
+
+def test_a_policy_that_overwrites_its_observations_changes_nothing():
+    def overwriting(observations):
+        actions = observations[:, :2].copy()
+        observations[:] = 7.0
+        return actions
+
+    assert judged(overwriting).regions == judged(lambda o: o[:, :2]).regions
+
+
+def test_actions_are_clipped_and_the_clipped_share_is_counted():
+    report = judged(constant(-0.2, 1.0))
+    assert [region.clipped_share for region in report.regions] == [0.5] * 3
+    assert report.regions == tuple(
+        region.model_copy(update={"clipped_share": 0.5})
+        for region in judged(constant(0.0, 1.0)).regions
+    )
+
+
+def test_symmetric_actions_are_rescaled():
+    unit, symmetric = (
+        judged(constant(0.25, 1.0)),
+        judged(constant(-0.5, 1.0), action_range="symmetric"),
+    )
+    assert symmetric.action_range == "symmetric"
+    assert symmetric.regions == unit.regions
+
+
+def test_an_unknown_action_range_is_refused():
+    with pytest.raises(OptionError, match="action_range='wide': must be 'unit' or 'symmetric'"):
+        judged(constant(0.5, 0.5), action_range="wide")
+
+
+def test_a_policy_is_named_after_its_function():
+    def careful(observations):
+        return np.full((len(observations), 2), 0.5)
+
+    assert as_policy(careful, SPEC).name == "careful"
+    assert as_policy(lambda o: o, SPEC).name == "policy"
+    assert as_policy(careful, SPEC, name="mine").name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("absent.zip", None, "there is no such file"),
+        ("text.zip", b"hello", "not a model that Stable-Baselines3 saved"),
+        ("policy.onnx", b"\x08\x07", "not a model that Stable-Baselines3 saved"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(PolicyError, match=message):
+        judged(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("[]", "not a model that Stable-Baselines3 saved"),
+        ("{not json", "not a model that Stable-Baselines3 saved"),
+        ('{"exploration_fraction": 0.1}', "unknown algorithm; known: PPO, SAC"),
+        ('{"clip_range": 0.2}', "cannot be loaded as a PPO model"),
+    ],
+)
+def test_an_archive_that_holds_no_known_model_is_refused(tmp_path, data, message):
+    pytest.importorskip("stable_baselines3")
+    with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
+        archive.writestr("data", data)
+    with pytest.raises(PolicyError, match=message):
+        judged(str(tmp_path / "model.zip"))
+
+
+@pytest.fixture(scope="module")
+def sb3():
+    return pytest.importorskip("stable_baselines3")
+
+
+def untrained(sb3, algorithm, action_range="unit", **kw):
+    env = sme_registry.make(SPEC, action_range=action_range)
+    return getattr(sb3, algorithm)("MlpPolicy", env, device="cpu", seed=3, **kw)
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "A2C", "SAC", "TD3", "DDPG"])
+def test_a_saved_model_scores_as_the_model_itself(sb3, algorithm, tmp_path):
+    model = untrained(sb3, algorithm, "symmetric")
+    model.save(tmp_path / "agent.zip")
+    live, saved = judged(model), judged(tmp_path / "agent.zip")
+    assert (live.policy, saved.policy) == (algorithm, "agent")
+    assert saved.regions == live.regions
+    assert live.action_range == saved.action_range == "symmetric"
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize("algorithm", ["PPO", "TD3"])
+def test_a_model_scores_as_its_deterministic_predictions(sb3, algorithm, action_range):
+    model = untrained(sb3, algorithm, action_range)
+    own = judged(model)
+    assert own.action_range == action_range
+    predicted = judged(lambda o: model.predict(o, deterministic=True)[0], action_range=action_range)
+    for mine, theirs in zip(own.regions, predicted.regions, strict=True):
+        assert mine.similarity == pytest.approx(theirs.similarity, abs=1e-12)
+
+
+def test_the_clipped_share_of_an_unsquashed_model_is_that_of_its_raw_actions(sb3):
+    model = untrained(sb3, "PPO", "unit")
+    assert judged(lambda o: model.predict(o, deterministic=True)[0]).regions[0].clipped_share == 0
+    assert 0.05 < judged(model).regions[0].clipped_share < 0.95
+
+
+def test_evaluating_a_model_leaves_its_training_mode_alone(sb3):
+    model = untrained(sb3, "PPO")
+    for mode in (True, False):
+        model.policy.set_training_mode(mode)
+        judged(model)
+        assert model.policy.training is mode
+
+
+def test_a_model_for_another_task_is_refused(sb3):
+    model = untrained(sb3, "PPO")
+    with pytest.raises(PolicyError, match=r"its observations have shape \(5,\): must be \(10,\)"):
+        evaluate(model, "Default-v1", PROTOCOL)
+    with pytest.raises(PolicyError, match=r"its actions have shape \(2,\): must be \(1,\)"):
+        evaluate(model, SPEC.derive(action_dim=1), PROTOCOL)
+
+
+def test_a_model_with_an_action_space_of_its_own_needs_its_range_said(sb3):
+    model = untrained(sb3, "PPO")
+    model.action_space = type(model.action_space)(-2.0, 2.0, (2,))
+    with pytest.raises(PolicyError, match=r"must be \[0, 1\] or \[-1, 1\] in every channel"):
+        judged(model)
+    assert judged(model, action_range="unit").action_range == "unit"
+
+
+def test_a_model_behind_vec_normalize_is_refused(sb3):
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    env = VecNormalize(DummyVecEnv([lambda: sme_registry.make(SPEC)]))
+    model = sb3.PPO("MlpPolicy", env, device="cpu")
+    with pytest.raises(PolicyError, match="VecNormalize"):
+        judged(model)
