@@ -23,7 +23,8 @@ from sme_registry.registration import (
 )
 
 if TYPE_CHECKING:
-    from sme_registry.evaluation import EvaluationReport, evaluate
+    from sme_registry.evaluation.evaluate import evaluate
+    from sme_registry.evaluation.report import EvaluationReport
     from sme_registry.spec import EvaluationProtocol, SMESpec
     from sme_registry.task import Task, materialize
 
