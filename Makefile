@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 # The first interpreter that is new enough; `make PYTHON=/path/to/python3.11 test` chooses one.
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3 python3.11 python; do \
-	$$python -c '$(NEW_ENOUGH)' 2>/dev/null && echo $$python && break; done)
+	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test check bench docs clean
@@ -42,12 +42,12 @@ clean:                 ## remove the virtual environment, caches and built packa
 
 # The stamp is written last, so an installation that was cut short is done again.
 $(INSTALLED): pyproject.toml constraints.txt
-	@$(if $(PYTHON),,echo "Python 3.11 or newer is needed, and neither python3, python3.11 nor python\
-	is. Install it, or name it: make PYTHON=/path/to/python3.11"; exit 1)
-	@$(PYTHON) -c '$(NEW_ENOUGH)' || { echo "PYTHON=$(PYTHON): must be Python 3.11 or newer and\
-	start; it is: $$($(PYTHON) --version 2>&1 | tail -n 1)"; exit 1; }
-	@$(PY) -c '$(NEW_ENOUGH)' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV);\
-	echo "No virtual environment could be made: this Python lacks its venv module or pip. On Debian\
-	and Ubuntu: apt-get install python3-venv"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed; python3, python3.11 and python" \
+	"are absent or older. Install it, or name it: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c '$(NEW_ENOUGH)' >/dev/null 2>&1 || { echo "PYTHON=$(PYTHON): must be Python 3.11" \
+	"or newer. It says: $$($(PYTHON) --version 2>&1 | tail -n 1)"; exit 1; }
+	@$(PY) -c '$(NEW_ENOUGH)' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); \
+	echo "No virtual environment could be made: this Python lacks its module venv, or pip." \
+	"On Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
 	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@touch $@
