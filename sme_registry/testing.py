@@ -114,6 +114,7 @@ def check_info(task: TaskLike, *, single: MakeSingle = SMEEnv, seed: int = 0) ->
         _expect("info at reset", info, {})
         rng = np.random.default_rng(seed)
         kept: list[tuple[Any, Any]] = []
+        spoilt: list[Any] = []
         for _ in range(min(spec.horizon, 5)):
             observation, _, terminated, truncated, info = env.step(_action(env, rng))
             _expect("info's keys", set(info), INFO_KEYS)
@@ -130,11 +131,16 @@ def check_info(task: TaskLike, *, single: MakeSingle = SMEEnv, seed: int = 0) ->
             # Whoever writes into what is handed out must not move the environment.
             kept.append((observation.copy(), optimal.copy()))
             before = env.state
-            observation[:], optimal[:] = -1.0, -1.0
+            observation[:], optimal[:] = -7.0, -7.0
+            spoilt += [observation, optimal]
             if not np.array_equal(env.state, before):
                 raise ConformanceError("Writing into what `step` returned has moved the state.")
             if terminated or truncated:
                 break
+        if any((array != -7.0).any() for array in spoilt):
+            raise ConformanceError(
+                "An array that `step` has returned is used again by a later step."
+            )
         again = single(spec, action_range=action_range)
         again.reset(seed=seed)
         rng = np.random.default_rng(seed)
@@ -301,7 +307,8 @@ def _mixed(optimal: npt.NDArray[Any], rng: np.random.Generator) -> npt.NDArray[n
     """Actions of the unit range between the optimal and the random, some a little outside."""
     shape = optimal.shape
     share = rng.uniform(0.0, 0.5, (*shape[:-1], 1))
-    return ((1 - share) * optimal + share * rng.uniform(-0.1, 1.1, shape)).astype(np.float32)
+    mixed: npt.NDArray[np.float64] = (1 - share) * optimal + share * rng.uniform(-0.1, 1.1, shape)
+    return mixed.astype(np.float32)
 
 
 def _action(env: Any, rng: np.random.Generator) -> npt.NDArray[np.float32]:
