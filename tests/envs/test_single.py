@@ -1,0 +1,341 @@
+"""`SMEEnv`: what is paid when, how episodes end, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.envs import SMEEnv
+from sme_registry.errors import ActionError, EpisodeError, OptionError, StateError
+
+START = np.array([0.3, 0.6, 0.9])
+
+
+def env_of(**fields: Any) -> SMEEnv:
+    """A small task, begun at a fixed state."""
+    env = SMEEnv({"state_dim": 3, "action_dim": 2, **fields})
+    env.reset(seed=0, options={"state": START})
+    return env
+
+
+def earn(env: SMEEnv, step_reward: float) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Step with an action that earns `step_reward`: each channel (1 − r)/4 off, or 0.3 for 0."""
+    optimal = env.task.optimal_action(env.state)
+    off = (1.0 - step_reward) / 4.0 if step_reward > 0 else 0.3
+    observation, reward, *ends, info = env.step(
+        np.where(optimal < 0.5, optimal + off, optimal - off)
+    )
+    return observation, float(reward), *ends, info
+
+
+def test_rewards_are_paid_every_k_steps_and_at_the_end() -> None:
+    env = env_of(k=3, horizon=7)
+    steps = [earn(env, 1.0) for _ in range(7)]
+    assert [reward for _, reward, *_ in steps] == pytest.approx([0, 0, 3, 0, 0, 3, 1])
+    pending = [1 / 3, 2 / 3, 0, 1 / 3, 2 / 3, 0, 0]
+    assert [observation[-1] for observation, *_ in steps] == pytest.approx(pending)
+    assert [observation[-2] for observation, *_ in steps] == pytest.approx(np.arange(1, 8) / 7)
+    assert [step[4]["accumulated_reward"] for step in steps] == pytest.approx(
+        [3 * share for share in pending]
+    )
+    assert [step[3] for step in steps] == [False] * 6 + [True]
+
+
+def test_with_k_beyond_the_horizon_all_is_paid_at_the_end() -> None:
+    env = env_of(k=100, horizon=4)
+    assert [earn(env, r)[1] for r in (1.0, 0.5, 0.25, 1.0)] == pytest.approx([0, 0, 0, 2.75])
+
+
+@pytest.mark.parametrize(
+    ("asked", "paid"), [(0.6, 0.6), (0.51, 0.51), (0.49, 0.0), (0.1, 0.0), (1.0, 1.0), (0.0, 0.0)]
+)
+def test_step_rewards_at_or_below_r_min_pay_nothing(asked: float, paid: float) -> None:
+    _, reward, _, _, info = earn(env_of(r_min=0.5), asked)
+    assert reward == pytest.approx(paid)
+    assert info["regret"] == pytest.approx(1.0 - paid)
+    assert info["similarity"] == pytest.approx(1 - (1 - asked) / 4 if asked else 0.7)
+
+
+def exactly_half(**fields: Any) -> tuple[Any, ...]:
+    """A step whose reward, before any threshold, is ½ in every bit."""
+    env = SMEEnv({"state_dim": 1, "action_dim": 1, **fields})
+    for start in np.linspace(0, 1, 200):
+        env.reset(options={"state": [start]})
+        optimal = env.task.optimal_action(env.state)
+        returned = env.step(optimal + (0.125 if optimal[0] < 0.5 else -0.125))
+        if returned[4]["similarity"] == 0.875:
+            return returned
+    raise AssertionError("no state gives a reward of exactly one half")
+
+
+def test_r_min_is_strict() -> None:
+    assert exactly_half(r_min=0.5)[1] == 0.0
+    assert exactly_half(r_min=float(np.nextafter(0.5, 0)))[1] == 0.5
+
+
+def test_a_step_reward_of_exactly_D_survives() -> None:
+    assert not exactly_half(D=0.5)[2]
+    assert exactly_half(D=float(np.nextafter(0.5, 1)))[2]
+
+
+def test_termination_pays_nothing_extra_and_leaves_what_is_lost_in_info() -> None:
+    env = env_of(k=5, D=0.5, horizon=20)
+    for _ in range(2):
+        assert earn(env, 1.0)[2:4] == (False, False)
+    observation, reward, terminated, truncated, info = earn(env, 0.25)
+    assert (reward, terminated, truncated) == (0.0, True, False)
+    assert info["accumulated_reward"] == pytest.approx(2.25)
+    assert observation[-1] == pytest.approx(2.25 / 5)
+
+
+def test_termination_on_the_step_of_a_payout_is_paid_as_any_other() -> None:
+    env = env_of(k=2, D=0.5, horizon=20)
+    earn(env, 1.0)
+    _, reward, terminated, truncated, info = earn(env, 0.25)
+    assert (terminated, truncated) == (True, False)
+    assert reward == pytest.approx(1.25)
+    assert info["accumulated_reward"] == 0.0
+
+
+def test_both_flags_are_set_on_one_step_and_truncation_pays() -> None:
+    env = env_of(k=5, D=0.5, horizon=3)
+    earn(env, 1.0)
+    earn(env, 1.0)
+    observation, reward, terminated, truncated, info = earn(env, 0.25)
+    assert (terminated, truncated) == (True, True)
+    assert reward == pytest.approx(2.25)
+    assert info["accumulated_reward"] == observation[-1] == 0.0
+    assert observation[-2] == 1.0
+
+
+def test_survival_is_tested_on_the_gated_reward() -> None:
+    assert not earn(env_of(D=0.1), 0.4)[2]
+    assert earn(env_of(D=0.1, r_min=0.6), 0.4)[2]
+
+
+def test_survival_is_tested_on_the_step_reward_not_on_the_payout() -> None:
+    assert not earn(env_of(D=0.5, k=10), 1.0)[2]
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_actions_outside_the_range_count_as_its_bounds(action_range: Any) -> None:
+    low = {"unit": 0.0, "symmetric": -1.0}[action_range]
+    seen = []
+    for action in ([low, 1.0], [low - 5.0, 1e30]):
+        env = SMEEnv("Plane1", action_range=action_range)
+        env.reset(seed=0)
+        seen.append((*env.step(np.array(action))[:2], *env.state))
+    assert [list(map(np.ndarray.tolist, map(np.asarray, s))) for s in seen[:1]] == [
+        list(map(np.ndarray.tolist, map(np.asarray, s))) for s in seen[1:]
+    ]
+
+
+def test_the_symmetric_range_is_the_same_task_rescaled() -> None:
+    unit, symmetric = SMEEnv("Default"), SMEEnv("Default", action_range="symmetric")
+    unit.reset(seed=0)
+    symmetric.reset(seed=0)
+    for action in np.random.default_rng(0).integers(0, 9, (50, 4)) / 8.0:  # exact in either range
+        first, second = unit.step(action), symmetric.step(2.0 * action - 1.0)
+        np.testing.assert_array_equal(first[0], second[0])
+        assert first[1] == second[1]
+        np.testing.assert_array_equal(
+            2.0 * first[4]["optimal_action"] - 1.0, second[4]["optimal_action"]
+        )
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_the_optimal_action_in_info_has_no_regret_when_played_back(action_range: Any) -> None:
+    env = SMEEnv("Complexity10", action_range=action_range)
+    env.reset(seed=0)
+    for _ in range(10):
+        optimal = copy.deepcopy(env).step(np.zeros(4, np.float32))[4]["optimal_action"]
+        assert env.step(optimal)[4]["regret"] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "same",
+    [
+        lambda a: a.tolist(),
+        lambda a: a.astype(np.float64),
+        lambda a: np.repeat(a, 3)[::3],
+        lambda a: a[::-1].copy()[::-1],
+        lambda a: np.array([a, a]).T.copy()[:, 0],
+        lambda a: a.astype(">f4"),
+        lambda a: a.view(np.ma.MaskedArray),
+    ],
+    ids=["list", "float64", "strided", "reversed", "column", "big-endian", "masked"],
+)
+def test_an_action_is_the_same_in_whatever_form_it_comes(same: Any) -> None:
+    action = np.array([0.125, 0.75, 0.5, 0.25], np.float32)
+    plain, other = SMEEnv("Default"), SMEEnv("Default")
+    plain.reset(seed=0)
+    other.reset(seed=0)
+    np.testing.assert_array_equal(plain.step(action)[0], other.step(same(action))[0])
+
+
+def test_whole_numbers_are_actions() -> None:
+    env = SMEEnv("Plane1")
+    env.reset(seed=0)
+    assert 0.0 <= env.step(np.array([0, 1]))[4]["similarity"] <= 1.0  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (np.array([np.nan, 0.5], np.float32), "NaN"),
+        (np.array([np.inf, 0.5]), "infinite"),
+        (np.zeros(3, np.float32), r"shape \(3,\): must be of shape \(2,\)"),
+        (np.zeros((1, 2), np.float32), "shape"),
+        (np.zeros(0, np.float32), "shape"),
+        (0.5, "shape"),
+        (None, "numbers"),
+        ("ab", "numbers"),
+        (["a", "b"], "numbers"),
+        ([True, False], "numbers"),
+        (np.array([True, False]), "numbers"),
+        ([1j, 0], "numbers"),
+        ([[0.1], [0.2, 0.3]], "array of shape"),
+        ({"a": 1}, "numbers"),
+    ],
+)
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_an_unusable_action_is_refused_and_nothing_moves(
+    action: Any, words: str, action_range: Any
+) -> None:
+    env, untouched = (SMEEnv("Plane1", action_range=action_range) for _ in range(2))
+    for e in (env, untouched):
+        e.reset(seed=0)
+        e.step(np.full(2, 0.5, np.float32))
+    with pytest.raises(ActionError, match=words):
+        env.step(action)
+    good = np.full(2, 0.25, np.float32)
+    np.testing.assert_array_equal(env.step(good)[0], untouched.step(good)[0])
+
+
+def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
+    for render_mode in (None, "rgb_array"):
+        if render_mode:
+            pytest.importorskip("pygame")
+        env = SMEEnv("Plane1", horizon=2, render_mode=render_mode)
+        for action in (np.zeros(2, np.float32), np.zeros(2), [0, 0]):
+            with pytest.raises(EpisodeError, match="has not begun"):
+                env.step(action)  # type: ignore[arg-type]
+        env.reset()
+        for _ in range(2):
+            env.step(np.zeros(2, np.float32))
+        for action in (np.zeros(2, np.float32), np.zeros(2), [0, 0]):
+            with pytest.raises(EpisodeError, match="has ended"):
+                env.step(action)  # type: ignore[arg-type]
+        env.reset()
+        env.step(np.zeros(2, np.float32))
+
+
+def test_an_episode_begins_at_the_state_that_is_given() -> None:
+    env = SMEEnv("Plane1")
+    for state in ([0.25, 0.75], (0, 1), np.array([1.0, 0.0], np.float32)):
+        observation, info = env.reset(options={"state": state})
+        assert observation.tolist() == [*map(float, state), 0.0, 0.0]
+        assert env.state.tolist() == [*map(float, state)]
+        assert info == {}
+
+
+def test_a_given_state_takes_nothing_from_the_generator() -> None:
+    first, second = SMEEnv("Plane1"), SMEEnv("Plane1")
+    first.reset(seed=0, options={"state": [0.5, 0.5]})
+    second.reset(seed=0, options={"state": [0.1, 0.2]})
+    np.testing.assert_array_equal(first.reset()[0], second.reset()[0])
+    np.testing.assert_array_equal(first.reset(options={})[0], second.reset(options=None)[0])
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        ([0.5, 1.0000001], "outside"),
+        ([-1e-300, 0.5], "outside"),
+        ([np.nan, 0.5], "outside"),
+        ([0.5], "shape"),
+        ([[0.5, 0.5]], "shape"),
+        (["a", "b"], "shape"),
+        (None, "shape"),
+    ],
+)
+def test_a_state_that_cannot_begin_an_episode_is_refused(state: Any, words: str) -> None:
+    env = SMEEnv("Plane1")
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    before = env.state
+    with pytest.raises(StateError, match=words):
+        env.reset(options={"state": state})
+    np.testing.assert_array_equal(env.state, before)
+
+
+def test_an_unknown_option_is_refused_with_the_nearest_known_one() -> None:
+    with pytest.raises(OptionError, match=r"unknown option.*Did you mean 'state'"):
+        SMEEnv("Plane1").reset(options={"sate": [0, 0]})
+
+
+def test_rendering_without_a_mode_warns_and_gives_nothing() -> None:
+    env = SMEEnv("Plane1")
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+
+
+def test_both_back_ends_walk_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    for name in ("Default", "HardFragile", "Complexity50", "StateDim32", "ActionDim16", "Plane10"):
+        envs = []
+        for backend in ("numba", "numpy"):
+            monkeypatch.setenv("SME_BACKEND", backend)
+            envs.append(SMEEnv(name, k=3, r_min=0.1, D=0.0, horizon=60))
+            envs[-1].reset(seed=0)
+        rng, (fast, plain) = np.random.default_rng(0), envs
+        for _ in range(60):
+            optimal = plain.task.optimal_action(plain.state)
+            action = (0.7 * optimal + 0.3 * rng.random(optimal.shape)).astype(np.float32)
+            got, expected = fast.step(action), plain.step(action)
+            np.testing.assert_array_equal(fast.state, plain.state)
+            np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-7)
+            assert got[1] == pytest.approx(expected[1], abs=3e-12)
+            assert got[2:4] == expected[2:4]
+            for key in expected[4]:
+                np.testing.assert_allclose(got[4][key], expected[4][key], rtol=0, atol=3e-12)
+
+
+@pytest.mark.parametrize("here", ["numba", "numpy"])
+def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
+    here: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("numba")
+    there = {"numba": "numpy", "numpy": "numba"}[here]
+    monkeypatch.setenv("SME_BACKEND", here)
+    for make in (SMEEnv, lambda name: sme_registry.make_vec(name, 3)):
+        env: Any = make("Complexity10")
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.25, np.float32)
+        env.step(action)
+        monkeypatch.setenv("SME_BACKEND", there)
+        moved = pickle.loads(pickle.dumps(env))
+        for _ in range(120):
+            if env.step(action)[3] is True:
+                break
+            moved.step(action)
+            np.testing.assert_array_equal(env.state, moved.state)
+        monkeypatch.setenv("SME_BACKEND", here)
+
+
+def test_a_made_environment_is_copied_with_its_wrappers() -> None:
+    env = gymnasium.make("SME/Interval5-v1")
+    env.reset(seed=0)
+    action = np.full(4, 0.5, np.float32)
+    env.step(action)
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        mine = copy.deepcopy(env)
+        for _ in range(10):
+            np.testing.assert_array_equal(mine.step(action)[0], twin.step(action)[0])
