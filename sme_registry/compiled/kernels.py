@@ -202,35 +202,36 @@ def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-unt
 @njit(error_model="numpy")
 def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
     """y = Φ(W x + b) for `count` lanes: x `[in, LANES]`, y `[out, LANES]`, W transposed."""
+    # Two indices everywhere: a row taken as an array of its own costs two atomic operations.
     inputs, outputs = W.shape
     for o in range(outputs):
-        total = y[o]
         bias = b[o]
         for lane in range(count):
-            total[lane] = bias
+            y[o, lane] = bias
         i = 0
         while i + 8 <= inputs:
-            w0, w1, w2, w3 = W[i, o], W[i + 1, o], W[i + 2, o], W[i + 3, o]
-            w4, w5, w6, w7 = W[i + 4, o], W[i + 5, o], W[i + 6, o], W[i + 7, o]
-            x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
-            x4, x5, x6, x7 = x[i + 4], x[i + 5], x[i + 6], x[i + 7]
+            i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
+            i4, i5, i6, i7 = np.uint64(i + 4), np.uint64(i + 5), np.uint64(i + 6), np.uint64(i + 7)
+            w0, w1, w2, w3 = W[i0, o], W[i1, o], W[i2, o], W[i3, o]
+            w4, w5, w6, w7 = W[i4, o], W[i5, o], W[i6, o], W[i7, o]
             for lane in range(count):
-                z = total[lane] + w0 * x0[lane]
-                z = z + w1 * x1[lane]
-                z = z + w2 * x2[lane]
-                z = z + w3 * x3[lane]
-                z = z + w4 * x4[lane]
-                z = z + w5 * x5[lane]
-                z = z + w6 * x6[lane]
-                total[lane] = z + w7 * x7[lane]
+                z = y[o, lane] + w0 * x[i0, lane]
+                z = z + w1 * x[i1, lane]
+                z = z + w2 * x[i2, lane]
+                z = z + w3 * x[i3, lane]
+                z = z + w4 * x[i4, lane]
+                z = z + w5 * x[i5, lane]
+                z = z + w6 * x[i6, lane]
+                y[o, lane] = z + w7 * x[i7, lane]
             i += 8
         while i < inputs:
-            w, xi = W[i, o], x[i]
+            i0 = np.uint64(i)
+            w = W[i0, o]
             for lane in range(count):
-                total[lane] = total[lane] + w * xi[lane]
+                y[o, lane] = y[o, lane] + w * x[i0, lane]
             i += 1
         for lane in range(count):
-            total[lane] = normal_cdf(total[lane])
+            y[o, lane] = normal_cdf(y[o, lane])
 
 
 @njit(
@@ -276,7 +277,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
     W = p[_HEADER : _HEADER + A * S].reshape(A, S)
     b = p[_HEADER + A * S : _HEADER + A * S + S]
     x, y = np.empty((widest, LANES)), np.empty((widest, LANES))
-    best = np.empty((A, LANES))
+    best, state = np.empty((A, LANES)), np.empty((S, LANES))
     acted = np.empty((A, LANES))
     missed = np.empty(LANES)
     batch = t.size
@@ -288,9 +289,9 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
             channels, layers = int(p[at]), int(p[at + 1])
             at += 2
             for j in range(channels):
-                row, source = x[j], s[int(p[at + j])]
+                channel = np.uint64(p[at + j])
                 for lane in range(count):
-                    row[lane] = source[first + lane]
+                    x[j, lane] = s[channel, first + lane]
             at += channels
             outputs = 0
             for _ in range(layers):
@@ -310,30 +311,41 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
         for lane in range(count):
             missed[lane] = 0.0
         for i in range(A):
-            chosen, target = acted[i], best[i]
             for lane in range(count):
                 a = action[first + lane, i]
                 a = a if a > 0.0 else 0.0
                 a = a if a < 1.0 else 1.0
-                missed[lane] += abs(a - target[lane])
-                chosen[lane] = float64(float32(a))
-                optimal[first + lane, i] = target[lane]
+                missed[lane] += abs(a - best[i, lane])
+                acted[i, lane] = float64(float32(a))
+                optimal[first + lane, i] = best[i, lane]
 
         for j in range(S):
-            before, after, offset = s[j], moved[j], b[j]
+            offset = b[j]
             for lane in range(count):
-                after[first + lane] = before[first + lane] + offset
-            for i in range(A):
-                w, chosen = W[i, j], acted[i]
+                state[j, lane] = s[j, first + lane] + offset
+            i = 0
+            while i + 4 <= A:
+                i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
+                w0, w1, w2, w3 = W[i0, j], W[i1, j], W[i2, j], W[i3, j]
                 for lane in range(count):
-                    after[first + lane] = after[first + lane] + w * chosen[lane]
+                    z = state[j, lane] + w0 * acted[i0, lane]
+                    z = z + w1 * acted[i1, lane]
+                    z = z + w2 * acted[i2, lane]
+                    state[j, lane] = z + w3 * acted[i3, lane]
+                i += 4
+            while i < A:
+                i0 = np.uint64(i)
+                w = W[i0, j]
+                for lane in range(count):
+                    state[j, lane] = state[j, lane] + w * acted[i0, lane]
+                i += 1
             for lane in range(count):
-                z = after[first + lane]
-                after[first + lane] = 2.0 * abs(z - np.rint(z))
+                z = 2.0 * abs(state[j, lane] - np.rint(state[j, lane]))
+                state[j, lane] = z
+                moved[j, first + lane] = z
         for lane in range(count):
-            row = observation[first + lane]
             for j in range(S):
-                row[j] = moved[j, first + lane]
+                observation[first + lane, j] = state[j, lane]
 
         # Three short loops rather than one long one: the first two fill vector registers.
         for lane in range(count):

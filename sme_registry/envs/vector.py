@@ -265,19 +265,18 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         """Put lanes at the start of an episode, and write what they observe."""
         S = self.sme_spec.state_dim
         if states is None:
-            states = np.array([self._generator(lane).random(S) for lane in lanes])
+            states = np.empty((len(lanes), S))
+            for row, lane in zip(states, lanes.tolist(), strict=True):
+                generator = self._generators[lane]
+                if generator is None:
+                    generator = self._generators[lane] = seeding.np_random(None)[0]
+                generator.random(out=row)
         self._s[:, lanes] = states.T
         self._t[lanes] = 0
         self._accumulated[lanes] = 0.0
         self._ended[lanes] = False
         observation[lanes, :S] = states
         observation[lanes, S:] = 0.0
-
-    def _generator(self, lane: int) -> np.random.Generator:
-        generator = self._generators[lane]
-        if generator is None:
-            generator = self._generators[lane] = seeding.np_random(None)[0]
-        return generator
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""
