@@ -1,0 +1,78 @@
+"""Steps per second, single and batched, against Gymnasium's own and against plain NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sme_registry
+from benchmarks.plain_numpy import PlainBatch, PlainEnv
+from sme_registry import SMESpec, materialize
+
+BATCH = 1024
+
+gymnasium.register("PlainNumPy-v0", entry_point=PlainEnv)
+
+
+def stepping(env: gymnasium.Env[Any, Any]) -> Callable[[int], None]:
+    """Steps with one fixed action (drawing actions would cost more than a step), and resets."""
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.4, np.float32)
+
+    def work(steps: int) -> None:
+        for _ in range(steps):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return work
+
+
+def batch_stepping(env: Any, actions: Any) -> Callable[[int], None]:
+    if isinstance(env, gymnasium.vector.VectorEnv):
+        env.reset(seed=0)
+
+    def work(steps: int) -> None:
+        for _ in range(steps):
+            env.step(actions)
+
+    return work
+
+
+@pytest.mark.parametrize(("complexity", "units", "bar"), [(1, 20_000, 12), (50, 1_000, 10)])
+def test_single_step(compare: Any, complexity: int, units: int, bar: float) -> None:
+    ours = gymnasium.make("SME/Default-v1", complexity=complexity)
+    plain = gymnasium.make("PlainNumPy-v0", task=materialize(SMESpec(complexity=complexity)))
+    peers = {"plain NumPy": (stepping(plain), units // 10, bar)}
+    if complexity == 1:
+        peers["Pendulum-v1"] = (stepping(gymnasium.make("Pendulum-v1")), units // 10, 6)
+    compare(f"single, complexity {complexity}", "step", stepping(ours), units, peers)
+
+
+def test_batched_step(compare: Any) -> None:
+    actions = np.random.default_rng(0).random((BATCH, 4), dtype=np.float32)
+    ours = batch_stepping(sme_registry.make_vec("SME/Default-v1", BATCH), actions)
+    plain = batch_stepping(PlainBatch(materialize(SMESpec()), BATCH), actions)
+    cartpole = gymnasium.make_vec(
+        "CartPole-v1", num_envs=BATCH, vectorization_mode="vector_entry_point"
+    )
+    pendulum = gymnasium.make_vec("Pendulum-v1", num_envs=BATCH, vectorization_mode="sync")
+    compare(
+        f"batch of {BATCH}",
+        "batch",
+        ours,
+        500,
+        {
+            "plain batched NumPy": (plain, 200, 1.8),
+            "native CartPole-v1": (batch_stepping(cartpole, np.zeros(BATCH, np.int64)), 200, 1.0),
+            "SyncVectorEnv of Pendulum-v1": (
+                batch_stepping(pendulum, np.full((BATCH, 1), 0.4, np.float32)),
+                4,
+                200,
+            ),
+        },
+    )
