@@ -1,4 +1,4 @@
-"""What may be passed to `reset(options=...)`."""
+"""What may be passed to `reset`: seeds, and `options`."""
 
 from __future__ import annotations
 
@@ -43,3 +43,16 @@ def initial_states(state: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64
             "the cube; to ask the task about states outside it, use env.unwrapped.task."
         )
     return array
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed of an environment's generator: None, or an integer of at least 0.
+
+    Raises:
+      OptionError: neither.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise OptionError(f"seed={seed!r:.60}: must be an integer of at least 0, or None.")
+    return int(seed)

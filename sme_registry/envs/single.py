@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from sme_registry.compiled import engine
 from sme_registry.envs import actions
 from sme_registry.envs.naming import renamed_by_content
-from sme_registry.envs.options import initial_states, refuse_unknown
+from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.resolve import resolve
@@ -158,17 +158,15 @@ class SMEEnv(gymnasium.Env[Observation, Action]):
 
         Raises:
           StateError: the state has the wrong shape or lies outside the cube.
-          OptionError: an unknown option.
+          OptionError: an unknown option, or a seed that is no integer of at least 0.
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
         _refuse_short_time_limit(self.sme_spec.horizon)
         refuse_unknown(options, ("state",))
-        super().reset(seed=seed)
-        S = self.sme_spec.state_dim
-        if options and "state" in options:
-            s = initial_states(options["state"], (S,))
-        else:
-            s = self.np_random.random(S)
+        S, seed = self.sme_spec.state_dim, checked_seed(seed)
+        given = initial_states(options["state"], (S,)) if options and "state" in options else None
+        super().reset(seed=seed)  # all is checked: only now anything moves
+        s = self.np_random.random(S) if given is None else given
         self._lane[:2] = 0.0
         self._lane[2:] = s
         observation = np.zeros(S + 2, np.float32)

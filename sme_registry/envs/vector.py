@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from sme_registry.compiled import engine
 from sme_registry.envs import actions as action_ranges
 from sme_registry.envs.naming import renamed_by_content
-from sme_registry.envs.options import initial_states, refuse_unknown
+from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown
 from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
@@ -171,9 +171,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         options = options or {}
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        for lane, lane_seed in zip(lanes, self._seeds(seed)[lanes], strict=True):
-            if lane_seed is not None:
-                self._generators[lane] = seeding.np_random(int(lane_seed))[0]
+        seeds = self._seeds(seed)[lanes]
         states = None
         if "state" in options:
             S = self.sme_spec.state_dim
@@ -181,6 +179,10 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             one_for_all = given.ndim == 1
             states = initial_states(options["state"], (S,) if one_for_all else (self.num_envs, S))
             states = np.broadcast_to(states, (self.num_envs, S))[lanes]
+        # All is checked: only now anything moves.
+        for lane, lane_seed in zip(lanes, seeds, strict=True):
+            if lane_seed is not None:
+                self._generators[lane] = seeding.np_random(lane_seed)[0]
         observation = observe(self.sme_spec, self.state, self._t, self._accumulated)
         self._begin(lanes, observation, states)
         self._begun[lanes] = True
@@ -283,16 +285,16 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         seeds = np.full(self.num_envs, None, dtype=object)
         if seed is None:
             return seeds
-        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
-            seeds[:] = [int(seed) + lane for lane in range(self.num_envs)]
+        if not isinstance(seed, list | tuple | np.ndarray):
+            first = checked_seed(seed) or 0
+            seeds[:] = [first + lane for lane in range(self.num_envs)]
             return seeds
-        given = list(seed) if isinstance(seed, Sequence | np.ndarray) else None
-        if given is None or len(given) != self.num_envs:
+        if len(seed) != self.num_envs:
             raise OptionError(
                 f"seed={seed!r:.60}: must be an integer, None, or a list of one for each of the "
                 f"{self.num_envs} lanes."
             )
-        seeds[:] = given
+        seeds[:] = [checked_seed(lane_seed) for lane_seed in seed]
         return seeds
 
     def _mask(self, mask: Any) -> Mask:

@@ -270,9 +270,11 @@ def test_a_state_that_cannot_begin_an_episode_is_refused(state: Any, words: str)
     env.reset(seed=0)
     env.step(np.zeros(2, np.float32))
     before = env.state
+    twin = copy.deepcopy(env)
     with pytest.raises(StateError, match=words):
-        env.reset(options={"state": state})
+        env.reset(seed=9, options={"state": state})
     np.testing.assert_array_equal(env.state, before)
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
 
 
 def test_an_unknown_option_is_refused_with_the_nearest_known_one() -> None:
@@ -339,3 +341,14 @@ def test_a_made_environment_is_copied_with_its_wrappers() -> None:
         mine = copy.deepcopy(env)
         for _ in range(10):
             np.testing.assert_array_equal(mine.step(action)[0], twin.step(action)[0])
+
+
+@pytest.mark.parametrize("seed", ["abc", 1.5, True, -1, [1], np.array([1])])
+def test_a_seed_that_cannot_be_used_is_refused(seed: Any) -> None:
+    with pytest.raises(OptionError, match="seed=.*integer of at least 0"):
+        SMEEnv("Plane1").reset(seed=seed)
+
+
+def test_numpys_integers_are_seeds() -> None:
+    first, second = SMEEnv("Plane1").reset(seed=7), SMEEnv("Plane1").reset(seed=np.int64(7))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(first[0], second[0])

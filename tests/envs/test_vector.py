@@ -1,0 +1,251 @@
+"""`SMEVectorEnv`: resets of some lanes, autoreset modes, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.errors import (
+    ActionError,
+    EpisodeError,
+    OptionError,
+    ResourceLimitError,
+    StateError,
+    WrapperError,
+)
+
+MODES = [mode.value for mode in AutoresetMode]
+HALF = np.full((3, 2), 0.5, np.float32)
+
+
+def plane(mode: str = "NextStep", **fields: Any) -> SMEVectorEnv:
+    return SMEVectorEnv("Plane1", 3, autoreset_mode=mode, **fields)
+
+
+def test_same_step_gives_the_last_observation_and_info_beside_the_next_first_ones() -> None:
+    env, single = plane("SameStep", horizon=2, k=5), SMEEnv("Plane1", horizon=2, k=5)
+    env.reset(seed=0)
+    single.reset(seed=1)
+    for _ in range(2):
+        observations, rewards, _, truncated, infos = env.step(HALF)
+        last, reward, _, _, info = single.step(HALF[1])
+    assert truncated.all()
+    assert rewards[1] == reward
+    np.testing.assert_array_equal(infos["final_obs"][1], last)
+    assert infos["final_info"]["regret"][1] == info["regret"]
+    assert infos["_final_obs"].all()
+    assert not infos["_regret"].any()
+    np.testing.assert_array_equal(observations[1], single.reset()[0])
+
+
+def test_next_step_ignores_the_actions_of_lanes_that_rest_but_not_their_form() -> None:
+    env = plane(horizon=1)
+    env.reset(seed=0)
+    assert env.step(HALF)[3].all()
+    for bad in (np.zeros((3, 1)), np.zeros((3, 3)), np.zeros(2), [["a", "b"]] * 3, HALF > 0):
+        with pytest.raises(ActionError):
+            env.step(bad)
+    observations, rewards, terminated, truncated, infos = env.step(np.full((3, 2), np.nan))
+    assert not rewards.any()
+    assert not terminated.any()
+    assert not truncated.any()
+    assert not observations[:, 2:].any()
+    assert not infos["_similarity"].any()
+    assert env.step(HALF)[3].all()
+
+
+def test_disabled_refuses_to_step_ended_lanes_and_resets_those_asked_for() -> None:
+    env = plane("Disabled", horizon=2)
+    env.reset(seed=0)
+    env.step(HALF)
+    last = env.step(HALF)[0]
+    with pytest.raises(EpisodeError, match=r"3 lanes have ended.*reset_mask"):
+        env.step(HALF)
+    observations, _ = env.reset(options={"reset_mask": np.array([True, False, True])})
+    np.testing.assert_array_equal(observations[1], last[1])
+    assert not observations[[0, 2], 2:].any()
+    with pytest.raises(EpisodeError, match=r"1 lanes have ended \(the first is lane 1\)"):
+        env.step(HALF)
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert env.step(HALF)[0][:, 2].tolist() == [0.5] * 3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_lanes_that_are_not_reset_go_on_untouched(mode: str) -> None:
+    env, whole = plane(mode, horizon=9), plane(mode, horizon=9)
+    for batch in (env, whole):
+        batch.reset(seed=0)
+        batch.step(HALF)
+    env.reset(seed=[None, 5, None], options={"reset_mask": np.array([False, True, False])})
+    first, second = env.step(HALF), whole.step(HALF)
+    np.testing.assert_array_equal(first[0][[0, 2]], second[0][[0, 2]])
+    assert first[0][1, 2] == np.float32(1 / 9)
+    assert second[0][1, 2] == np.float32(2 / 9)
+
+
+def test_a_masked_seed_seeds_only_the_lanes_of_the_mask() -> None:
+    env, single = plane(), SMEEnv("Plane1")
+    env.reset(seed=0)
+    observations, _ = env.reset(seed=40, options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(observations[1], single.reset(seed=41)[0])
+
+
+def test_a_batch_begins_at_one_state_for_all_or_one_for_each() -> None:
+    env = plane()
+    env.reset(options={"state": [0.25, 0.5]})
+    assert env.state.tolist() == [[0.25, 0.5]] * 3
+    states = [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
+    observations, _ = env.reset(options={"state": states})
+    assert env.state.tolist() == states
+    assert observations[:, :2].tolist() == states
+    mask = np.array([False, True, False])
+    env.reset(options={"state": [0.125, 0.125], "reset_mask": mask})
+    assert env.state.tolist() == [states[0], [0.125, 0.125], states[2]]
+
+
+def test_a_step_before_every_lane_has_begun_is_refused() -> None:
+    env = plane()
+    with pytest.raises(EpisodeError, match="not begun"):
+        env.step(HALF)
+    env.reset(options={"reset_mask": np.array([True, True, False])})
+    with pytest.raises(EpisodeError, match="not begun"):
+        env.step(HALF)
+    env.reset(options={"reset_mask": np.array([False, False, True])})
+    env.step(HALF)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.full((3, 2), np.nan, np.float32),
+        np.array([[0.5, 0.5], [0.5, 0.5], [0.5, -np.inf]]),
+        np.zeros((2, 3)),
+        np.zeros(2),
+        np.zeros((3, 2, 1)),
+        "abc",
+        None,
+        [[True, False]] * 3,
+        [[0.1, 0.2], [0.3], [0.4, 0.5]],
+    ],
+    ids=["nan", "inf", "transposed", "one", "deep", "string", "none", "bool", "ragged"],
+)
+def test_unusable_actions_are_refused_and_no_lane_moves(
+    bad: Any, mode: str, action_range: Any
+) -> None:
+    env, untouched = (plane(mode, action_range=action_range, k=2) for _ in range(2))
+    for e in (env, untouched):
+        e.reset(seed=0)
+        e.step(HALF)
+    with pytest.raises(ActionError, match="action"):
+        env.step(bad)
+    got, expected = env.step(HALF), untouched.step(HALF)
+    for mine, other in zip(got[:4], expected[:4], strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "words"),
+    [
+        ({"num_envs": 0}, OptionError, "num_envs=0"),
+        ({"num_envs": -1}, OptionError, "at least 1"),
+        ({"num_envs": 2.0}, OptionError, "num_envs=2.0"),
+        ({"num_envs": True}, OptionError, "num_envs=True"),
+        ({"num_envs": "3"}, OptionError, "num_envs='3'"),
+        ({"num_envs": 2**40}, ResourceLimitError, "fewer lanes"),
+        ({"autoreset_mode": "Sometimes"}, OptionError, "'NextStep', 'SameStep', 'Disabled'"),
+        ({"autoreset_mode": None}, OptionError, "autoreset_mode=None"),
+        ({"render_mode": "rgb_array"}, OptionError, "single environment"),
+        ({"action_range": "wide"}, OptionError, "action_range='wide'"),
+        ({"max_episode_steps": 5}, WrapperError, "horizon=5"),
+    ],
+)
+def test_a_batch_that_cannot_be_made_is_a_typed_error(
+    kwargs: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        SMEVectorEnv("Plane1", **{"num_envs": 2, **kwargs})
+    if not isinstance(kwargs.get("num_envs", 2), str):
+        with pytest.raises(error, match=words):
+            gymnasium.make_vec("SME/Plane1-v1", **{"num_envs": 2, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"state": [0.5, 1.5]}, StateError, "outside"),
+        ({"state": [[0.5, 0.5]] * 2}, StateError, "shape"),
+        ({"state": "abc"}, StateError, "shape"),
+        ({"reset_mask": [True, True, True]}, OptionError, "dtype bool"),
+        ({"reset_mask": np.ones(2, bool)}, OptionError, "shape"),
+        ({"reset_mask": np.zeros(3, bool)}, OptionError, "at least one"),
+        ({"reset_mask": np.ones(3)}, OptionError, "dtype bool"),
+        ({"reset_maks": np.ones(3, bool)}, OptionError, "Did you mean 'reset_mask'"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused_and_no_lane_moves(
+    options: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    env = plane()
+    env.reset(seed=0)
+    env.step(HALF)
+    before, twin = env.state, copy.deepcopy(env)
+    with pytest.raises(error, match=words):
+        env.reset(seed=9, options=options)
+    np.testing.assert_array_equal(env.state, before)
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])  # nor has it been seeded
+
+
+@pytest.mark.parametrize(
+    "seed", [[1, 2], "abc", 1.5, True, [1, 2, 3.5], [1, 2, "c"], -1, [0, 0, -1]]
+)
+def test_a_seed_that_cannot_be_used_is_refused(seed: Any) -> None:
+    with pytest.raises(OptionError, match="seed"):
+        plane().reset(seed=seed)
+
+
+def test_both_back_ends_step_a_batch_through_the_same_states(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("numba")
+    for name in ("Default", "HardFragile", "StateDim64", "ActionDim16"):
+        envs = []
+        for backend in ("numba", "numpy"):
+            monkeypatch.setenv("SME_BACKEND", backend)
+            envs.append(SMEVectorEnv(name, 37, k=3, horizon=25, autoreset_mode="SameStep"))
+            envs[-1].reset(seed=0)
+        rng, (fast, plain) = np.random.default_rng(0), envs
+        for _ in range(60):
+            optimal = plain.task.optimal_action(plain.state)
+            action = (0.7 * optimal + 0.3 * rng.random(optimal.shape)).astype(np.float32)
+            got, expected = fast.step(action), plain.step(action)
+            np.testing.assert_array_equal(fast.state, plain.state)
+            np.testing.assert_allclose(got[0], expected[0], rtol=0, atol=1e-7)
+            np.testing.assert_allclose(got[1], expected[1], rtol=0, atol=3e-12)
+            np.testing.assert_array_equal(got[2:4], expected[2:4])
+            for key in ("optimal_action", "similarity", "step_reward", "regret"):
+                np.testing.assert_allclose(got[4][key], expected[4][key], rtol=0, atol=3e-12)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_pickled_batch_keeps_its_resting_lanes(mode: str) -> None:
+    env = plane(mode, horizon=2)
+    env.reset(seed=0)
+    env.step(HALF)
+    env.step(HALF)
+    twin = pickle.loads(pickle.dumps(env))
+    if mode == "Disabled":
+        with pytest.raises(EpisodeError):
+            twin.step(HALF)
+        return
+    for _ in range(5):
+        for got, expected in zip(twin.step(HALF)[:4], env.step(HALF)[:4], strict=True):
+            np.testing.assert_array_equal(got, expected)
