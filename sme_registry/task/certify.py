@@ -1,0 +1,351 @@
+"""`certify`: is this draw of a task a sane one? Measured before training, not discovered after it.
+
+Source: METHOD, sections 1 and 2. Axis letters: `S` state_dim, `A` action_dim, `N` lanes or states.
+
+A check passes inside one range, warns inside a wider one, and refuses outside both. A warning is
+for a task that is right but easy: the constant action ½ is near its optimum, as METHOD says of
+`semi_orthogonal` policies of 2 to 5 layers. Refused is what is broken, or teaches nothing.
+
+The ranges of difficulty come from 4,560 draws (40 seeds of 114 settings; S 1..64, A 1..16,
+L 1..20). Mean r̃ of the constant policy: smallest, median, largest. Spread: smallest, median.
+
+    setting                                  r̃ of ½             spread        passed  refused
+    L = 1, A ≤ S                             0.716 0.744 0.752  0.282 0.292   100 %   0 %
+    unit_variance, S ≥ 8                     0.646 0.748 0.848  0.145 0.267    97 %   0 %
+    unit_variance, S 2..4                    0.584 0.747 0.964  0.042 0.227    73 %   3 %
+    semi_orthogonal, S ≥ 16                  0.736 0.750 0.832  0.130 0.273    92 %   0 %
+    semi_orthogonal, S = 8, A = 4, L = 2     0.824 0.869 0.891  0.052 0.119     0 %   0 %
+    semi_orthogonal, S = 8, A = 4, L = 5     0.758 0.790 0.828  0.112 0.199    68 %   0 %
+    semi_orthogonal, S = 8, A = 4, L = 10    0.724 0.747 0.805  0.203 0.258    98 %   0 %
+    semi_orthogonal, S = A = 2, L = 2        0.878 0.933 0.975  0.004 0.050     0 %  95 %
+    semi_orthogonal, S = A = 2, L = 3        0.840 0.917 0.974  0.017 0.076     0 %  68 %
+    semi_orthogonal, A > S, L = 1            0.784 0.803 0.854  0.015 0.164    20 %   3 %
+    S = 1, L > 1, unit_variance              0.531 0.799 0.990  0.011 0.220    33 %  30 %
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import OptionError
+from sme_registry.spec import SMESpec
+from sme_registry.task import memory
+from sme_registry.task.draw import Array, Layer
+from sme_registry.task.streams import uniform
+from sme_registry.task.task import Task, materialize
+
+Outcome = Literal["passed", "warning", "refused", "reported"]
+
+STATES = 20_000  # the standard error of mean r̃ is then below 0.001
+LANES = 4_096
+MIXING_STEPS = 100
+CONSTANT_STEPS = 2_000
+_TOGETHER = 256
+_CELLS = 16
+_FALSE_ALARM = 1e-6  # chance that a uniform ensemble is refused by one of the uniformity checks
+_LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Check:
+    """One measured number of a task beside what it should be.
+
+    Attributes:
+      name: what is measured.
+      value: the number; None where it was not measured (`meaning` says why).
+      low, high: the range in which it passes; None where there is no bound on that side.
+      outcome: "passed"; "warning" for a task that works and teaches little; "refused" for a
+        broken or trivial one; "reported" for what is shown and not judged.
+      meaning: one sentence for the reader.
+    """
+
+    name: str
+    value: float | None
+    low: float | None
+    high: float | None
+    outcome: Outcome
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What `certify` found.
+
+    Attributes:
+      digest: of the spec.
+      seed: of the states and actions that it was measured with; not the task's.
+      checks: in the order of `certify`.
+    """
+
+    digest: str
+    seed: int
+    checks: tuple[Check, ...]
+
+    @property
+    def outcome(self) -> Outcome:
+        """The worst of the checks: "passed", "warning" or "refused"."""
+        found = {check.outcome for check in self.checks}
+        return "refused" if "refused" in found else "warning" if "warning" in found else "passed"
+
+    @property
+    def passed(self) -> bool:
+        """Whether no check refuses the task; warnings pass."""
+        return self.outcome != "refused"
+
+    def of(self, outcome: Outcome) -> tuple[Check, ...]:
+        """The checks with this outcome."""
+        return tuple(check for check in self.checks if check.outcome == outcome)
+
+    def plain(self) -> dict[str, Any]:
+        """Everything as plain JSON data."""
+        checks = [dict(vars(check)) for check in self.checks]
+        return {
+            "digest": self.digest,
+            "seed": self.seed,
+            "outcome": self.outcome,
+            "passed": self.passed,
+            "checks": checks,
+        }
+
+
+def certify(task: Task | SMESpec, *, seed: int = 0) -> Certificate:
+    """Measure a drawn task. The same task and seed give the same certificate.
+
+    Args:
+      task: the task, or the spec to draw it from.
+      seed: of the states and actions measured with, in [0, 2⁵³).
+
+    Returns:
+      The certificate; `passed` is False where the task should not be used.
+
+    Raises:
+      OptionError: the seed is not such an integer.
+      ResourceLimitError: the task, or the states to measure it with, would not fit in memory.
+      FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**53:
+        raise OptionError(f"seed={seed!r}: must be an integer in [0, 2**53). Leave it out for 0.")
+    if isinstance(task, SMESpec):
+        task = materialize(task)
+    S, A = task.spec.state_dim, task.spec.action_dim
+    lanes = max(256, min(LANES, 2**24 // (S * A)))
+    states = max(2_000, min(STATES, 2**26 // (S + task.spec.hidden_width)))
+    memory.refuse_above_limit(
+        48 * max(lanes, states) * (S + A + task.spec.hidden_width),
+        f"Certifying a task of state_dim={S}, action_dim={A}",
+        "Certify a task of the same kind with fewer channels.",
+    )
+    checks = (
+        *_parameters(task),
+        *_mixing(task, seed, lanes),
+        _no_collapse(task, seed),
+        *_difficulty(task, seed, states),
+    )
+    return Certificate(task.spec.digest, seed, checks)
+
+
+def _judged(
+    name: str,
+    value: float,
+    meaning: str,
+    *,
+    passes: tuple[float | None, float | None],
+    warns: tuple[float | None, float | None] | None = None,
+) -> Check:
+    def inside(bounds: tuple[float | None, float | None]) -> bool:
+        low, high = bounds
+        return (low is None or value >= low) and (high is None or value <= high)
+
+    outcome: Outcome = "refused"
+    if inside(passes):
+        outcome = "passed"
+    elif warns is not None and inside(warns):
+        outcome = "warning"
+    return Check(name, value, *passes, outcome, meaning)
+
+
+def _draw(task: Task, seed: int, name: str, *shape: int) -> Array:
+    """Uniform numbers for measuring, independent of every stream that tasks are drawn from."""
+    label = f"certify/{task.spec.digest}/{name}"
+    return uniform(seed, label, math.prod(shape)).reshape(shape)
+
+
+def _parameters(task: Task) -> tuple[Check, ...]:
+    rows = float(np.abs(task.W.sum(axis=1) - 1.0).max())
+    every = [layer for policy in task.policies for layer in policy]
+    unit_rows = task.spec.policy_init == "unit_variance"
+    orthogonal = max(_orthogonality_error(layer, unit_rows) for layer in every)
+    centred = max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every)
+    return (
+        _judged(
+            "transition_row_sums",
+            rows,
+            "How far a row of W is from the sum 1, which keeps an action's mass.",
+            passes=(None, 0.0),
+        ),
+        _judged(
+            "layers_orthogonal",
+            orthogonal,
+            "How far W/√12 of a layer of π* is from semi-orthogonal (rescaled: from unit rows).",
+            passes=(None, _ROUNDING),
+        ),
+        _judged(
+            "layers_centred",
+            centred,
+            "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
+            passes=(None, _ROUNDING),
+        ),
+    )
+
+
+def _orthogonality_error(layer: Layer, unit_rows: bool) -> float:
+    W = layer.W / math.sqrt(12.0)
+    out, inputs = W.shape
+    if out > inputs and unit_rows:
+        return float(np.abs(np.linalg.norm(W, axis=1) - 1.0).max())
+    gram = W.T @ W if out > inputs else W @ W.T
+    return float(np.abs(gram - np.eye(len(gram))).max())
+
+
+def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
+    """Where random actions lead an ensemble that starts uniformly, and one that starts at a point.
+
+    The first must stay uniform. The second need not become so within an episode: a channel into
+    which the actions put little may stay in a nearly invariant set. That is shown, not judged.
+    """
+    S, A = task.spec.state_dim, task.spec.action_dim
+    s = _draw(task, seed, "states", lanes, S)
+    together = np.repeat(_draw(task, seed, "start", 1, S), _TOGETHER, axis=0)
+    for t in range(MIXING_STEPS):
+        a = _draw(task, seed, f"actions/{t}", lanes, A)
+        s, together = task.transition(s, a), task.transition(together, a[:_TOGETHER])
+    # Kolmogorov's bound on √N·D, shared out over the channels (Bonferroni).
+    bound = math.sqrt(0.5 * math.log(2.0 * S / _FALSE_ALARM))
+    return (
+        _judged(
+            "uniform_states",
+            _distance_from_uniform(s),
+            f"Largest √N·KS distance of a state channel from uniform, {MIXING_STEPS} random "
+            "actions after uniform starts.",
+            passes=(None, bound),
+        ),
+        _judged(
+            "coverage",
+            _coverage(s, pairs=S > 1),
+            f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state channels "
+            "that these states lie in.",
+            passes=(0.95 if lanes == LANES else 0.5, None),
+        ),
+        Check(
+            "coverage_from_one_start",
+            _coverage(together, pairs=False),
+            None,
+            None,
+            "reported",
+            f"Smallest share of {_CELLS} cells of a state channel that {_TOGETHER} lanes reach by "
+            f"the same number of random actions, all from one start.",
+        ),
+    )
+
+
+def _distance_from_uniform(s: Array) -> float:
+    """The largest √N · KS distance of the marginals of `[N, S]` states from U(0, 1)."""
+    N = len(s)
+    ranked = np.sort(s, axis=0)
+    steps = np.arange(N)[:, None] / N
+    return float(math.sqrt(N) * np.maximum(ranked - steps, steps + 1.0 / N - ranked).max())
+
+
+def _coverage(s: Array, *, pairs: bool) -> float:
+    """Smallest share of cells that `[N, S]` states lie in, of a channel or two neighbours."""
+    cells = np.minimum((s * _CELLS).astype(np.int64), _CELLS - 1)
+    if pairs:
+        cells = cells[:, :-1] * _CELLS + cells[:, 1:]
+    return min(len(np.unique(column)) for column in cells.T) / _CELLS ** (2 if pairs else 1)
+
+
+def _no_collapse(task: Task, seed: int) -> Check:
+    """Lanes that begin apart and act alike must not end on common states, in any channel."""
+    S, A = task.spec.state_dim, task.spec.action_dim
+    lanes = max(8, min(64, 2**20 // (S * A)))
+    constants = np.concatenate([np.full((1, A), c) for c in (0.0, 0.5, 1.0)])
+    constants = np.concatenate([constants, _draw(task, seed, "constants", 1, A)])
+    a = np.repeat(constants, lanes, axis=0)
+    s = np.tile(_draw(task, seed, "constant_starts", lanes, S), (len(constants), 1))
+    for _ in range(CONSTANT_STEPS):
+        s = task.transition(s, a)
+    ranked = np.sort(s.reshape(len(constants), lanes, S), axis=1)
+    distinct = 1 + (np.diff(ranked, axis=1) > 0).sum(axis=1)
+    return _judged(
+        "distinct_states",
+        float(distinct.min()) / lanes,
+        f"Smallest share of distinct values of a state channel over {lanes} lanes after "
+        f"{CONSTANT_STEPS:,} steps of one constant action: floating point must not collapse.",
+        passes=(0.9, None),
+    )
+
+
+def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
+    """How far from trivial π* is: the scores of policies that know nothing, and its spread."""
+    S = task.spec.state_dim
+    s = _draw(task, seed, "difficulty", states, S)
+    optimal = _in_blocks(task, s)
+    similarity = task.similarity_of(np.full_like(optimal, 0.5), optimal)
+    return (
+        _judged(
+            "constant_policy_similarity",
+            float(similarity.mean()),
+            "Mean r̃ of the constant action ½ over uniform states; near 0.75 where π* spreads over "
+            "its range. Higher: the target is near-trivial. Lower: it sits in corners.",
+            passes=(0.65, 0.80),
+            warns=(0.60, 0.90),
+        ),
+        _judged(
+            "constant_policy_reward",
+            float(task.reward_of(similarity).mean()),
+            "Mean step reward of the constant action ½: what an agent earns without learning.",
+            passes=(None, 0.30),
+            warns=(None, 0.60),
+        ),
+        _judged(
+            "channel_spread",
+            float(optimal.std(axis=0).min()),
+            "Smallest standard deviation of a channel of π* over uniform states; 0.289 where it "
+            "is uniform, 0 where the channel has collapsed to a constant.",
+            passes=(0.15, None),
+            warns=(0.05, None),
+        ),
+        _linear_policy(task, seed, s, optimal),
+    )
+
+
+def _in_blocks(task: Task, s: Array, rows: int = 4_096) -> Array:
+    """π* of `[N, S]` states; a deep policy's inner layers of all of them would not fit in cache."""
+    return np.concatenate([task.policy(s[i : i + rows]) for i in range(0, len(s), rows)])
+
+
+def _linear_policy(task: Task, seed: int, s: Array, optimal: Array) -> Check:
+    """The mean step reward of the best affine policy, fitted on one half, scored on the other."""
+    S, half = task.spec.state_dim, len(s) // 2
+    name = "linear_policy_reward"
+    if S > _LINEAR_LIMIT or half < 4 * (S + 1):
+        meaning = f"Not measured: a fit over state_dim={S} channels takes too long."
+        return Check(name, None, None, None, "reported", meaning)
+    fitted, *_ = np.linalg.lstsq(_affine(s[:half]), optimal[:half], rcond=None)
+    actions = np.clip(_affine(s[half:]) @ fitted, 0.0, 1.0)
+    value = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
+    meaning = (
+        "Mean step reward of the least-squares linear policy: what needs no deep learning. Not "
+        "judged: high at complexity 1 by construction."
+    )
+    return Check(name, float(value), None, None, "reported", meaning)
+
+
+def _affine(s: Array) -> npt.NDArray[np.float64]:
+    return np.concatenate([s, np.ones((len(s), 1))], axis=1)

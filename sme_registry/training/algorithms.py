@@ -1,0 +1,65 @@
+"""The algorithms by name, loaded when they are needed: importing PyTorch takes seconds."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import warnings
+from typing import Any
+
+from sme_registry.errors import MissingDependencyError, UnknownNameError, did_you_mean
+
+# Each with what `sme train --help` says of it. The value's class is in `stable_baselines3`.
+ALGORITHMS = {
+    "TD3": "off-policy, deterministic; the fastest learner on the default task",
+    "SAC": "off-policy, entropy-regularised",
+    "DDPG": "off-policy, deterministic; TD3's ancestor",
+    "PPO": "on-policy; ten times faster a step, and many more steps to learn",
+    "A2C": "on-policy",
+}
+
+
+def known_algorithm(name: str) -> str:
+    """The algorithm's name as it is written, whatever the case it was given in.
+
+    Raises:
+      UnknownNameError: no such algorithm; says which there are and what is near.
+    """
+    by_fold = {known.casefold(): known for known in ALGORITHMS}
+    found = by_fold.get(str(name).casefold())
+    if found is None:
+        raise UnknownNameError(
+            f"algorithm={name!r}: must be one of {', '.join(ALGORITHMS)}."
+            f"{did_you_mean(str(name), ALGORITHMS)}"
+        )
+    return found
+
+
+def refuse_without_dependencies() -> None:
+    """Raise where Stable-Baselines3 or PyTorch is not installed; imports neither.
+
+    Raises:
+      MissingDependencyError: says what to install.
+    """
+    for package, known_as in (("stable_baselines3", "Stable-Baselines3"), ("torch", "PyTorch")):
+        if importlib.util.find_spec(package) is None:
+            raise MissingDependencyError(
+                f"training: {known_as} is not installed. Run `pip install 'sme-registry[train]'`."
+            )
+
+
+def load_algorithm(name: str) -> Any:
+    """The algorithm's class.
+
+    Raises:
+      UnknownNameError: no such algorithm.
+      MissingDependencyError: Stable-Baselines3 is not installed.
+    """
+    name = known_algorithm(name)
+    refuse_without_dependencies()
+    # It imports the retired `gym` where that is installed, which then prints a long notice.
+    with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return getattr(importlib.import_module("stable_baselines3"), name)
