@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
 import rfc8785
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -33,12 +32,31 @@ _SHOWN = 60  # characters of a bad value that an error repeats
 
 
 def plain_number(value: Any) -> Any:
-    """NumPy's scalars as Python's, so that a sweep over `np.arange` needs no casts; no booleans."""
+    """NumPy's scalars as Python's, so that a sweep over `np.arange` needs no casts; no booleans.
+
+    Negative zero becomes zero: the two are equal, so they must not differ in text.
+    """
     if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:
         kind = value.dtype.kind
         if kind in "iuf":
-            return value.item()
-    return value
+            value = value.item()
+    return value + 0.0 if type(value) is float else value
+
+
+def _plain_numbers(data: Any) -> Any:
+    """`plain_number` of each of a mapping's values, and of the entries of those that are lists.
+
+    Here and not as validators of the fields' types: Pydantic's JSON Schema loses the bounds of a
+    number that has a validator of its own.
+    """
+    if not isinstance(data, dict):
+        return data
+    return {
+        name: [plain_number(entry) for entry in value]
+        if type(value) in (list, tuple)
+        else plain_number(value)
+        for name, value in data.items()
+    }
 
 
 def _integer_only(value: Any) -> Any:
@@ -49,17 +67,8 @@ def _integer_only(value: Any) -> Any:
     return number
 
 
-def _no_negative_zero(value: float) -> float:
-    return value + 0.0
-
-
-Integer = Annotated[int, BeforeValidator(plain_number)]
-Real = Annotated[
-    float,
-    Field(allow_inf_nan=False),
-    BeforeValidator(plain_number),
-    AfterValidator(_no_negative_zero),
-]
+Integer = int
+Real = Annotated[float, Field(allow_inf_nan=False)]
 SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", min_length=1, max_length=64)]
 
@@ -85,7 +94,7 @@ class StrictModel(BaseModel):
     @classmethod
     def _in_our_words(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         try:
-            return handler(data)
+            return handler(_plain_numbers(data))
         except ValidationError as error:
             lines = [
                 InitErrorDetails(
@@ -161,7 +170,9 @@ def _explain(document: type[StrictModel], line: Any) -> str:
     """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
     location, value = line["loc"], line["input"]
     if line["type"] == _EXPLAINED:
-        return _from_the_root(str(line["msg"]), location)
+        return _from_the_root(
+            str(line["msg"]), location, nested=isinstance(value, dict | BaseModel)
+        )
     if not location:
         return f"{document.__name__}{_NOT_AN_OBJECT}, got {show(value)}."
     path = ".".join(str(part) for part in location)
@@ -182,7 +193,7 @@ def _explain(document: type[StrictModel], line: Any) -> str:
     return f"{path}={show(value)}: {allowed}. {fix}"
 
 
-def _from_the_root(message: str, location: tuple[int | str, ...]) -> str:
+def _from_the_root(message: str, location: tuple[int | str, ...], *, nested: bool) -> str:
     """A nested document's line with its field's whole path: `team.agents.1.observes=…`."""
     parts = [str(part) for part in location]
     path = ".".join(parts)
@@ -194,7 +205,7 @@ def _from_the_root(message: str, location: tuple[int | str, ...]) -> str:
         return message
     if _NOT_AN_OBJECT in message:
         return path + message[message.index(_NOT_AN_OBJECT) :]
-    if isinstance(location[-1], int) and "=" in message:  # one entry of a list of scalars
+    if isinstance(location[-1], int) and not nested:  # one entry of a list of scalars
         return path + message[message.index("=") :]
     return f"{path}.{message}"
 

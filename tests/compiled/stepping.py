@@ -1,0 +1,68 @@
+"""One way to call any engine, so that tests compare engines and not their calling conventions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sme_registry.compiled import Engine
+from sme_registry.task import Task
+
+
+@dataclass
+class Result:
+    """What a step gave, as arrays with or without the axis of lanes."""
+
+    state: Any
+    observation: Any
+    optimal_action: Any
+    similarity: Any
+    step_reward: Any
+    regret: Any
+    reward: Any
+    accumulated_reward: Any
+    terminated: Any
+    truncated: Any
+
+
+class Lane:
+    """One lane of an engine: an episode that is stepped by its single-lane entry points."""
+
+    def __init__(
+        self, task: Task, engine: Engine, state: Any, t: int = 0, r_cum: float = 0.0
+    ) -> None:
+        self.task, self.engine = task, engine
+        self.buffer, self.numbers = engine.new_lane()
+        self.numbers[2:] = state
+
+    def step(self, action: Any) -> Result | None:
+        """One step with a float32 or float64 action; None where it was refused."""
+        A, S = self.task.spec.action_dim, self.task.spec.state_dim
+        optimal, observation = np.empty(A), np.empty(S + 2, np.float32)
+        entry = self.engine.step_float32 if action.dtype == np.float32 else self.engine.step_float64
+        *values, end = entry(self.buffer, action, optimal, observation)
+        if end < 0:
+            return None
+        state = self.numbers[2:].copy()
+        return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
+
+
+def step_batch(
+    task: Task, engine: Engine, states: Any, t: Any, r_cum: Any, actions: Any
+) -> Result | None:
+    """One step of a batch of lanes; `states` `[B, S]`. None where it was refused."""
+    B, S, A = len(states), task.spec.state_dim, task.spec.action_dim
+    moved, observation, optimal = (
+        np.empty((S, B)),
+        np.empty((B, S + 2), np.float32),
+        np.empty((B, A)),
+    )
+    values, ends = np.empty((5, B)), np.empty((2, B), bool)
+    if not engine.step_many(
+        engine.params, np.ascontiguousarray(states.T), t, r_cum, actions,
+        moved, observation, optimal, values, ends,
+    ):  # fmt: skip
+        return None
+    return Result(moved.T, observation, optimal, *values, *ends)

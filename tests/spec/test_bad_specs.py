@@ -1,0 +1,209 @@
+"""Every bad document is refused with its field, its value, what is allowed, and what to do."""
+
+import json
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from sme_registry.errors import SMEError, SpecError
+from sme_registry.spec import EnvFile, EvaluationProtocol, SMESpec, Suite
+
+DEEP: object = []
+for _ in range(900):
+    DEEP = [DEEP]
+
+BAD = [
+    # fields, what the message must contain
+    ({"state_dim": 0}, ["state_dim=0: must be an integer in [1, 1048576].", "the default, 8."]),
+    ({"action_dim": -3}, ["action_dim=-3: must be an integer in [1, 1048576]."]),
+    ({"k": 0}, ["k=0: must be an integer in [1, 2147483647].", "Leave it out for the default, 1."]),
+    ({"k": "10"}, ["k='10': must be an integer in"]),
+    ({"k": 1.0}, ["k=1.0: must be an integer in"]),
+    ({"k": True}, ["k=True: must be an integer in"]),
+    ({"k": np.True_}, ["k=np.True_: must be an integer in"]),
+    ({"k": None}, ["k=None: must be an integer in"]),
+    ({"k": 10**4000}, ["k=1000", "…: must be an integer in"]),
+    ({"k": DEEP}, ["k=[[[", "must be an integer"]),
+    ({"complexity": 10_001}, ["complexity=10001: must be an integer in [1, 10000]."]),
+    ({"horizon": 0}, ["horizon=0: must be", "the default, 100."]),
+    ({"hidden_width": 0}, ["hidden_width=0: must be an integer in [1, 4096].", "default, 64."]),
+    ({"r_min": 1}, ["r_min=1: must be a finite number in [0, 1)."]),
+    ({"r_min": -1e-9}, ["r_min=-1e-09: must be a finite number in [0, 1)."]),
+    ({"r_min": float("nan")}, ["r_min=nan: must be a finite number in [0, 1)."]),
+    ({"D": float("inf")}, ["D=inf: must be a finite number in [0, 1)."]),
+    ({"D": np.float32("nan")}, ["D=nan: must be a finite number"]),
+    ({"D": True}, ["D=True: must be a finite number"]),
+    ({"D": "0.5"}, ["D='0.5': must be a finite number"]),
+    (
+        {"policy_init": "unit"},
+        ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'."],
+    ),
+    ({"schema_version": 2}, ["schema_version=2: must be 1. Leave it out"]),
+    ({"schema_version": True}, ["schema_version=True: must be 1."]),
+    ({"schema_version": 1.0}, ["schema_version=1.0: must be 1."]),
+    ({"seed": -1}, ["seed=-1: must be an integer in [0, 9007199254740992)"]),
+    ({"seed": 2**53}, ["seed=9007199254740992: must be", "'0x…' of 1 to 64 hex digits"]),
+    ({"seed": 1.0}, ["seed=1.0: must be an integer"]),
+    ({"seed": True}, ["seed=True: must be an integer"]),
+    ({"seed": "7"}, ["seed='7': must be", "0x"]),
+    ({"seed": "0x"}, ["seed='0x': must be"]),
+    ({"seed": "0xg"}, ["seed='0xg': must be"]),
+    ({"seed": "0x1\n"}, ["seed='0x1\\n': must be"]),
+    ({"seed": "0x" + "1" * 65}, ["seed='0x1111", "64 hex digits"]),
+    ({"seed": np.add}, ["seed=<ufunc 'add'>: must be"]),
+    ({"hiden_width": 3}, ["hiden_width=3: unknown field.", "Did you mean 'hidden_width'?"]),
+    ({"K": 3}, ["K=3: unknown field.", "Did you mean 'k'?"]),
+    ({"zzz": 3}, ["zzz=3: unknown field.", "Known fields: schema_version, state_dim"]),
+    ({7: 3}, ["7: field names must be strings."]),
+    ({"team": "two"}, ["team: must be an object of named fields, got 'two'."]),
+    ({"team": {}}, ["team.agents: missing: must be a list of 1 to 1024 entries. Add it."]),
+    ({"team": {"agents": []}}, ["team.agents=[]: must be a list of 1 to 1024 entries."]),
+    ({"team": {"agents": ["me"]}}, ["team.agents.0: must be an object of named fields, got 'me'."]),
+    (
+        {"team": {"agents": [{"action_dim": 3}]}},
+        ["team.agents: their action channels add up to 3", "action_dim=4"],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 2}, {"action_dim": "2"}]}},
+        ["team.agents.1.action_dim='2': must be an integer in [1, 1048576]."],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 4, "observs": "all"}]}},
+        ["team.agents.0.observs='all': unknown field.", "Did you mean 'observes'?"],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 4, "observes": [3, 1]}]}},
+        ["team.agents.0.observes=[3, 1]: channels must be in increasing order", "Write [1, 3]."],
+    ),
+    ({"team": {"agents": [{"action_dim": 4, "observes": []}]}}, ["observes=[]: must be 'all' or"]),
+    ({"team": {"agents": [{"action_dim": 4, "observes": [True]}]}}, ["observes=[True]: must be"]),
+    (
+        {"team": {"agents": [{"action_dim": 4, "observes": np.arange(3)}]}},
+        ["team.agents.0.observes=array([0, 1, 2]): must be 'all' or a list"],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 4, "observes": [8]}]}},
+        ["team.agents.agent_0.observes=[8]: must be in [0, state_dim=8).", "Remove channel 8"],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 4, "name": "the pilot"}]}},
+        ["team.agents.0.name='the pilot': must be a word, '_' and a number, such as 'agent_0'"],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 2, "name": "agent_1"}, {"action_dim": 2}]}},
+        ["team.agents: the name 'agent_1' is given twice. Rename one of them."],
+    ),
+    (
+        {"team": {"agents": [{"action_dim": 4}], "reward": "shared"}},
+        ["team.reward='shared': must be 'individual' or 'team'."],
+    ),
+]
+
+
+@pytest.mark.parametrize(("fields", "fragments"), BAD, ids=[str(b)[:50] for b, _ in BAD])
+def test_a_bad_field_is_refused_in_words_that_say_what_to_do(fields, fragments):
+    with pytest.raises(SpecError) as caught:
+        SMESpec.parse(fields)
+    message = str(caught.value)
+    for fragment in fragments:
+        assert fragment in message
+    assert len(message) < 500
+    assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize("document", [[], "x", 3, None, True])
+def test_what_is_no_mapping_is_no_spec(document):
+    with pytest.raises(SpecError, match="must be an object of named fields"):
+        SMESpec.parse(document)
+
+
+def test_all_errors_are_told_at_once():
+    with pytest.raises(SpecError) as caught:
+        SMESpec.parse({"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}})
+    lines = str(caught.value).splitlines()
+    assert lines[0] == "SMESpec: "
+    told = [line.strip().split(":")[0] for line in lines[1:]]
+    assert told == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
+
+
+def test_the_source_of_a_document_begins_its_error():
+    with pytest.raises(SpecError, match=r"^here\.json: k=0: must be"):
+        SMESpec.parse({"k": 0}, "here.json")
+
+
+def test_the_constructor_raises_pydantics_error_with_the_place_and_our_words():
+    with pytest.raises(ValidationError) as caught:
+        SMESpec(k=0, team={"agents": [{"action_dim": 0}]})
+    first, second = caught.value.errors()
+    assert first["loc"] == ("k",)
+    assert first["msg"] == (
+        "k=0: must be an integer in [1, 2147483647]. Leave it out for the default, 1."
+    )
+    assert second["loc"] == ("team", "agents", 0, "action_dim")
+    assert second["msg"].startswith("team.agents.0.action_dim=0: must be")
+
+
+def test_deriving_refuses_as_parsing_does():
+    with pytest.raises(SpecError, match=r"complexiti=3: unknown field\. Did you mean 'complexity'"):
+        SMESpec().derive(complexiti=3)
+    with pytest.raises(SpecError, match="D=1: must be a finite number in"):
+        SMESpec().derive(D=1)
+
+
+def test_a_spec_error_is_also_a_value_error():
+    assert issubclass(SpecError, SMEError)
+    assert issubclass(SpecError, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("document", "fields", "fragment"),
+    [
+        (Suite, {"classes": []}, "classes=[]: must be a list of 1 to 1000 entries."),
+        (
+            Suite,
+            {"classes": [{"name": "a", "setting": {}, "seeds": [1, 1]}]},
+            "classes.0.seeds=[1, 1]: each may stand once.",
+        ),
+        (
+            Suite,
+            {"classes": [{"name": "a", "setting": {}, "seeds": [1, -1]}]},
+            "classes.0.seeds.1=-1: must be an integer in [0, 9007199254740992)",
+        ),
+        (
+            Suite,
+            {"classes": [{"name": "a", "setting": {}, "seeds": [i]} for i in (1, 2)]},
+            "classes: the name 'a' is given twice.",
+        ),
+        (
+            Suite,
+            {"classes": [{"name": "a", "setting": {"k": 0}, "seeds": [1]}]},
+            "classes.0.setting.k=0: must be an integer in",
+        ),
+        (EvaluationProtocol, {"epsilons": [0.4, 0.2]}, "epsilons=[0.4, 0.2]: must increase"),
+        (EvaluationProtocol, {"epsilons": [0.0]}, "epsilons=[0.0]: must increase, from above 0."),
+        (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be an integer"),
+        (EvaluationProtocol, {"sampling": "grid"}, "sampling='grid': must be 'volume_uniform'."),
+        (EnvFile, SMESpec().plain(), "digest: missing: must be 'sha256:' and 64 lower-case hex"),
+        (EnvFile, SMESpec().plain(), "spec: missing: must be an object: schema_version, "),
+        (EnvFile, {"spec": {"k": 0}}, "spec.k=0: must be an integer in"),
+        (EnvFile, {"spec": {"team": {"agents": [{"action_dim": 1}]}}}, "spec.team.agents: their"),
+        (EnvFile, {"name": "a b"}, "name='a b': must be a string of 1 to 64 letters, digits"),
+        (EnvFile, {"digest": "sha256:AB"}, "digest='sha256:AB': must be 'sha256:' and 64"),
+        (EnvFile, {"description": "x" * 2001}, "must be a string of 0 to 2000 characters."),
+        (EnvFile, {"description": "\ud800"}, "description='\\ud800': must be a string"),
+        (EnvFile, {"tags": ["a b"]}, "tags.0='a b': "),
+        (EnvFile, {"fingerprint": {"optimal_action": [["x"]]}}, "optimal_action.0.0='x': "),
+    ],
+)
+def test_other_documents_are_refused_as_clearly(document, fields, fragment):
+    with pytest.raises(SpecError) as caught:
+        document.parse(fields)
+    assert fragment in str(caught.value)
+
+
+def test_a_message_of_a_bad_field_is_plain_text_that_json_can_carry():
+    with pytest.raises(SpecError) as caught:
+        SMESpec.parse({"k": "\x00\u202e" * 50})
+    assert "\x00" not in str(caught.value)
+    assert json.dumps(str(caught.value))

@@ -1,0 +1,209 @@
+"""The catalogue under `specs/`: each file is read, drawn, checked against its fingerprint, stepped.
+
+Released names never change: `tests/golden/digests.json` holds the digest of each. After adding a
+file run `python -m tests.golden.regenerate`, which adds it and refuses to change the others.
+"""
+
+import json
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from sme_registry.spec import (
+    EnvFile,
+    EvaluationProtocol,
+    ProtocolFile,
+    SMESpec,
+    Suite,
+    SuiteFile,
+    catalogue,
+)
+from sme_registry.spec.resolve import resolve
+from sme_registry.task import materialize
+
+ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
+PROTOCOLS = catalogue.entries(ProtocolFile)
+RELEASED = json.loads((Path(__file__).parents[1] / "golden" / "digests.json").read_text())
+EVERY_FILE = [
+    (kind, path) for kind in (EnvFile, SuiteFile, ProtocolFile) for path in catalogue.paths(kind)
+]
+
+
+JSON_TYPES = {"object": dict, "array": list, "string": str, "integer": int, "null": type(None)}
+CHECKS = {
+    "const": lambda value, limit: value == limit,
+    "enum": lambda value, limit: value in limit,
+    "minimum": lambda value, limit: value >= limit,
+    "maximum": lambda value, limit: value <= limit,
+    "exclusiveMinimum": lambda value, limit: value > limit,
+    "exclusiveMaximum": lambda value, limit: value < limit,
+    "minLength": lambda value, limit: len(value) >= limit,
+    "maxLength": lambda value, limit: len(value) <= limit,
+    "minItems": lambda value, limit: len(value) >= limit,
+    "maxItems": lambda value, limit: len(value) <= limit,
+    "pattern": lambda value, limit: re.search(limit, value),
+    "required": lambda value, limit: set(limit) <= set(value),
+    "additionalProperties": lambda value, limit: limit is False,
+    "type": lambda value, limit: (
+        isinstance(value, JSON_TYPES.get(limit, int | float)) and not isinstance(value, bool)
+    ),
+}
+NOTES = {"title", "description", "default", "$defs"}
+
+
+def follow(schema, value, definitions):
+    """Assert that a value follows a JSON Schema; knows the words that ours use, and no others."""
+    for word, limit in sorted(schema.items(), key=lambda item: item[0] != "type"):
+        if word == "$ref":
+            follow(definitions[limit.removeprefix("#/$defs/")], value, definitions)
+        elif word == "anyOf":
+            assert any(follows(choice, value, definitions) for choice in limit)
+        elif word == "properties":
+            assert set(value) <= set(limit)
+            for name, entry in value.items():
+                follow(limit[name], entry, definitions)
+        elif word == "items":
+            for entry in value:
+                follow(limit, entry, definitions)
+        elif word not in NOTES:
+            assert CHECKS[word](value, limit), (word, limit, value)
+
+
+def follows(schema, value, definitions):
+    try:
+        follow(schema, value, definitions)
+    except AssertionError:
+        return False
+    return True
+
+
+def ids(files):
+    return [file.versioned_name for file in files]
+
+
+def test_the_catalogue_has_the_tasks_that_the_design_names():
+    families = {
+        "Default": [""], "StateDim": [2, 4, 16, 32, 64], "ActionDim": [1, 2, 8, 16],
+        "Interval": [5, 10, 25, 100], "MinReward": [25, 50, 75], "Survival": [10, 25, 50],
+        "Complexity": [2, 3, 5, 10, 20, 50], "Plane": [1, 10, 50],
+    }  # fmt: skip
+    expected = {f"{family}{value}" for family, values in families.items() for value in values}
+    assert expected <= {file.name for file in ENVS}
+    assert {"smoke", "paper-ablations", "core"} <= {file.name for file in SUITES}
+    assert "paper" in {file.name for file in PROTOCOLS}
+
+
+@pytest.mark.parametrize(("kind", "path"), EVERY_FILE, ids=[path.stem for _, path in EVERY_FILE])
+def test_a_file_goes_by_its_name_and_its_digest_is_its_documents(kind, path):
+    file = kind.read(path)
+    assert path.stem == file.versioned_name
+    assert file.digest == getattr(file, kind.content).digest
+    assert file.description
+    assert file.plain() == json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(("kind", "path"), EVERY_FILE, ids=[path.stem for _, path in EVERY_FILE])
+def test_a_file_follows_the_exported_json_schema(kind, path):
+    schema = kind.model_json_schema()
+    follow(schema, json.loads(path.read_text()), schema.get("$defs", {}))
+
+
+@pytest.mark.parametrize("document", [SMESpec, Suite, EvaluationProtocol])
+def test_the_exported_json_schema_states_fields_ranges_and_closes_the_object(document):
+    schema = document.model_json_schema()
+    assert set(schema["properties"]) == set(document.model_fields)
+    assert schema["additionalProperties"] is False
+    json.dumps(schema)
+
+
+def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
+    fields = SMESpec.model_json_schema()["properties"]
+    assert (fields["state_dim"]["minimum"], fields["state_dim"]["maximum"]) == (1, 2**20)
+    assert (fields["r_min"]["minimum"], fields["r_min"]["exclusiveMaximum"]) == (0, 1)
+    assert fields["schema_version"]["const"] == 1
+    assert fields["policy_init"]["enum"] == ["semi_orthogonal", "unit_variance"]
+    for bad in (
+        {"k": 0},
+        {"k": "1"},
+        {"r_min": 1},
+        {"D": -1},
+        {"seed": -1},
+        {"seed": "7"},
+        {"kk": 1},
+    ):
+        schema = SMESpec.model_json_schema()
+        assert follows(schema, SMESpec().plain(), schema["$defs"])
+        assert not follows(schema, SMESpec().plain() | bad, schema["$defs"])
+    assert fields["seed"]["anyOf"][1]["pattern"] == "^0x[0-9a-fA-F]{1,64}$"
+
+
+@pytest.mark.parametrize("file", ENVS, ids=ids(ENVS))
+def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
+    spec = resolve(file.versioned_name)
+    assert spec._fingerprint == file.fingerprint
+    task = materialize(spec)  # compares with the fingerprint
+    assert task.W.shape == (spec.action_dim, spec.state_dim)
+    env = gymnasium.make(f"SME/{file.versioned_name}", disable_env_checker=True)
+    assert env.unwrapped.sme_spec == spec
+    _, info = env.reset(seed=1)
+    assert info == {}
+    s = env.unwrapped.state
+    a = task.optimal_action(s)
+    observation, _, terminated, _, info = env.step(a)
+    assert info["regret"] < 1e-12
+    assert not terminated
+    np.testing.assert_array_equal(env.unwrapped.state, task.transition(s, a))
+    np.testing.assert_array_equal(observation[:-2], env.unwrapped.state.astype(np.float32))
+    env.close()
+
+
+@pytest.mark.parametrize("file", SUITES, ids=ids(SUITES))
+def test_a_suites_instances_are_distinct_tasks_that_can_be_drawn(file):
+    instances = file.suite.instances
+    assert len(instances) == sum(len(member.seeds) for member in file.suite.classes)
+    assert len({spec.digest for spec in instances}) == len(instances)
+    for member in file.suite.classes:
+        first = member.instances[0]
+        assert first == SMESpec.parse({**member.setting.plain(), "seed": member.seeds[0]})
+        materialize(first)
+
+
+def test_suites_have_the_sizes_that_the_design_states():
+    by_name = {file.name: [len(m.seeds) for m in file.suite.classes] for file in SUITES}
+    assert by_name["smoke"] == [2, 2, 2]
+    assert by_name["core"] == [10] * 6
+
+
+def test_core_uses_unit_variance_where_layers_widen():
+    core = next(file.suite for file in SUITES if file.name == "core")
+    for member in core.classes:
+        setting = member.setting
+        if setting.complexity > 1 and setting.state_dim < setting.hidden_width:
+            assert setting.policy_init == "unit_variance"
+    assert sum(member.setting.complexity >= 10 for member in core.classes) >= 3
+
+
+def test_a_released_name_never_changes_its_digest():
+    for file in (*ENVS, *SUITES, *PROTOCOLS):
+        assert RELEASED[file.content][file.versioned_name] == file.digest
+    for kind in (EnvFile, SuiteFile, ProtocolFile):
+        assert sorted(RELEASED[kind.content]) == sorted(catalogue.names(kind))
+
+
+def test_no_two_tasks_of_the_catalogue_are_the_same():
+    assert len({file.digest for file in ENVS}) == len(ENVS)
+    assert len({file.spec.content_name for file in ENVS}) == len(ENVS)
+
+
+def test_names_come_in_natural_order_and_can_be_used_by_every_registry():
+    names = catalogue.names(EnvFile)
+    assert names.index("StateDim4-v1") < names.index("StateDim16-v1")
+    for name in names:
+        assert re.fullmatch(r"[-_\w]+-v1", name)
+
+
+def test_names_by_content_are_read_without_validation_but_are_right():
+    assert dict(catalogue.released()) == {f.versioned_name: f.spec.content_name for f in ENVS}

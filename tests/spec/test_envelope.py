@@ -1,0 +1,186 @@
+"""Files: what `save` writes, `load` reads; what was changed on the way is noticed."""
+
+import json
+
+import gymnasium
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+import sme_registry
+from sme_registry.errors import (
+    DigestMismatchError,
+    FingerprintMismatchError,
+    MalformedDocumentError,
+    OptionError,
+    SpecError,
+)
+from sme_registry.spec import EnvFile, SMESpec
+from sme_registry.task import fingerprint, materialize
+from sme_registry.task.task import _draw_cached
+from tests.strategies import specs
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "mine.json"
+    sme_registry.save(
+        SMESpec(state_dim=3, action_dim=2, seed=5), path, description="ä", tags=("a",)
+    )
+    return path
+
+
+def changed(path, **fields):
+    """The file with some of its fields replaced."""
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+    return path
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
+@given(spec=specs())
+def test_a_spec_survives_its_file(spec, tmp_path):
+    path = sme_registry.save(spec, tmp_path / "task.json")
+    loaded = sme_registry.load(path)
+    assert loaded == spec
+    assert loaded.digest == spec.digest
+    sme_registry.materialize(loaded)  # checks the fingerprint
+
+
+def test_a_file_says_what_it_is(saved):
+    file = EnvFile.read(saved)
+    assert (file.name, file.version, file.versioned_name) == ("mine", 1, "mine-v1")
+    assert (file.description, file.tags) == ("ä", ("a",))
+    assert file.digest == file.spec.digest
+    assert list(json.loads(saved.read_text())) == [
+        "name", "version", "description", "tags", "digest", "spec", "fingerprint",
+    ]  # fmt: skip
+
+
+def test_name_and_description_are_no_part_of_the_identity(saved):
+    before = sme_registry.load(saved)
+    after = sme_registry.load(changed(saved, name="other", description="better", tags=[]))
+    assert before == after
+    assert before.digest == after.digest
+
+
+def test_a_changed_spec_is_noticed_by_its_digest(saved):
+    fields = json.loads(saved.read_text())["spec"] | {"seed": 6}
+    with pytest.raises(DigestMismatchError) as caught:
+        sme_registry.load(changed(saved, spec=fields))
+    message = str(caught.value)
+    assert str(saved) in message
+    assert SMESpec.parse(fields).digest in message
+    assert "take the file again from its source, or save the changed spec as a new file" in message
+
+
+def test_a_changed_digest_is_noticed(saved):
+    with pytest.raises(DigestMismatchError):
+        sme_registry.load(changed(saved, digest="sha256:" + "0" * 64))
+
+
+def bad_fingerprints():
+    spec = SMESpec(state_dim=3, action_dim=2, seed=5)
+    good = fingerprint.take(materialize(spec)).plain()
+    off = json.loads(json.dumps(good))
+    off["next_state"][1][2] += 2e-6
+    yield pytest.param(off, "fingerprint.next_state: differs by 2e-06", id="a number")
+    off = json.loads(json.dumps(good))
+    off["optimal_action"][2][0] -= 0.5
+    yield pytest.param(off, "fingerprint.optimal_action: differs by 0.5", id="an action")
+    yield pytest.param(
+        good | {"next_state": good["next_state"][:2]}, "next_state: has another shape", id="a row"
+    )
+    yield pytest.param(
+        good | {"optimal_action": [[0.1], [0.1, 0.2], [0.3]]}, "has another shape", id="ragged"
+    )
+    off = json.loads(json.dumps(good))
+    off["next_state"][0][0] = 1e999
+    yield pytest.param(off, "next_state: differs by inf", id="overflow")
+
+
+@pytest.mark.parametrize(("published", "fragment"), list(bad_fingerprints()))
+def test_other_numbers_than_the_published_load_but_do_not_run(saved, published, fragment):
+    changed(saved, fingerprint=published)
+    if "Infinity" in saved.read_text():
+        saved.write_text(saved.read_text().replace("Infinity", "1e999"))
+    spec = sme_registry.load(saved)
+    assert spec == SMESpec(state_dim=3, action_dim=2, seed=5)
+    for run in (
+        lambda: sme_registry.materialize(spec),
+        lambda: sme_registry.make(saved),
+        lambda: sme_registry.make(spec),
+        lambda: sme_registry.make_vec(spec, 2),
+        lambda: gymnasium.make(sme_registry.env_spec(spec)),
+        lambda: gymnasium.make("SME/Default-v1", spec=str(saved)),
+        lambda: sme_registry.register(spec, "BadFingerprint"),
+        lambda: sme_registry.save(spec, saved.with_name("copy.json")),
+    ):
+        with pytest.raises(FingerprintMismatchError, match=fragment):
+            run()
+    assert not saved.with_name("copy.json").exists()
+    assert "SME/BadFingerprint-v1" not in gymnasium.registry
+
+
+def test_a_rounding_difference_is_no_other_task(saved):
+    published = json.loads(saved.read_text())["fingerprint"]
+    published["next_state"][1][2] += 5e-7
+    sme_registry.materialize(sme_registry.load(changed(saved, fingerprint=published)))
+
+
+def test_one_bad_file_does_not_spoil_the_equal_spec_from_elsewhere(saved):
+    spec = SMESpec(state_dim=3, action_dim=2, seed=987)
+    good = sme_registry.save(spec, saved.with_name("good.json"))
+    text = good.read_text()
+    _draw_cached.cache_clear()
+    bad = saved.with_name("bad.json")
+    bad.write_text(text)
+    numbers = json.loads(text)["fingerprint"]
+    numbers["next_state"][0][0] += 0.1
+    changed(bad, fingerprint=numbers)
+    with pytest.raises(FingerprintMismatchError):
+        sme_registry.materialize(sme_registry.load(bad))
+    task = sme_registry.materialize(spec)
+    assert sme_registry.materialize(task.spec) is task
+
+
+def test_a_derived_spec_is_held_to_no_fingerprint(saved):
+    sme_registry.materialize(sme_registry.load(saved).derive(seed=6))
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        ("", MalformedDocumentError),
+        ("[]", SpecError),
+        ("{}", SpecError),
+        ('{"name": "a"}', SpecError),
+        (json.dumps(SMESpec().plain()), SpecError),
+        ('{"name": ' + "[" * 990 + "]" * 990 + "}", SpecError),
+    ],
+)
+def test_what_is_not_a_tasks_file_is_refused_with_its_path(tmp_path, content, error):
+    path = tmp_path / "bad.json"
+    path.write_text(content)
+    with pytest.raises(error) as caught:
+        sme_registry.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_saving_under_a_bad_name_writes_nothing(tmp_path):
+    for arguments in ({"name": "my task"}, {"tags": ("x y",)}, {"description": "x" * 2001}):
+        with pytest.raises(SpecError):
+            sme_registry.save(SMESpec(), tmp_path / "task.json", **arguments)
+    with pytest.raises(SpecError, match="name='my task': must be a string of 1 to 64 letters"):
+        sme_registry.save(SMESpec(), tmp_path / "my task.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_saving_over_a_folder_is_refused(tmp_path):
+    (tmp_path / "task").mkdir()
+    with pytest.raises(OptionError, match="cannot be written"):
+        sme_registry.save(SMESpec(), tmp_path / "task")
+
+
+def test_saving_again_replaces_the_file_whole(saved):
+    sme_registry.save(SMESpec(seed=9), saved)
+    assert sme_registry.load(saved) == SMESpec(seed=9)
+    assert [child.name for child in saved.parent.iterdir()] == ["mine.json"]

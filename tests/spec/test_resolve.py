@@ -1,0 +1,98 @@
+"""Whatever names a task leads to its spec, and what names nothing is told what is near."""
+
+import shutil
+
+import pytest
+
+from sme_registry.errors import MalformedDocumentError, SMEError, SpecError, UnknownNameError
+from sme_registry.spec import EnvFile, SMESpec, catalogue
+from sme_registry.spec.resolve import resolve
+
+DEFAULT = catalogue.find(EnvFile, "Default-v1")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "SME/Default-v1",
+        "Default-v1",
+        "Default",
+        "SME/Default",
+        "sme_registry:SME/Default-v1",
+        f"SME/{DEFAULT.spec.content_name}-v1",
+        DEFAULT.spec.content_name,
+        DEFAULT.digest,
+        DEFAULT.digest[: 7 + 12],
+        DEFAULT.digest[:30],
+        DEFAULT.digest.upper().replace("SHA", "sha"),
+        str(catalogue.spec_folder() / "envs" / "Default-v1.json"),
+        catalogue.spec_folder() / "envs" / "Default-v1.json",
+        {},
+        {"complexity": 1},
+        SMESpec(),
+    ],
+)
+def test_every_name_of_the_default_task_leads_to_it(name):
+    assert resolve(name) == SMESpec()
+
+
+def test_specs_of_named_files_carry_their_fingerprint_and_others_none():
+    assert resolve("Default")._fingerprint == DEFAULT.fingerprint
+    assert resolve(DEFAULT.digest)._fingerprint == DEFAULT.fingerprint
+    assert resolve({})._fingerprint is None
+    assert resolve(SMESpec(k=7))._fingerprint is None
+
+
+def test_instances_of_suites_are_found_by_digest():
+    from sme_registry.spec import SuiteFile
+
+    suite = catalogue.entries(SuiteFile)[0].suite
+    for spec in suite.instances[:3]:
+        assert resolve(spec.digest[:19]) == spec
+
+
+def test_a_path_needs_no_ending_where_it_cannot_be_a_name(tmp_path):
+    path = tmp_path / "task"
+    shutil.copy(catalogue.spec_folder() / "envs" / "Default-v1.json", path)
+    assert resolve(path) == SMESpec()
+    assert resolve(str(path)) == SMESpec()
+
+
+@pytest.mark.parametrize(
+    ("name", "fragment"),
+    [
+        ("Defualt", "Did you mean 'Default-v1'"),
+        ("default-v1", "Did you mean 'Default-v1'"),
+        ("SME/Complexity11-v1", "Did you mean 'Complexity1"),
+        ("SME/Default-v2", "Did you mean 'Default-v1'"),
+        ("xyzzy", "`sme list` shows what there is."),
+        ("", "`sme list` shows what there is."),
+        ("sha256:66e9", "give at least 12 hex digits"),
+        ("sha256:zzzzzzzzzzzz", "load its file instead"),
+        (DEFAULT.digest[:18] + "0", f"Did you mean '{DEFAULT.digest[:19]}'?"),
+        (f"SME/{DEFAULT.spec.content_name}-v9", "no task has version 9 of the dynamics"),
+    ],
+)
+def test_an_unknown_name_is_told_what_is_near(name, fragment):
+    with pytest.raises(UnknownNameError) as caught:
+        resolve(name)
+    assert fragment in str(caught.value)
+    assert isinstance(caught.value, LookupError)
+
+
+@pytest.mark.parametrize("thing", [None, 5, b"Default-v1", ["Default-v1"], 0.5, SMESpec])
+def test_what_names_nothing_at_all_is_refused(thing):
+    with pytest.raises(SpecError, match="must be an SMESpec or a mapping"):
+        resolve(thing)
+
+
+@pytest.mark.parametrize("path", ["/no/such/file.json", "no-such.json", "a\0.json"])
+def test_a_missing_file_says_so(path):
+    with pytest.raises(MalformedDocumentError, match="cannot be read"):
+        resolve(path)
+
+
+def test_nothing_but_our_errors_comes_of_odd_names():
+    for name in ("/", "//", "SME/", ":", "SME/Default-v1-v1", "\0", "é" * 1000, "sha256:", "-v1"):
+        with pytest.raises(SMEError):
+            resolve(name)

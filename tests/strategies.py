@@ -1,0 +1,57 @@
+"""Hypothesis strategies for valid documents, small enough to be drawn and stepped at once."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+from hypothesis import strategies as st
+
+from sme_registry.spec import SMESpec
+
+SEEDS = st.one_of(
+    st.integers(0, 2**53 - 1),
+    st.integers(0, 2**256 - 1).map(lambda number: f"0x{number:x}"),
+)
+THRESHOLDS = st.one_of(
+    st.sampled_from([0.0, 0.25, 0.5, 0.95]), st.floats(0.0, 1.0, exclude_max=True)
+)
+
+
+@st.composite
+def teams(draw: st.DrawFn, state_dim: int, action_dim: int) -> dict[str, Any]:
+    """Teams that share out `action_dim` channels and observe any of `state_dim`."""
+    cuts = draw(st.sets(st.integers(1, action_dim - 1), max_size=3)) if action_dim > 1 else set()
+    borders = [0, *sorted(cuts), action_dim]
+    channels = st.lists(st.integers(0, state_dim - 1), min_size=1, unique=True).map(sorted)
+    agents = [
+        {"action_dim": high - low, "observes": draw(st.one_of(st.just("all"), channels))}
+        for low, high in itertools.pairwise(borders)
+    ]
+    return {"agents": agents, "reward": draw(st.sampled_from(["individual", "team"]))}
+
+
+@st.composite
+def spec_fields(draw: st.DrawFn, team: bool | None = None) -> dict[str, Any]:
+    """The fields of a valid spec as plain data; `team` says whether it has one (None: either)."""
+    state_dim, action_dim = draw(st.integers(1, 6)), draw(st.integers(1, 5))
+    fields = {
+        "state_dim": state_dim,
+        "action_dim": action_dim,
+        "k": draw(st.integers(1, 10)),
+        "r_min": draw(THRESHOLDS),
+        "D": draw(THRESHOLDS),
+        "complexity": draw(st.integers(1, 4)),
+        "horizon": draw(st.integers(1, 30)),
+        "hidden_width": draw(st.sampled_from([1, 2, 5, 16, 20])),
+        "policy_init": draw(st.sampled_from(["semi_orthogonal", "unit_variance"])),
+        "seed": draw(SEEDS),
+    }
+    if draw(st.booleans()) if team is None else team:
+        fields["team"] = draw(teams(state_dim, action_dim))
+    return fields
+
+
+def specs(team: bool | None = None) -> st.SearchStrategy[SMESpec]:
+    """Valid specs; `team` says whether they have one (None: either)."""
+    return spec_fields(team).map(SMESpec.parse)
