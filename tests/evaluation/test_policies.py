@@ -67,7 +67,8 @@ def test_a_policy_that_overwrites_its_observations_changes_nothing():
         observations[:] = 7.0
         return actions
 
-    assert judged(overwriting).regions == judged(lambda o: o[:, :2]).regions
+    honest = judged(lambda o: o[:, :2], name="overwriting")
+    assert judged(overwriting) == honest
 
 
 def test_actions_are_clipped_and_the_clipped_share_is_counted():

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.regions import expansion, observations, region_name
+from sme_registry.evaluation.regions import _Shell, expansion, observations, region_name
 from sme_registry.spec import EvaluationProtocol, SMESpec
 
 SIGNIFICANCE = 1e-3  # of each test below; the seeds are fixed, so it fails always or never
@@ -50,6 +50,17 @@ def test_a_thin_shell_loses_no_state_to_rounding(epsilons):
     E = expansion(states(region, 8, epsilons=epsilons))
     assert (low < E).all()
     assert (high >= E).all()
+
+
+def test_a_state_beside_the_opposite_face_is_not_rounded_over_it():
+    # The float32 grid is finer below 0 than above 1, so both faces must be brought to the same E.
+    protocol = EvaluationProtocol(epsilons=(0.2, 0.2000005))
+    low, high = protocol.edges[2]
+    shell = _Shell(protocol, 2, 8)
+    for u in (2.0**-53, 1.0 - 2.0**-53):
+        E = expansion(shell.states(np.full((20_000, 8), u)).astype(np.float64))
+        assert (low < E).all()
+        assert (high >= E).all()
 
 
 def test_a_shell_without_a_float32_number_is_refused():

@@ -1,0 +1,224 @@
+"""Figures: whole files of the asked format, and what is drawn in them."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, evaluate, materialize
+from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
+
+pytest.importorskip("matplotlib")
+
+from sme_registry import plots
+
+PLANE = SMESpec(state_dim=2, action_dim=2)
+PROTOCOL = {"states_per_region": 100, "epsilons": [0.5, 1.0]}
+SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+
+
+def half(observations):
+    return np.full((len(observations), 2), 0.5)
+
+
+@pytest.fixture(scope="module")
+def report():
+    return evaluate(half, PLANE, PROTOCOL, name=r"a $\frac$ name")
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Every figure drawn in a test, as it was when it was saved."""
+    from matplotlib.figure import Figure
+
+    drawn = []
+    save = Figure.savefig
+
+    def saving(figure, *args, **kw):
+        drawn.append(figure)
+        return save(figure, *args, **kw)
+
+    monkeypatch.setattr(Figure, "savefig", saving)
+    return drawn
+
+
+EPISODES = [{"step": 100 * (i + 1), "mean_regret": 1.0 - i / 50} for i in range(50)]
+
+
+@pytest.mark.parametrize("ending", plots.FORMATS)
+@pytest.mark.parametrize("kind", ["decay_curve", "similarity_map", "training_curve"])
+def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind):
+    path = tmp_path / "made" / f"figure.{ending}"
+    written = {
+        "decay_curve": lambda: plots.decay_curve(report, path),
+        "similarity_map": lambda: plots.similarity_map(half, PLANE, path, resolution=20),
+        "training_curve": lambda: plots.training_curve(EPISODES, path),
+    }[kind]()
+    assert written == path
+    assert path.read_bytes().startswith(SIGNATURES[ending])
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("ending", plots.FORMATS)
+def test_the_same_figure_is_the_same_file(tmp_path, report, ending):
+    first, second = tmp_path / f"1.{ending}", tmp_path / f"2.{ending}"
+    plots.decay_curve(report, first)
+    plots.decay_curve(report, second)
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["figure.jpg", "figure", "png"])
+def test_another_format_is_refused_before_anything_is_drawn(tmp_path, report, name):
+    with pytest.raises(OptionError, match=r"must end in \.png, \.pdf, \.svg"):
+        plots.decay_curve(report, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "map.png"
+    path.write_bytes(b"old")
+    with pytest.raises(PolicyError):
+        plots.similarity_map(lambda o: np.zeros((len(o), 3)), PLANE, path, resolution=4)
+    assert path.read_bytes() == b"old"
+
+
+def test_without_matplotlib_the_message_names_the_extra(tmp_path, report, monkeypatch):
+    for module in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[plot\]'"):
+        plots.decay_curve(report, tmp_path / "figure.png")
+
+
+def test_drawing_leaves_matplotlibs_settings_alone(tmp_path, report):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    plots.decay_curve(report, tmp_path / "figure.png")
+    with pytest.raises(PolicyError):
+        plots.similarity_map(lambda o: None, PLANE, tmp_path / "map.png", resolution=4)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_decay_curve_shows_the_reports_numbers_and_every_reference(tmp_path, report, figures):
+    plots.decay_curve(report, tmp_path / "figure.png")
+    for axes, measure in zip(figures[0].axes, ("similarity", "normalised_regret"), strict=True):
+        drawn = [tuple(line.get_ydata()) for line in axes.lines]
+        for regions in (report.regions, *report.references.values()):
+            assert tuple(getattr(region, measure) for region in regions) in drawn
+        assert tuple(axes.lines[0].get_xdata()) == (0.0, 0.5, 1.0)
+        assert "not comparable" in axes.get_xlabel()
+
+
+def test_a_policys_name_is_not_read_as_a_formula(tmp_path, report, figures):
+    plots.decay_curve(report, tmp_path / "figure.png")  # "$\\frac$" would be an error
+    assert figures[0].legends[0].get_texts()[0].get_text() == r"a \$\frac\$ name"
+
+
+def test_decay_curve_draws_references_once_for_each_task(tmp_path, report, figures):
+    again = report.model_copy(update={"policy": "again"})
+    other = evaluate(half, PLANE.derive(seed=1), PROTOCOL)
+    for reports in ([report], [report, again], [report, again, other]):
+        plots.decay_curve(reports, tmp_path / "figure.png", measures=["similarity"])
+    lines = [sum(len(line.get_xdata()) > 0 for line in f.axes[0].lines) for f in figures]
+    assert lines == [1 + 5, 2 + 5, 3 + 5 + 5]
+    plots.decay_curve(report, tmp_path / "figure.png", references=False)
+    assert len(figures[-1].axes[0].lines) == 1
+
+
+def test_decay_curve_of_different_state_dims_warns_that_levels_differ(tmp_path, report, figures):
+    other = evaluate(half, PLANE.derive(state_dim=3), PROTOCOL)
+    plots.decay_curve([report, other], tmp_path / "figure.png")
+    assert "different S: these levels are not comparable" in figures[0].axes[0].get_xlabel()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(([],), "must be one or more evaluation reports"), (("r", "m"), "measures=")],
+)
+def test_decay_curve_refuses_what_it_cannot_draw(tmp_path, report, arguments, message):
+    reports = report if arguments[0] == "r" else arguments[0]
+    measures = ["mae"] if len(arguments) > 1 else ["similarity"]
+    with pytest.raises(OptionError, match=message):
+        plots.decay_curve(reports, tmp_path / "figure.png", measures=measures)
+
+
+def test_similarity_map_shows_r_over_the_plane_beyond_the_unit_square(tmp_path, figures):
+    plots.similarity_map(half, PLANE, tmp_path / "map.png", resolution=8)
+    axes = figures[0].axes[0]
+    (image,) = axes.images
+    assert image.get_extent() == [-0.5, 1.5, -0.5, 1.5]
+    side = (np.arange(8) + 0.5) / 4 - 0.5
+    task = materialize(PLANE)
+    expected = [[task.similarity([x, y], [0.5, 0.5]) for x in side] for y in side]
+    assert np.abs(np.asarray(image.get_array()) - expected).max() < 1e-6
+    outline = axes.lines[0]
+    assert set(zip(*outline.get_data(), strict=True)) == {(0, 0), (1, 0), (1, 1), (0, 1)}
+
+
+def test_similarity_map_gives_the_policy_the_asked_time(tmp_path):
+    seen = set()
+
+    def watching(observations):
+        assert observations.dtype == np.float32
+        seen.update(map(tuple, observations[:, 2:]))
+        return half(observations)
+
+    plots.similarity_map(watching, PLANE, tmp_path / "map.png", resolution=4, time=0.25)
+    assert seen == {(0.25, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "message"),
+    [
+        ("Default-v1", {}, "state_dim=8: must be 2 for a map"),
+        (PLANE, {"epsilon": 0.0}, r"epsilon=0.0: must be in \(0, 100\]"),
+        (PLANE, {"epsilon": float("nan")}, r"epsilon=nan: must be in"),
+        (PLANE, {"resolution": 1}, r"resolution=1: must be in \[2, 2000\]"),
+        (PLANE, {"time": 1.5}, r"time=1.5: must be in \[0, 1\]"),
+    ],
+)
+def test_similarity_map_refuses_arguments_out_of_range(tmp_path, spec, options, message):
+    with pytest.raises(OptionError, match=message):
+        plots.similarity_map(half, spec, tmp_path / "map.png", **options)
+
+
+def test_training_curve_reads_a_csv_and_leaves_out_a_row_cut_short(tmp_path, figures):
+    path = tmp_path / "episodes.csv"
+    rows = [f"{i},{row['step']},{row['mean_regret']}" for i, row in enumerate(EPISODES)]
+    path.write_text("\n".join(["episode,step,mean_regret", *rows, "51,51"]))
+    plots.training_curve(path, tmp_path / "from-csv.png", window=5)
+    plots.training_curve(EPISODES, tmp_path / "from-rows.png", window=5)
+    cloud, expected = (f.axes[0].collections[0].get_offsets() for f in figures)
+    assert len(cloud) == 50
+    assert np.array_equal(cloud, expected)
+
+
+def test_training_curve_is_the_running_median(tmp_path, figures):
+    rng = np.random.default_rng(0)
+    rows = [{"step": i, "mean_regret": r} for i, r in enumerate(rng.random(30), start=1)]
+    plots.training_curve(rows, tmp_path / "figure.png", window=5)
+    regret = np.array([row["mean_regret"] for row in rows])
+    line = figures[0].axes[0].lines[0]
+    medians = [np.median(regret[max(0, i - 2) : i + 3]) for i in range(30)]
+    assert np.array_equal(line.get_ydata(), medians)
+    assert np.array_equal(line.get_xdata(), np.arange(1, 31))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "holds no finished episode yet"),
+        ("step,mean_regret\n", "holds no finished episode yet"),
+        ("a,b\n1,2\n", "must have numbers for step and mean_regret"),
+        ("step,mean_regret\n1,x\n", "must have numbers for step and mean_regret"),
+        (None, "cannot be read"),
+    ],
+)
+def test_training_curve_refuses_what_is_no_log(tmp_path, content, message):
+    path = tmp_path / "episodes.csv"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(OptionError, match=message):
+        plots.training_curve(path, tmp_path / "figure.png")
