@@ -8,7 +8,8 @@ uniform_random         a ~ U([0, 1]^A), drawn anew in each state
 
 The two fitted ones know the training cube only: they are fitted on the states of WD, at most
 `FIT_STATES` of them (all, under paper-v1), and used unchanged in every other region. So they lose
-outside what an agent that learnt no more than they did would lose.
+outside what an agent that learnt no more than they did would lose. Judged in WD on the states they
+were fitted on, they look too good there where those are not many times state_dim.
 """
 
 from __future__ import annotations
