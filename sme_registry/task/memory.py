@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import SMESpec
-from sme_registry.task.draw import agents, observed_channels
+from sme_registry.task.draw import agents
 
 LIMIT_VARIABLE = "SME_MEMORY_LIMIT_GIB"
 DEFAULT_LIMIT_GIB = 4.0
@@ -52,21 +52,26 @@ def refuse_above_limit(needed: int, what: str, remedy: str) -> None:
     limit = limit_bytes()
     if needed > limit:
         raise ResourceLimitError(
-            f"{what} would need {needed / 2**30:,.2f} GiB of memory; the limit is "
-            f"{limit / 2**30:g} GiB. {remedy} Where there is memory for it, set "
-            f"{LIMIT_VARIABLE} above {needed / 2**30:,.2f}."
+            f"{what} would need {_gib(needed)} GiB of memory; the limit is {_gib(limit)} GiB. "
+            f"{remedy} Where there is memory for it, set {LIMIT_VARIABLE} above {_gib(needed)}."
         )
+
+
+def _gib(count: int) -> str:
+    gib = count / 2**30
+    return f"{gib:.1f}" if gib >= 10 else f"{gib:.3g}"
 
 
 def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
     """`(inputs, outputs, how many)` of every matrix of a task, without a list of its layers."""
     H, inner = spec.hidden_width, spec.complexity - 1
-    yield spec.state_dim, spec.action_dim, 1
-    for agent, observed in zip(agents(spec), observed_channels(spec), strict=True):
+    yield spec.action_dim, spec.state_dim, 1  # W and b of the transition
+    for agent in agents(spec):
+        observed = spec.state_dim if agent.observes == "all" else len(agent.observes)
         if inner == 0:
-            yield len(observed), agent.action_dim, 1
+            yield observed, agent.action_dim, 1
         else:
-            yield len(observed), H, 1
+            yield observed, H, 1
             if inner > 1:
                 yield H, H, inner - 1
             yield H, agent.action_dim, 1

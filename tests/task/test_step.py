@@ -1,0 +1,175 @@
+"""Episodes by the definition: payouts, ends, and the optimum that earns the maximal return."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import sme_registry
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize, observe, step
+from tests.strategies import specs
+
+
+def rollout(task, B, act, seed=0):
+    """Steps of `B` episodes side by side until the horizon; ends are recorded, not obeyed."""
+    random = np.random.default_rng(seed)
+    s, t, r_cum = random.random((B, task.spec.state_dim)), np.zeros(B, np.int64), np.zeros(B)
+    steps = []
+    for _ in range(task.spec.horizon):
+        steps.append(step(task, s, t, r_cum, act(s, random)))
+        s, t, r_cum = steps[-1].state, t + 1, steps[-1].accumulated_reward
+    return steps
+
+
+def mixed(task):
+    """Actions between the optimum and noise, so that rewards of every size occur."""
+
+    def act(s, random):
+        best = task.policy(s[:, None, :])[:, 0, :]
+        return best + random.random((len(s), 1)) ** 2 * (random.random(best.shape) - best)
+
+    return act
+
+
+@given(specs())
+def test_the_optimum_earns_exactly_the_horizon(spec):
+    task = materialize(spec)
+    steps = rollout(task, 3, lambda s, _: task.policy(s[:, None, :])[:, 0, :])
+    assert not any(done.terminated.any() for done in steps)
+    np.testing.assert_array_equal(np.sum([done.reward for done in steps], axis=0), spec.horizon)
+    assert all((done.similarity == 1.0).all() for done in steps)
+
+
+@given(st.integers(1, 12), st.sampled_from([0.0, 0.5, 0.999]), st.integers(1, 30))
+def test_the_optimum_earns_exactly_the_horizon_in_the_environment(k, r_min, horizon):
+    env = sme_registry.make(
+        SMESpec(state_dim=3, action_dim=2, k=k, r_min=r_min, D=r_min, horizon=horizon),
+        disable_env_checker=True,
+    )
+    env.reset(seed=1)
+    earned, ended = 0.0, False
+    while not ended:
+        best = env.unwrapped.task.optimal_action(env.unwrapped.state)
+        _, reward, terminated, ended, info = env.step(best)
+        earned += reward
+        assert not terminated
+        assert info["regret"] < 1e-12
+    assert earned == pytest.approx(horizon, abs=1e-10)
+
+
+@given(specs())
+def test_what_is_earned_is_paid_or_pending_at_every_step(spec):
+    task = materialize(spec)
+    steps = rollout(task, 5, mixed(task))
+    earned = paid = np.zeros(5)
+    for done in steps:
+        earned, paid = earned + done.step_reward, paid + done.reward
+        np.testing.assert_allclose(paid + done.accumulated_reward, earned, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(steps[-1].accumulated_reward, 0.0)  # truncation pays the rest
+
+
+@given(specs())
+def test_payouts_come_every_k_steps_and_at_the_horizon(spec):
+    task = materialize(spec)
+    for t, done in enumerate(rollout(task, 5, mixed(task)), start=1):
+        if t % spec.k == 0 or t == spec.horizon:
+            np.testing.assert_array_equal(done.accumulated_reward, 0.0)
+        else:
+            np.testing.assert_array_equal(done.reward, 0.0)
+        assert (done.truncated == (t >= spec.horizon)).all()
+        np.testing.assert_array_equal(done.terminated, done.step_reward < spec.D)
+
+
+def one_step(spec, t, r_cum, off):
+    """One step of one lane whose action is `off` from the optimum in every channel."""
+    task = materialize(spec)
+    s = np.full((1, spec.state_dim), 0.3)
+    best = task.policy(s[:, None, :])[:, 0, :]
+    a = np.where(best > 0.5, best - off, best + off)
+    return step(task, s, np.array([t]), np.array([r_cum]), a)
+
+
+def test_termination_alone_pays_nothing_and_shows_what_is_lost():
+    done = one_step(SMESpec(k=10, D=0.5, horizon=100), t=3, r_cum=2.5, off=0.2)
+    assert done.terminated[0]
+    assert not done.truncated[0]
+    assert done.reward[0] == 0.0
+    assert done.accumulated_reward[0] == pytest.approx(2.5 + 0.2, abs=1e-12)
+
+
+def test_termination_on_a_payout_step_is_paid_as_any_other():
+    done = one_step(SMESpec(k=4, D=0.5, horizon=100), t=3, r_cum=2.5, off=0.2)
+    assert done.terminated[0]
+    assert done.reward[0] == pytest.approx(2.7, abs=1e-12)
+
+
+def test_termination_and_truncation_may_fall_on_one_step_which_is_paid():
+    done = one_step(SMESpec(k=10, D=0.5, horizon=4), t=3, r_cum=2.5, off=0.2)
+    assert done.terminated[0]
+    assert done.truncated[0]
+    assert done.reward[0] == pytest.approx(2.7, abs=1e-12)
+    assert done.accumulated_reward[0] == 0.0
+
+
+def test_survival_is_tested_on_the_gated_step_reward_and_strictly():
+    # r̂ is 0.2 where every channel is 0.2 off.
+    assert not one_step(SMESpec(D=0.1), 0, 0.0, 0.2).terminated[0]
+    assert one_step(SMESpec(D=0.1, r_min=0.3), 0, 0.0, 0.2).terminated[0]
+    exact = float(one_step(SMESpec(), 0, 0.0, 0.2).step_reward[0])
+    assert not one_step(SMESpec(D=exact), 0, 0.0, 0.2).terminated[0]
+    assert one_step(SMESpec(D=float(np.nextafter(exact, 1.0))), 0, 0.0, 0.2).terminated[0]
+
+
+def test_without_a_survival_threshold_nothing_terminates():
+    assert not one_step(SMESpec(D=0.0), 0, 0.0, 0.4).terminated[0]
+
+
+@given(specs())
+def test_observations_are_state_time_and_pending_reward_in_the_unit_interval(spec):
+    task = materialize(spec)
+    for t, done in enumerate(rollout(task, 5, mixed(task)), start=1):
+        seen = observe(spec, done.state, np.full(5, t), done.accumulated_reward)
+        assert seen.dtype == np.float32
+        assert seen.shape == (5, spec.state_dim + 2)
+        assert ((seen >= 0.0) & (seen <= 1.0)).all()
+        np.testing.assert_array_equal(seen[:, :-2], done.state.astype(np.float32))
+        np.testing.assert_array_equal(seen[:, -2], np.float32(t / spec.horizon))
+        np.testing.assert_array_equal(
+            seen[:, -1], (done.accumulated_reward / spec.k).astype(np.float32)
+        )
+    assert seen[0, -2] == 1.0
+
+
+@given(specs(), st.integers(1, 9))
+def test_a_batch_is_its_single_lanes_bit_for_bit(spec, B):
+    task = materialize(spec)
+    random = np.random.default_rng(B)
+    s, a = random.random((B, spec.state_dim)), random.random((B, spec.action_dim))
+    t, r_cum = random.integers(0, spec.horizon, B), random.random(B)
+    whole = step(task, s, t, r_cum, a)
+    for i in range(B):
+        lane = slice(i, i + 1)
+        single = step(task, s[lane], t[lane], r_cum[lane], a[lane])
+        for field in whole._fields:
+            np.testing.assert_array_equal(getattr(whole, field)[lane], getattr(single, field))
+
+
+def test_the_environment_follows_the_definition():
+    spec = SMESpec(state_dim=5, action_dim=3, k=4, r_min=0.2, complexity=2, horizon=20, seed=9)
+    task, env = materialize(spec), gymnasium.make(sme_registry.env_spec(spec))
+    random = np.random.default_rng(3)
+    env.reset(seed=5)
+    s, r_cum = env.unwrapped.state[None], np.zeros(1)
+    for t in range(20):
+        a = np.clip(mixed(task)(s, random), 0.0, 1.0).astype(np.float32)
+        done = step(task, s, np.array([t]), r_cum, a.astype(np.float64))
+        seen, reward, terminated, truncated, info = env.step(a[0])
+        np.testing.assert_array_equal(env.unwrapped.state, done.state[0])
+        np.testing.assert_array_equal(seen[:5], done.state[0].astype(np.float32))
+        np.testing.assert_allclose(info["optimal_action"], done.optimal_action[0], atol=1e-12)
+        assert reward == pytest.approx(done.reward[0], abs=1e-12)
+        assert info["accumulated_reward"] == pytest.approx(done.accumulated_reward[0], abs=1e-12)
+        assert (terminated, truncated) == (bool(done.terminated[0]), bool(done.truncated[0]))
+        s, r_cum = done.state, done.accumulated_reward

@@ -1,0 +1,265 @@
+"""The equations: transition, optimal policy, similarity, step reward, regret."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from sme_registry.errors import ActionError, SpecError, StateError
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
+from tests.strategies import specs
+
+UNIT = st.floats(0.0, 1.0)
+
+
+def rng():
+    return np.random.default_rng(20261121)
+
+
+@given(specs(), st.data())
+def test_the_transition_maps_the_cube_into_itself(spec, data):
+    task = materialize(spec)
+    s = data.draw(hnp.arrays(np.float64, (3, spec.state_dim), elements=UNIT))
+    a = data.draw(hnp.arrays(np.float64, (3, spec.action_dim), elements=UNIT))
+    moved = task.transition(s, a)
+    assert moved.shape == s.shape
+    assert ((moved >= 0.0) & (moved <= 1.0)).all()
+
+
+@given(specs())
+def test_the_transition_is_the_arc_cosine_of_the_method_to_rounding(spec):
+    task = materialize(spec)
+    s, a = rng().random((50, spec.state_dim)), rng().random((50, spec.action_dim))
+    a = a.astype(np.float32).astype(np.float64)
+    expected = np.arccos(np.cos(2.0 * np.pi * (s + a @ task.W + task.b))) / np.pi
+    # arccos loses half of the digits where its argument is ±1.
+    np.testing.assert_allclose(task.transition(s, a), expected, rtol=0, atol=3e-8)
+
+
+def test_the_triangle_wave_has_its_values_at_its_corners():
+    task = materialize(SMESpec(state_dim=1, action_dim=1))
+    b = float(task.b[0])
+    for y, folded in [(0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (0.75, 0.5), (1.0, 0.0), (-0.125, 0.25)]:
+        assert task.transition([y - b], [0.0])[0] == pytest.approx(folded, abs=1e-15)
+
+
+def test_random_actions_keep_uniform_states_uniform():
+    task = materialize(SMESpec(state_dim=4, action_dim=3, seed=2))
+    random = rng()
+    s = random.random((20_000, 4))
+    for _ in range(25):
+        s = task.transition(s, random.random((20_000, 3)))
+    for channel in s.T:
+        assert stats.kstest(channel, "uniform").pvalue > 0.001
+
+
+@given(specs())
+def test_the_transition_is_lipschitz_in_state_and_action_jointly(spec):
+    task = materialize(spec)
+    random = rng()
+    s, ds = random.random((2, 50, spec.state_dim))
+    a, da = random.random((2, 50, spec.action_dim))
+    a2 = np.clip(a + 0.01 * (da - 0.5), 0.0, 1.0)
+    a, a2 = (x.astype(np.float32).astype(np.float64) for x in (a, a2))
+    s2 = s + 0.01 * (ds - 0.5)
+    moved = np.linalg.norm(task.transition(s2, a2) - task.transition(s, a), axis=1)
+    apart = np.sqrt(((s2 - s) ** 2).sum(axis=1) + ((a2 - a) ** 2).sum(axis=1))
+    bound = 2.0 * np.sqrt(1.0 + np.linalg.norm(task.W, 2) ** 2)
+    assert (moved <= bound * apart + 1e-12).all()
+    s_alone = np.linalg.norm(task.transition(s2, a) - task.transition(s, a), axis=1)
+    assert (s_alone <= 2.0 * np.linalg.norm(s2 - s, axis=1) + 1e-12).all()
+
+
+def test_uniform_states_give_near_uniform_optimal_actions():
+    task = materialize(SMESpec(state_dim=32, action_dim=4, complexity=1))
+    actions = task.optimal_action(rng().random((20_000, 32)))
+    for channel in actions.T:
+        assert stats.kstest(channel, "uniform").statistic < 0.02
+
+
+def constant_similarity(**fields):
+    """Mean r̃ of the constant policy ½ over four draws of a plane task."""
+    tasks = [materialize(SMESpec(state_dim=2, action_dim=2, seed=i, **fields)) for i in range(4)]
+    s = rng().random((2000, 2))
+    return np.mean([task.similarity(s, np.full((2000, 2), 0.5)) for task in tasks])
+
+
+def test_unit_variance_keeps_widening_policies_from_bunching_around_a_half():
+    # METHOD: at S = A = 2 and L = 3 the paper's words make a target of which ½ is 0.91 right.
+    assert 0.87 < constant_similarity(complexity=3) < 0.95
+    for complexity in (2, 3, 5, 10):
+        similarity = constant_similarity(complexity=complexity, policy_init="unit_variance")
+        assert 0.7 < similarity < 0.82
+
+
+@given(specs())
+def test_the_optimum_has_similarity_of_exactly_one(spec):
+    task = materialize(spec)
+    s = rng().uniform(-0.5, 1.5, (20, spec.state_dim))
+    a = task.optimal_action(s)
+    np.testing.assert_array_equal(task.similarity(s, a), 1.0)
+    np.testing.assert_array_equal(task.step_reward(s, a), 1.0)
+    np.testing.assert_array_equal(task.regret(s, a), 0.0)
+    assert task.similarity(s[0], task.optimal_action(s[0])) == 1.0
+
+
+@given(specs())
+def test_similarity_reward_and_regret_are_the_methods(spec):
+    task = materialize(spec)
+    s, a = rng().random((50, spec.state_dim)), rng().random((50, spec.action_dim))
+    a[25:] = np.clip(task.optimal_action(s[25:]) + 0.1 * (a[25:] - 0.5), 0.0, 1.0)
+    similarity = 1.0 - np.abs(a - task.optimal_action(s)).mean(axis=1)
+    np.testing.assert_allclose(task.similarity(s, a), similarity, rtol=0, atol=1e-15)
+    graded = np.maximum(0.0, 4.0 * (task.similarity(s, a) - 0.75))
+    reward = np.where(graded > spec.r_min, graded, 0.0)
+    np.testing.assert_array_equal(task.step_reward(s, a), reward)
+    np.testing.assert_array_equal(task.regret(s, a), 1.0 - reward)
+
+
+def test_the_reward_threshold_is_strict():
+    task = materialize(SMESpec(r_min=0.5))
+    np.testing.assert_array_equal(
+        task.reward_of([0.75, 0.875, np.nextafter(0.875, 1.0), 1.0]),
+        [0.0, 0.0, 4.0 * (np.nextafter(0.875, 1.0) - 0.75), 1.0],
+    )
+    assert materialize(SMESpec()).reward_of(0.75) == 0.0
+
+
+@given(specs())
+def test_a_single_state_is_answered_as_its_row_of_a_batch(spec):
+    task = materialize(spec)
+    s, a = rng().random((7, spec.state_dim)), rng().random((7, spec.action_dim))
+    for i in range(7):
+        np.testing.assert_array_equal(task.transition(s[i], a[i]), task.transition(s, a)[i])
+        np.testing.assert_allclose(
+            task.optimal_action(s[i]), task.optimal_action(s)[i], rtol=0, atol=1e-13
+        )
+        assert task.similarity(s[i], a[i]) == pytest.approx(task.similarity(s, a)[i], abs=1e-13)
+    assert task.transition(s[0], a[0]).shape == (spec.state_dim,)
+    assert task.optimal_action(s[0]).shape == (spec.action_dim,)
+    assert np.ndim(task.similarity(s[0], a[0])) == 0
+    assert np.ndim(task.step_reward(s[0], a[0])) == 0
+    assert task.transition(s[0], a).shape == (7, spec.state_dim)
+
+
+@given(specs())
+def test_actions_out_of_range_are_clipped(spec):
+    task = materialize(spec)
+    s, a = rng().random((20, spec.state_dim)), rng().uniform(-1.0, 2.0, (20, spec.action_dim))
+    inside = np.clip(a, 0.0, 1.0)
+    np.testing.assert_array_equal(task.transition(s, a), task.transition(s, inside))
+    np.testing.assert_array_equal(task.similarity(s, a), task.similarity(s, inside))
+    assert (task.similarity(s, a) >= 0.0).all()
+
+
+@pytest.mark.parametrize("distance", [1.0, 10.0, 1e6, 1e299])
+def test_the_optimal_policy_is_defined_far_outside_the_cube(distance):
+    for complexity in (1, 3):
+        task = materialize(SMESpec(complexity=complexity))
+        a = task.optimal_action(distance * rng().uniform(-1.0, 1.0, (50, 8)))
+        assert ((a >= 0.0) & (a <= 1.0)).all()
+
+
+def test_agents_follow_only_what_they_observe():
+    team = {"agents": [{"action_dim": 2, "observes": [0, 3]}, {"action_dim": 2, "observes": [5]}]}
+    task = materialize(SMESpec(complexity=3, team=team))
+    s = rng().random(8)
+    other = s.copy()
+    other[[1, 2, 4, 6, 7]] = 0.0
+    np.testing.assert_array_equal(task.optimal_action(s), task.optimal_action(other))
+    other[5] += 0.1
+    assert (task.optimal_action(s)[:2] == task.optimal_action(other)[:2]).all()
+    assert (task.optimal_action(s)[2:] != task.optimal_action(other)[2:]).all()
+    assert [len(layers) for layers in task.layers] == [3, 3]
+
+
+# METHOD, section 2: the constant policy ½ earns about 9 of 100 at the default, 24 at A = 1 and 4
+# at A = 16 (where the layer widens: with `unit_variance`); its mean r̃ is 0.726–0.755.
+@pytest.mark.parametrize(
+    ("action_dim", "low", "high"), [(4, 0.07, 0.11), (1, 0.22, 0.26), (16, 0.03, 0.05)]
+)
+def test_the_constant_policy_earns_what_the_method_says(action_dim, low, high):
+    earned, similar = [], []
+    for seed in range(10):
+        spec = SMESpec(action_dim=action_dim, policy_init="unit_variance", seed=seed)
+        task = materialize(spec)
+        s, half = rng().random((4000, 8)), np.full((4000, action_dim), 0.5)
+        earned.append(task.step_reward(s, half).mean())
+        similar.append(task.similarity(s, half).mean())
+    assert low < np.mean(earned) < high
+    assert 0.72 < np.mean(similar) < 0.76
+
+
+BAD_STATES = [
+    ([0.5] * 7, "state of shape (7,): must be [8] or [B, 8] (this task's state_dim is 8)."),
+    (np.zeros((2, 3, 8)), "state of shape (2, 3, 8): must be [8] or [B, 8]"),
+    (0.5, "state of shape (): must be"),
+    ([np.nan] + [0.5] * 7, "state: has NaN or infinite entries."),
+    ([np.inf] + [0.5] * 7, "state: has NaN or infinite entries."),
+    ([1e301] + [0.5] * 7, "below 1e+300 in size."),
+    (["0.5"] * 8, "must be an array of 8 numbers."),
+    ([None] * 8, "must be an array of 8 numbers."),
+    ([[0.5] * 8, [0.5] * 7], "must be an array of 8 numbers."),
+    ([1j] * 8, "must be an array of 8 numbers."),
+]
+
+
+@pytest.mark.parametrize(("state", "message"), BAD_STATES)
+def test_a_bad_state_is_refused(state, message):
+    task = materialize(SMESpec())
+    for ask in (
+        lambda: task.optimal_action(state),
+        lambda: task.transition(state, [0.5] * 4),
+        lambda: task.similarity(state, [0.5] * 4),
+        lambda: task.step_reward(state, [0.5] * 4),
+        lambda: task.regret(state, [0.5] * 4),
+    ):
+        with pytest.raises(StateError) as caught:
+            ask()
+        assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0.5] * 3, "action of shape (3,): must be [4] or [B, 4]"),
+        ([np.nan, 0.5, 0.5, 0.5], "action: has NaN or infinite entries."),
+        ([0.5, 0.5, 0.5, -np.inf], "action: has NaN or infinite entries."),
+        ("left", "must be an array of 4 numbers."),
+        (np.zeros((2, 4)), "action of shape (2, 4): must be [3, 4], one action for each"),
+    ],
+)
+def test_a_bad_action_is_refused(action, message):
+    task = materialize(SMESpec())
+    s = np.full((3, 8), 0.5)
+    for ask in (task.transition, task.similarity, task.step_reward, task.regret):
+        with pytest.raises(ActionError) as caught:
+            ask(s, action)
+        assert message in str(caught.value)
+
+
+def test_integers_and_booleans_are_numbers_too():
+    task = materialize(SMESpec())
+    expected = task.similarity(np.zeros(8), np.ones(4))
+    assert task.similarity([0] * 8, [True] * 4) == expected
+
+
+def test_an_empty_batch_is_answered_by_an_empty_batch():
+    task = materialize(SMESpec())
+    assert task.transition(np.zeros((0, 8)), np.zeros((0, 4))).shape == (0, 8)
+    assert task.optimal_action(np.zeros((0, 8))).shape == (0, 4)
+    assert task.similarity(np.zeros((0, 8)), np.zeros((0, 4))).shape == (0,)
+
+
+def test_plain_fields_are_materialised_and_other_things_refused():
+    assert materialize({"k": 3}).spec == SMESpec(k=3)
+    for thing in ("Default-v1", None, 3):
+        with pytest.raises(SpecError, match="must be an SMESpec or a mapping of its fields"):
+            materialize(thing)
+
+
+def test_equal_specs_share_one_drawn_task():
+    assert materialize(SMESpec(seed=77)) is materialize(SMESpec(seed=77))
