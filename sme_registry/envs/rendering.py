@@ -61,29 +61,22 @@ class Renderer:
 
     Raises:
       MissingDependencyError: pygame is not installed.
-      OptionError: "human" where no window can be opened.
     """
 
     def __init__(self, spec: SMESpec, mode: str, metadata: dict[str, Any]) -> None:
-        self._pygame = pg = _import_pygame()
-        self._spec, self._mode = spec, mode
-        self._fps: int = metadata["render_fps"]
+        self._pygame = _import_pygame()
+        self._spec, self._mode, self._fps = spec, mode, metadata["render_fps"]
         self._title = _title(spec)
         self._window: pygame.Surface | None = None
-        if mode == "human":
-            try:
-                pg.display.init()
-                self._window = pg.display.set_mode((WIDTH, HEIGHT))
-            except pg.error as error:
-                raise OptionError(
-                    f"render_mode='human': no window can be opened here ({error}). "
-                    "Use render_mode='rgb_array'."
-                ) from None
-            pg.display.set_caption(f"SME {spec.content_name}")
-            self._clock = pg.time.Clock()
-        pg.font.init()
-        self._small, self._normal = pg.font.Font(None, 18), pg.font.Font(None, 22)
         self._begun = False
+
+    # A copy in the middle of an episode keeps what is recorded, and opens a window of its own.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = ("_pygame", "_window", "_clock", "_small", "_normal")
+        return {name: value for name, value in self.__dict__.items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _pygame=_import_pygame(), _window=None)
 
     def record(self, env: SMEEnv, last: tuple[Any, dict[str, Any]] | None) -> None:
         """Take in a reset or a step.
@@ -91,6 +84,9 @@ class Renderer:
         Args:
           env: the environment, after it.
           last: None at a reset; else the action, in the environment's range, and the step's info.
+
+        Raises:
+          OptionError: in mode "human", where no window can be opened.
         """
         self._state = env.state
         if last is None:
@@ -111,8 +107,8 @@ class Renderer:
             self._earned += info["step_reward"]
             self._payout = self._pending + info["step_reward"] - info["accumulated_reward"]
             self._pending = info["accumulated_reward"]
-        if self._window is not None:
-            self._show(self._window)
+        if self._mode == "human":
+            self._show()
 
     def frame(self) -> Frame | None:
         """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
@@ -135,13 +131,28 @@ class Renderer:
             self._window = None
             self._pygame.display.quit()
 
-    def _show(self, window: pygame.Surface) -> None:
-        self._draw(window)
-        self._pygame.event.pump()
-        self._pygame.display.flip()
+    def _show(self) -> None:
+        pg = self._pygame
+        if self._window is None:
+            try:
+                pg.display.init()
+                self._window = pg.display.set_mode((WIDTH, HEIGHT))
+            except pg.error as error:
+                raise OptionError(
+                    f"render_mode='human': no window can be opened here ({error}). "
+                    "Use render_mode='rgb_array'."
+                ) from None
+            pg.display.set_caption(f"SME {self._spec.content_name}")
+            self._clock = pg.time.Clock()
+        self._draw(self._window)
+        pg.event.pump()
+        pg.display.flip()
         self._clock.tick(self._fps)
 
     def _draw(self, surface: pygame.Surface) -> None:
+        # Fonts do not outlive pygame.quit(), which other environments call when they close.
+        self._pygame.font.init()
+        self._small, self._normal = (self._pygame.font.Font(None, size) for size in (18, 22))
         surface.fill(_PAPER)
         right, half = WIDTH - _MARGIN, WIDTH // 2
         self._text(surface, self._title, (_MARGIN, 18), _INK, self._normal)

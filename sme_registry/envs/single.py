@@ -111,12 +111,11 @@ class SMEEnv(gymnasium.Env[Observation, Action]):
             "_armed",
             "_optimal_rows",
             "_observation_rows",
-            "_renderer",
         )
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _renderer=None)
+        self.__dict__.update(state)
         self._load_engine()
         self._lane[:] = state["_lane"]
 

@@ -345,7 +345,7 @@ def test_a_made_environment_is_copied_with_its_wrappers() -> None:
 
 @pytest.mark.parametrize("seed", ["abc", 1.5, True, -1, [1], np.array([1])])
 def test_a_seed_that_cannot_be_used_is_refused(seed: Any) -> None:
-    with pytest.raises(OptionError, match="seed=.*integer of at least 0"):
+    with pytest.raises(OptionError, match=r"seed=.*integer of at least 0"):
         SMEEnv("Plane1").reset(seed=seed)
 
 

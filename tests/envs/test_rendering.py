@@ -1,0 +1,228 @@
+"""Frames: headless, of one size, of what has happened, and lazily drawn."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.envs import SMEEnv, rendering
+from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
+
+pygame = pytest.importorskip("pygame")
+ROOT = Path(sme_registry.__file__).resolve().parents[1]
+
+
+def begun(name: Any = "Default", **kwargs: Any) -> SMEEnv:
+    env = SMEEnv(name, render_mode="rgb_array", **kwargs)
+    env.reset(seed=0)
+    return env
+
+
+def colours(frame: Any) -> set[tuple[int, ...]]:
+    packed = np.unique(frame.astype(np.int64) @ [65536, 256, 1])
+    return {(colour >> 16, colour >> 8 & 255, colour & 255) for colour in packed.tolist()}
+
+
+def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a process with no display; `variables` are added to its environment."""
+    display = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    kept = {name: value for name, value in os.environ.items() if name not in display}
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**kept, "PYTHONPATH": str(ROOT), **variables},
+    )
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"state_dim": 64, "action_dim": 64},
+        {"state_dim": 300, "action_dim": 200},
+        {"state_dim": 1, "action_dim": 1},
+        {"horizon": 1},
+        {"horizon": 2**31 - 1, "k": 1000},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_every_frame_is_a_picture_of_one_size(fields: dict[str, int], action_range: Any) -> None:
+    env = begun(fields, action_range=action_range)
+    shape = (rendering.HEIGHT, rendering.WIDTH, 3)
+    for step in range(2):
+        frame = env.render()
+        assert frame.shape == shape
+        assert frame.dtype == np.uint8
+        assert frame.flags.c_contiguous
+        shown = {rendering._OPTIMAL, rendering._ACTION, rendering._REGRET}
+        assert (shown <= colours(frame)) == (step == 1)
+        if step == 0:
+            env.step(env.action_space.low + 0.25)
+
+
+def test_frames_are_fresh_and_show_each_step() -> None:
+    env = begun()
+    frames = [env.render()]
+    for _ in range(3):
+        env.step(np.full(4, 0.5, np.float32))
+        frames.append(env.render())
+    assert len({frame.tobytes() for frame in frames}) == 4
+    again = env.render()
+    np.testing.assert_array_equal(again, frames[-1])
+    again[:] = 0
+    np.testing.assert_array_equal(env.render(), frames[-1])
+
+
+def test_a_new_episode_is_drawn_afresh() -> None:
+    env = begun()
+    first = env.render()
+    env.step(np.full(4, 0.5, np.float32))
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), first)
+
+
+def test_an_optimal_action_is_drawn_on_its_mark_without_any_regret_between() -> None:
+    for action_range in ("unit", "symmetric"):
+        env = begun("Plane1", action_range=action_range, horizon=10)
+        optimal = copy.deepcopy(env).step(np.zeros(2))[4]["optimal_action"]
+        env.step(optimal)
+        panel = env.render()[90:260, rendering.WIDTH // 2 :]
+        assert rendering._ACTION in colours(panel)
+        assert rendering._REGRET not in colours(panel)
+        env.step(np.clip(1.0 - optimal, -1, 1))
+        assert rendering._REGRET in colours(env.render()[90:260, rendering.WIDTH // 2 :])
+
+
+def test_the_numbers_shown_are_those_of_the_episode() -> None:
+    env = begun("Default", k=4, horizon=10)
+    earned, paid = 0.0, []
+    for _ in range(10):
+        _, reward, _, _, info = env.step(np.full(4, 0.5, np.float32))
+        earned += info["step_reward"]
+        paid.append(reward)
+        renderer = env._renderer
+        assert renderer._payout == pytest.approx(reward, abs=1e-9)
+        assert renderer._earned - renderer._pending == pytest.approx(sum(paid), abs=1e-9)
+    assert renderer._regrets[-1] == pytest.approx(10 - earned)
+
+
+def test_what_is_recorded_is_not_changed_by_writing_into_what_step_returned() -> None:
+    env, untouched = begun(), begun()
+    action = np.full(4, 0.5, np.float32)
+    info = env.step(action)[4]
+    untouched.step(action.copy())
+    info["optimal_action"][:] = 0.0
+    action[:] = 1.0
+    np.testing.assert_array_equal(env.render(), untouched.render())
+
+
+def test_recording_draws_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = begun()
+    drawn = []
+    draw = rendering.Renderer._draw
+    monkeypatch.setattr(
+        rendering.Renderer, "_draw", lambda self, surface: drawn.append(draw(self, surface))
+    )
+    for _ in range(5):
+        env.step(np.full(4, 0.5, np.float32))
+    assert drawn == []
+    env.render()
+    assert len(drawn) == 1
+
+
+def test_rendering_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(EpisodeError, match="reset"):
+        SMEEnv("Default", render_mode="rgb_array").render()
+
+
+def test_a_copy_in_the_middle_of_an_episode_shows_all_of_it() -> None:
+    env = begun()
+    action = np.full(4, 0.5, np.float32)
+    env.step(action)
+    twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    for e in (env, *twins):
+        e.step(action)
+    for twin in twins:
+        np.testing.assert_array_equal(twin.render(), env.render())
+    twins[0].step(action)
+    assert not np.array_equal(twins[0].render(), env.render())
+
+
+def test_frames_are_drawn_after_another_environment_has_quit_pygame() -> None:
+    env = begun()
+    before = env.render()
+    pygame.quit()
+    np.testing.assert_array_equal(env.render(), before)
+
+
+def test_frames_need_no_display_print_nothing_and_leave_the_process_alone() -> None:
+    done = run(
+        "import os, sme_registry\n"
+        "before = dict(os.environ)\n"
+        "env = sme_registry.make('Default', render_mode='rgb_array')\n"
+        "env.reset(seed=0)\n"
+        "assert env.render().any()\n"
+        "env.close()\n"
+        "changed = {name for name in os.environ if os.environ[name] != before.get(name)}\n"
+        "print(sorted(changed))\n"
+    )
+    assert (done.stdout, done.stderr, done.returncode) == ("[]\n", "", 0)
+
+
+def test_human_mode_shows_a_window_at_each_step() -> None:
+    done = run(
+        "import numpy as np, pygame, sme_registry\n"
+        "env = sme_registry.make('Plane1', render_mode='human', horizon=3)\n"
+        "env.reset(seed=0)\n"
+        "shown = []\n"
+        "for _ in range(3):\n"
+        "    env.step(np.zeros(2, np.float32))\n"
+        "    shown.append(pygame.surfarray.array3d(pygame.display.get_surface()).tobytes())\n"
+        "    assert env.render() is None\n"
+        "assert len(set(shown)) == 3\n"
+        "env.close()\n"
+        "assert not pygame.display.get_init()\n"
+        "env.reset(seed=0)\n"
+        "assert pygame.display.get_surface() is not None\n"
+        "env.close()\n",
+        SDL_VIDEODRIVER="dummy",
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_human_mode_without_a_display_says_what_to_do() -> None:
+    done = run(
+        "import sme_registry\n"
+        "from sme_registry.errors import OptionError\n"
+        "try:\n"
+        "    sme_registry.make('Default', render_mode='human').reset()\n"
+        "except OptionError as error:\n"
+        "    print(error)\n",
+        SDL_VIDEODRIVER="x11",
+    )
+    assert "Use render_mode='rgb_array'" in done.stdout, done.stderr
+
+
+def test_without_pygame_the_way_to_install_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pygame", "pygame.font"):
+        monkeypatch.setitem(sys.modules, name, None)
+    env = SMEEnv("Default", render_mode="rgb_array")
+    with pytest.raises(MissingDependencyError, match=r"sme-registry\[render\]"):
+        env.reset()
+
+
+def test_an_unknown_mode_is_refused() -> None:
+    with pytest.raises(OptionError, match="render_mode='ansi'"):
+        SMEEnv("Default", render_mode="ansi")

@@ -1,0 +1,274 @@
+"""`SMEVecEnv`: the numbers of SB3's own DummyVecEnv, under SB3's algorithms and wrappers."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.errors import ActionError, EpisodeError, OptionError, SpecError, StateError
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
+
+from sme_registry.sb3 import SMEVecEnv
+
+# Ends early and late, pays late, and its lanes drift apart.
+HARD = sme_registry.SMESpec(horizon=12, k=5, D=0.2, r_min=0.1, complexity=2, seed=4)
+
+
+def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
+    kwargs = {"action_range": "symmetric", **kwargs}
+    return DummyVecEnv([lambda: sme_registry.make(spec, **kwargs)] * lanes)
+
+
+def assert_same(got: Any, expected: Any) -> None:
+    """Equal in every bit and type."""
+    assert type(got) is type(expected)
+    if isinstance(got, np.ndarray):
+        assert got.dtype == expected.dtype
+        np.testing.assert_array_equal(got, expected)
+    elif isinstance(got, dict):
+        assert got.keys() == expected.keys()
+        for key in got:
+            assert_same(got[key], expected[key])
+    elif isinstance(got, list | tuple):
+        assert len(got) == len(expected)
+        for mine, other in zip(got, expected, strict=True):
+            assert_same(mine, other)
+    else:
+        assert got == expected
+
+
+@pytest.mark.parametrize("action_range", ["symmetric", "unit"])
+@pytest.mark.parametrize("spec", [HARD, "Default", "Interval25", "HardFragile"], ids=str)
+def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_range: Any) -> None:
+    ours = SMEVecEnv(spec, 3, action_range=action_range)
+    theirs = dummy(spec, action_range=action_range)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.seed(42) == theirs.seed(42)
+    assert_same(ours.reset(), theirs.reset())
+    assert_same(ours.reset_infos, theirs.reset_infos)
+    rng = np.random.default_rng(0)
+    low = ours.action_space.low[0]
+    ends = 0
+    for _ in range(230):
+        optimal = ours.get_attr("task", 0)[0].optimal_action(np.array(ours.get_attr("state")))
+        action = low + (1 - low) * (0.6 * optimal + 0.4 * rng.random(optimal.shape))
+        got, expected = ours.step(action.astype(np.float32)), theirs.step(action.astype(np.float32))
+        assert_same(got, expected)
+        ends += int(got[2].sum())
+    assert ends >= 6
+    assert_same(ours.reset(), theirs.reset())
+
+
+def test_a_learner_sees_the_same_rollout_as_with_a_dummy_vec_env() -> None:
+    seen = []
+    for env in (SMEVecEnv(HARD, 2), dummy(HARD, 2)):
+        model = PPO("MlpPolicy", env, n_steps=32, batch_size=16, n_epochs=1, seed=1, device="cpu")
+        model.learn(64)
+        seen.append({name: array.numpy() for name, array in model.policy.state_dict().items()})
+    assert_same(seen[0], seen[1])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs"),
+    [
+        (PPO, {"n_steps": 64, "batch_size": 32, "n_epochs": 1}),
+        (SAC, {"learning_starts": 20, "batch_size": 16, "buffer_size": 500}),
+        (TD3, {"learning_starts": 20, "batch_size": 16, "buffer_size": 500}),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_sb3s_algorithms_learn_on_it(algorithm: Any, kwargs: dict[str, Any]) -> None:
+    env = VecMonitor(SMEVecEnv("Default", 4, horizon=10, k=5))
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]},
+                      **kwargs)  # fmt: skip
+    evaluated = EvalCallback(VecMonitor(SMEVecEnv("Default", 2, horizon=10)), n_eval_episodes=2,
+                             eval_freq=20, verbose=0)  # fmt: skip
+    model.learn(256, callback=evaluated)
+    assert model.num_timesteps >= 256
+    assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
+    assert len(model.ep_info_buffer) >= 24
+    assert np.isfinite(evaluated.last_mean_reward)
+
+
+def test_the_optimum_earns_the_horizon_through_sb3s_own_evaluation() -> None:
+    class Optimum:
+        def predict(self, observation: Any, **_: Any) -> tuple[Any, None]:
+            state = observation[:, :-2].astype(np.float64)
+            return 2.0 * task.optimal_action(state) - 1.0, None
+
+    env = VecMonitor(SMEVecEnv("Complexity2", 4, k=7, horizon=20))
+    task = env.get_attr("task")[0]
+    mean, spread = evaluate_policy(Optimum(), env, n_eval_episodes=8)  # type: ignore[arg-type]
+    assert mean == pytest.approx(20.0, abs=1e-3)
+    assert spread == pytest.approx(0.0, abs=1e-3)
+
+
+def test_sb3s_wrappers_work_on_it_and_survive_pickling() -> None:
+    env: Any = VecNormalize(VecFrameStack(VecCheckNan(VecMonitor(SMEVecEnv(HARD, 3))), 2))
+    env.seed(0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    episodes = 0
+    for _ in range(40):
+        observations, _, dones, infos = env.step(rng.uniform(-1, 1, (3, 4)).astype(np.float32))
+        assert observations.shape == (3, 2 * 10)
+        episodes += sum("episode" in info for info in infos)
+        assert all(("terminal_observation" in i) == d for i, d in zip(infos, dones, strict=True))
+    assert episodes > 0
+
+
+def test_a_pickled_copy_goes_on_as_the_original() -> None:
+    env = SMEVecEnv(HARD, 3)
+    env.seed(7)
+    env.reset()
+    env.set_attr("note", "mine", indices=[1])
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (40, 3, 4)).astype(np.float32)
+    for action in actions[:5]:
+        env.step(action)
+    twin = pickle.loads(pickle.dumps(env))
+    assert twin.get_attr("note", 1) == ["mine"]
+    for action in actions[5:]:
+        assert_same(twin.step(action), env.step(action))
+    assert_same(twin.get_attr("state"), env.get_attr("state"))
+
+
+def test_attributes_and_methods_of_the_lanes_are_reached() -> None:
+    env = SMEVecEnv("Default", 3, complexity=2)
+    env.seed(1)
+    observations = env.reset()
+    assert env.num_envs == 3
+    assert env.sme_spec.complexity == 2
+    assert [spec.complexity for spec in env.get_attr("sme_spec")] == [2, 2, 2]
+    assert env.get_attr("spec", 0)[0].id == f"SME/{env.sme_spec.content_name}-v1"
+    np.testing.assert_array_equal(env.get_attr("state", [2])[0].astype(np.float32),
+                                  observations[2, :8])  # fmt: skip
+    assert env.get_attr("render_mode") == [None] * 3
+    assert env.has_attr("task")
+    assert not env.has_attr("tusk")
+    with pytest.raises(AttributeError):
+        env.get_attr("tusk")
+    env.set_attr("tusk", 5, indices=1)
+    assert env.get_attr("tusk", 1) == [5]
+    assert not env.has_attr("tusk")
+    assert env.env_is_wrapped(Monitor) == [False] * 3
+    assert env.env_is_wrapped(gymnasium.wrappers.TimeLimit, indices=[0]) == [False]
+    with pytest.raises(AttributeError):
+        env.env_method("no_such_method")
+    first = env.env_method("reset", indices=[1], seed=9)[0][0]
+    np.testing.assert_array_equal(first, sme_registry.make("Default").reset(seed=9)[0])
+    np.testing.assert_array_equal(env.get_attr("state", 0)[0].astype(np.float32),
+                                  observations[0, :8])  # fmt: skip
+    env.close()
+
+
+def test_options_begin_lanes_where_they_say() -> None:
+    ours, theirs = SMEVecEnv("Plane1", 3), dummy("Plane1")
+    for options in ({"state": [0.25, 0.5]}, [{}, {"state": [0.5, 1.0]}, {}], None):
+        for env in (ours, theirs):
+            env.seed(3)
+            env.set_options(options)  # type: ignore[arg-type]
+        assert_same(ours.reset(), theirs.reset())
+        action = np.zeros((3, 2), np.float32)
+        for _ in range(101):
+            assert_same(ours.step(action), theirs.step(action))
+    ours.set_options({"state": [2.0, 0.0]})
+    with pytest.raises(StateError):
+        ours.reset()
+
+
+def test_infos_are_fresh_and_writing_into_what_is_returned_moves_nothing() -> None:
+    env, untouched = SMEVecEnv(HARD, 3), SMEVecEnv(HARD, 3)
+    rng = np.random.default_rng(0)
+    for e in (env, untouched):
+        e.seed(0)
+        e.reset()
+    for _ in range(40):
+        action = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+        got, expected = env.step(action), untouched.step(action)
+        assert_same(got, expected)
+        observations, rewards, dones, infos = got
+        observations[:], rewards[:], dones[:] = 9.0, 9.0, ~dones
+        for info in infos:
+            info["optimal_action"][:] = 9.0
+            info.get("terminal_observation", observations)[:] = 9.0
+            info.clear()
+
+
+def test_what_cannot_be_used_is_a_typed_error() -> None:
+    with pytest.raises(OptionError, match="num_envs=0"):
+        SMEVecEnv("Default", 0)
+    with pytest.raises(OptionError, match="action_range"):
+        SMEVecEnv("Default", action_range="wide")  # type: ignore[arg-type]
+    with pytest.raises(SpecError, match="complexity"):
+        SMEVecEnv("Default", complexity=0)
+    env = SMEVecEnv("Default", 2)
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step(np.zeros((2, 4)))
+    with pytest.raises(EpisodeError, match="step_async"):
+        env.step_wait()
+    env.reset()
+    with pytest.raises(ActionError, match="shape"):
+        env.step(np.zeros((2, 3)))
+    with pytest.raises(ActionError, match="NaN"):
+        env.step(np.full((2, 4), np.nan))
+    env.step(np.zeros((2, 4)))
+
+
+@pytest.mark.parametrize("method", ["spawn"])
+def test_subprocess_workers_make_it_by_module_and_id(method: str) -> None:
+    kwargs: dict[str, Any] = {
+        "n_envs": 2, "seed": 5, "env_kwargs": {"action_range": "symmetric", "horizon": 6, "k": 4}
+    }  # fmt: skip
+    workers = make_vec_env(
+        "sme_registry:SME/Default-v1", vec_env_cls=SubprocVecEnv,
+        vec_env_kwargs={"start_method": method}, **kwargs,
+    )  # fmt: skip
+    ours = SMEVecEnv("Default", 2, horizon=6, k=4)
+    ours.seed(5)
+    np.testing.assert_array_equal(workers.reset(), ours.reset())
+    rng = np.random.default_rng(0)
+    for _ in range(14):
+        action = rng.uniform(-1, 1, (2, 4)).astype(np.float32)
+        observations, rewards, dones, _ = ours.step(action)
+        got = workers.step(action)
+        np.testing.assert_array_equal(got[0], observations)
+        np.testing.assert_array_equal(got[1].astype(np.float32), rewards)  # theirs are float64
+        np.testing.assert_array_equal(got[2], dones)
+    workers.close()
+
+
+def test_without_sb3_the_way_to_install_it_is_named() -> None:
+    code = (
+        "import sys; sys.modules['stable_baselines3'] = None\n"
+        "from sme_registry.errors import MissingDependencyError\n"
+        "try:\n    import sme_registry.sb3\n"
+        "except MissingDependencyError as error:\n    print(error)\n"
+    )
+    root = Path(sme_registry.__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root)
+    assert "pip install 'sme-registry[train]'" in done.stdout, done.stderr
