@@ -1,0 +1,458 @@
+"""`sme list`, `show`, `new`, `validate`, `certify`: tasks, suites and protocols as documents."""
+
+from __future__ import annotations
+
+import enum
+import math
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+from pydantic import BaseModel
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.cli import names
+from sme_registry.cli.output import err, mark, out, print_json, print_pairs
+from sme_registry.errors import OptionError, SMEError, UnknownNameError
+from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, Suite, SuiteFile, catalogue
+from sme_registry.spec.envelope import Envelope
+from sme_registry.spec.protocol import EvaluationProtocol
+from sme_registry.spec.resolve import resolve, with_fingerprint
+
+Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
+
+
+class Kind(enum.StrEnum):
+    """What `sme list` shows."""
+
+    env = "env"
+    suite = "suite"
+    protocol = "protocol"
+
+
+class Schema(enum.StrEnum):
+    """Whose JSON Schema `sme show --json-schema` prints."""
+
+    spec = "spec"
+    env_file = "env-file"
+    suite = "suite"
+    suite_file = "suite-file"
+    protocol = "protocol"
+    protocol_file = "protocol-file"
+
+
+_SCHEMAS: dict[Schema, type[BaseModel]] = {
+    Schema.spec: SMESpec,
+    Schema.env_file: EnvFile,
+    Schema.suite: Suite,
+    Schema.suite_file: SuiteFile,
+    Schema.protocol: EvaluationProtocol,
+    Schema.protocol_file: ProtocolFile,
+}
+
+
+def list_(
+    kind: Annotated[
+        Kind | None, typer.Option("--kind", "-k", help="Only environments, suites or protocols.")
+    ] = None,
+    tag: Annotated[
+        list[str] | None, typer.Option("--tag", "-t", help="Only what has this tag; repeatable.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """The catalogue: environments, suites and protocols.
+
+    Examples:
+
+      sme list
+
+      sme list --kind env --tag paper
+
+      sme list --json | jq '.[].id'
+    """
+    wanted = set(tag or ())
+    found = {
+        name: [file for file in catalogue.entries(kind_of) if wanted <= set(file.tags)]
+        for name, kind_of in names.KINDS.items()
+        if kind in (None, name)
+    }
+    if json:
+        print_json([_summary(name, file) for name, files in found.items() for file in files])
+        return
+    if not any(found.values()):
+        known = sorted(
+            {tag for k in names.KINDS.values() for f in catalogue.entries(k) for tag in f.tags}
+        )
+        raise UnknownNameError(
+            f"--tag {' --tag '.join(sorted(wanted))}: nothing in the catalogue has "
+            f"{'it' if len(wanted) == 1 else 'them all'}. Tags: {', '.join(known)}."
+        )
+    for name, files in found.items():
+        if files:
+            out().print(_TABLES[name](files))
+
+
+def _summary(kind: str, file: Envelope) -> dict[str, Any]:
+    summary: dict[str, Any] = {
+        "kind": kind,
+        "name": file.versioned_name,
+        "digest": file.digest,
+        "tags": list(file.tags),
+        "description": file.description,
+    }
+    if isinstance(file, EnvFile):
+        summary["id"] = f"{catalogue.NAMESPACE}/{file.versioned_name}"
+        summary["spec"] = file.spec.plain()
+    return summary
+
+
+def _env_table(files: list[EnvFile]) -> Table:
+    table = Table(
+        title="Environments",
+        caption="S state, A action channels · L layers of π* · k reward interval · T horizon",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("id", no_wrap=True)
+    for column in ("S", "A", "L", "k", "r_min", "D", "T"):
+        table.add_column(column, justify="right")
+    table.add_column("tags", overflow="fold")
+    for file in files:
+        spec = file.spec
+        numbers = (
+            spec.state_dim, spec.action_dim, spec.complexity, spec.k, spec.r_min, spec.D,
+            spec.horizon,
+        )  # fmt: skip
+        table.add_row(
+            f"{catalogue.NAMESPACE}/{file.versioned_name}",
+            *(f"{number:g}" for number in numbers),
+            " ".join(file.tags),
+        )
+    return table
+
+
+def _suite_table(files: list[SuiteFile]) -> Table:
+    table = Table(title="Suites", title_justify="left")
+    for column in ("name", "classes", "tasks", "description"):
+        table.add_column(column, no_wrap=column == "name")
+    for file in files:
+        counts = len(file.suite.classes), len(file.suite.instances)
+        table.add_row(file.versioned_name, *map(str, counts), escape(file.description))
+    return table
+
+
+def _protocol_table(files: list[ProtocolFile]) -> Table:
+    table = Table(title="Protocols", title_justify="left")
+    for column in ("name", "regions", "states each", "description"):
+        table.add_column(column, no_wrap=column == "name")
+    for file in files:
+        protocol = file.protocol
+        counts = str(len(protocol.edges)), f"{protocol.states_per_region:,}"
+        table.add_row(file.versioned_name, *counts, escape(file.description))
+    return table
+
+
+_TABLES: dict[str, Any] = {"env": _env_table, "suite": _suite_table, "protocol": _protocol_table}
+
+
+def show(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME|PATH|DIGEST", help="What to show.")
+    ] = None,
+    json: Json = False,
+    json_schema: Annotated[
+        Schema | None,
+        typer.Option("--json-schema", help="Print the JSON Schema of a kind of document instead."),
+    ] = None,
+) -> None:
+    """One task, suite or protocol: its fields, its digest, and what follows from them.
+
+    Examples:
+
+      sme show Default
+
+      sme show mine.json --json
+
+      sme show sha256:66e9b7a9a266
+
+      sme show --json-schema env-file > env-file.schema.json
+    """
+    if json_schema is not None:
+        if name is not None:
+            raise OptionError(f"{name!r}: --json-schema takes no name. Give one or the other.")
+        schema = _SCHEMAS[json_schema].model_json_schema()
+        print_json({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema})
+        return
+    if name is None:
+        raise OptionError(
+            "NAME: missing: must be a name, a path or a digest, as in `sme show Default`."
+        )
+    found = names.find_any(name)
+    if isinstance(found, SMESpec | EnvFile):
+        _show_task(found, json)
+        return
+    document = getattr(found, found.content)
+    if json:
+        print_json(found.plain())
+    elif isinstance(document, Suite):
+        _show_suite(cast(SuiteFile, found))
+    else:
+        print_pairs(_title(found), {**document.plain(), "digest": found.digest})
+
+
+def _show_task(found: SMESpec | EnvFile, json: bool) -> None:
+    spec = found if isinstance(found, SMESpec) else found.spec
+    facts = _facts(spec)
+    if json:
+        head = {} if isinstance(found, SMESpec) else _summary("env", found)
+        print_json({**head, "spec": spec.plain(), "digest": spec.digest, "derived": facts})
+        return
+    print_pairs(spec.content_name if isinstance(found, SMESpec) else _title(found), spec.plain())
+    out().print()
+    print_pairs("Derived", {"digest": spec.digest, **facts})
+
+
+def _facts(spec: SMESpec) -> dict[str, Any]:
+    """What follows from a spec, without drawing it."""
+    from sme_registry.task.memory import parameter_bytes
+
+    payouts = math.ceil(spec.horizon / spec.k)
+    facts: dict[str, Any] = {
+        "id": f"{catalogue.NAMESPACE}/{spec.content_name}-v1",
+        "observation": f"[{spec.state_dim + 2}] float32 in [0, 1]: state, t/T, r_cum/k",
+        "action": f"[{spec.action_dim}] float32 in [0, 1]",
+        "parameters": parameter_bytes(spec) // 8,
+        "parameter_memory_bytes": parameter_bytes(spec),
+        "largest_return": spec.horizon,
+        "payouts_in_a_full_episode": payouts,
+        "largest_payout": min(spec.k, spec.horizon),
+    }
+    if spec.D > 0:
+        facts["episode_ends_below_step_reward"] = max(spec.D, spec.r_min)
+    return facts
+
+
+def _show_suite(file: SuiteFile) -> None:
+    default = SMESpec().plain()
+    table = Table(
+        title=_title(file), caption=file.digest, title_justify="left", caption_justify="left"
+    )
+    table.add_column("class", no_wrap=True)
+    table.add_column("differs from the default in")
+    table.add_column("seeds")
+    for member in file.suite.classes:
+        changed = {k: v for k, v in member.setting.plain().items() if v != default[k]}
+        seeds = ", ".join(map(str, member.seeds))
+        table.add_row(member.name, escape(", ".join(f"{k}={v}" for k, v in changed.items())), seeds)
+    out().print(table)
+
+
+def _title(file: Envelope) -> str:
+    return f"[bold]{file.versioned_name}[/]  {escape(file.description)}"
+
+
+def new(
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    state_dim: Annotated[int | None, typer.Option(help="S, state channels.")] = None,
+    action_dim: Annotated[int | None, typer.Option(help="A, action channels.")] = None,
+    k: Annotated[int | None, typer.Option("--k", help="Steps between payouts.")] = None,
+    r_min: Annotated[float | None, typer.Option(help="Step rewards up to it are 0.")] = None,
+    D: Annotated[
+        float | None, typer.Option("--D", help="An episode ends below this step reward.")
+    ] = None,
+    complexity: Annotated[int | None, typer.Option(help="L, layers of the optimal policy.")] = None,
+    horizon: Annotated[int | None, typer.Option(help="T, steps of an episode.")] = None,
+    hidden_width: Annotated[int | None, typer.Option(help="H, width of the inner layers.")] = None,
+    policy_init: Annotated[
+        str | None, typer.Option(help="semi_orthogonal, or unit_variance: also where layers widen.")
+    ] = None,
+    seed: Annotated[
+        str | None, typer.Option(help="Of the draw: an integer, or 0x… sealed.")
+    ] = None,
+    team: Annotated[
+        str | None,
+        typer.Option(help='JSON: \'{"agents": [{"action_dim": 2}, {"action_dim": 2}]}\'.'),
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option("--from", metavar="NAME|PATH", help="The task to derive from.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
+    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    tag: Annotated[list[str] | None, typer.Option(help="A word to find it by; repeatable.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Write a task's file: spec, digest, and a fingerprint of the numbers drawn.
+
+    What is left out has the default, or the value of --from. Whoever holds the file holds the
+    same task.
+
+    Examples:
+
+      sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
+
+      sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
+
+      sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
+    """
+    given = {
+        "state_dim": state_dim,
+        "action_dim": action_dim,
+        "k": k,
+        "r_min": r_min,
+        "D": D,
+        "complexity": complexity,
+        "horizon": horizon,
+        "hidden_width": hidden_width,
+        "policy_init": policy_init,
+        "seed": None if seed is None else names.json_or_text(seed),
+        "team": None if team is None else names.json_or_text(team),
+    }
+    fields = {field: value for field, value in given.items() if value is not None}
+    if path.exists() and not force:
+        raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
+    spec = (resolve(base) if base is not None else SMESpec()).derive(**fields)
+
+    import sme_registry
+
+    sme_registry.save(spec, path, name, description=description, tags=tuple(tag or ()))
+    out().print(f"{escape(str(path))}  {spec.digest}", soft_wrap=True)
+    err().print(f"[dim]sme certify {escape(str(path))}  checks the draw[/]", soft_wrap=True)
+
+
+def validate(
+    paths: Annotated[list[Path], typer.Argument(help="Files, or folders of *.json.")],
+    json: Json = False,
+) -> None:
+    """Check files of tasks, suites and protocols: strict JSON, fields, digest, fingerprint.
+
+    Every file is checked, also after a bad one. Exit code 2 if any is bad.
+
+    Examples:
+
+      sme validate mine.json
+
+      sme validate specs/envs specs/suites
+    """
+    results = [_validated(path) for given in paths for path in _files_in(given)]
+    if json:
+        print_json(results)
+    else:
+        for result in results:
+            if result["valid"]:
+                line = f"[green]valid[/]   {result['kind']:8}  {escape(result['path'])}"
+                out().print(line, soft_wrap=True)
+            else:
+                out().print(f"[red]bad[/]     {escape(result['error'])}", soft_wrap=True)
+    bad = sum(not result["valid"] for result in results)
+    if bad:
+        raise OptionError(f"{bad} of {len(results)} files {'is' if bad == 1 else 'are'} bad.")
+
+
+def _files_in(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    found = sorted(path.rglob("*.json"))
+    if not found:
+        raise OptionError(f"{path}: holds no .json file. Give files, or a folder of them.")
+    return found
+
+
+def _validated(path: Path) -> dict[str, Any]:
+    from sme_registry.task import materialize
+
+    result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
+    try:
+        file = names.read_any(path)
+        result["kind"] = "env" if isinstance(file, EnvFile) else file.content
+        result |= {"name": file.versioned_name, "digest": file.digest}
+        if isinstance(file, EnvFile):
+            materialize(with_fingerprint(file))
+        elif isinstance(file, SuiteFile):
+            _ = file.suite.instances
+        result["valid"] = True
+    except SMEError as error:
+        text = str(error)
+        result["error"] = text if str(path) in text else f"{path}: {text}"
+    return result
+
+
+def certify(
+    tasks: Annotated[list[str], typer.Argument(metavar="NAME|PATH...", help="Tasks, or suites.")],
+    seed: Annotated[int, typer.Option(help="Of the states and actions it is measured with.")] = 0,
+    json: Json = False,
+) -> None:
+    """Draw a task and measure whether it is sane: before training on it, not after.
+
+    Refused is what is broken or trivial. A warning is for what is right and easy, such as
+    semi_orthogonal policies of 2 to 5 layers, whose target bunches around the middle. Exit code 1
+    if any is refused.
+
+    Examples:
+
+      sme certify mine.json
+
+      sme certify core smoke
+    """
+    from sme_registry.task.certify import Certificate
+    from sme_registry.task.certify import certify as measure
+
+    found = [task for name in tasks for task in _tasks_of(name)]
+    certificates: list[tuple[str, Certificate]] = []
+    for label, spec in found:
+        certificates.append((label, measure(spec, seed=seed)))
+        if not json and len(found) > 1:
+            _print_line(*certificates[-1])
+    if json:
+        print_json([{"task": label, **made.plain()} for label, made in certificates])
+    elif len(found) == 1:
+        _print_certificate(*certificates[0])
+    if not all(made.passed for _, made in certificates):
+        raise typer.Exit(1)
+
+
+def _tasks_of(name: str) -> list[tuple[str, SMESpec]]:
+    found = names.find_any(name)
+    if isinstance(found, SuiteFile):
+        return [
+            (f"{found.name}/{member.name} seed {spec.seed}", spec)
+            for member in found.suite.classes
+            for spec in member.instances
+        ]
+    if isinstance(found, ProtocolFile):
+        raise UnknownNameError(f"{name!r}: is a protocol. Give a task or a suite.")
+    spec = found if isinstance(found, SMESpec) else with_fingerprint(cast(EnvFile, found))
+    return [(name, spec)]
+
+
+def _print_line(label: str, made: Any) -> None:
+    notable = [*made.of("refused"), *made.of("warning")]
+    why = ", ".join(f"{check.name} {check.value:.3g}" for check in notable)
+    out().print(f"{mark(made.outcome)}  {escape(label)}  [dim]{why}[/]", soft_wrap=True)
+
+
+def _print_certificate(label: str, made: Any) -> None:
+    table = Table(title=f"Certificate of {escape(label)}", title_justify="left", box=None)
+    for column in ("", "check"):
+        table.add_column(column, no_wrap=True)
+    table.add_column("value", justify="right")
+    table.add_column("passes in", no_wrap=True)
+    for check in made.checks:
+        low = "" if check.low is None else f"≥ {check.low:.3g}"
+        high = "" if check.high is None else f"≤ {check.high:.3g}"
+        value = "" if check.value is None else f"{check.value:.3g}"
+        bounds = ", ".join(filter(None, (low, high)))
+        table.add_row(mark(check.outcome), f"[bold]{check.name}[/]", value, bounds)
+    out().print(table)
+    out().print()
+    for check in made.checks:
+        out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")
+    out().print()
+    refused = made.of("refused")
+    if refused:
+        reason = ", ".join(check.name for check in refused)
+        err().print(f"[red]refused[/] for {reason}. Draw it with another seed, or change an axis.")
+    elif made.outcome == "warning":
+        err().print("[yellow]usable, but easy[/]: see the warnings above.")
+    else:
+        err().print("[green]passed[/]")

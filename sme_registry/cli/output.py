@@ -1,0 +1,55 @@
+"""What commands print: tables and plain JSON on standard output, everything else on the other."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.files import to_json
+
+_MARKS = {
+    "passed": "[green]passed[/]",
+    "warning": "[yellow]warning[/]",
+    "refused": "[red]refused[/]",
+    "reported": "[dim]shown[/]",
+}
+
+
+def out() -> Console:
+    """Standard output, looked up anew: tests and pipes replace it."""
+    return Console(file=sys.stdout, highlight=False)
+
+
+def err() -> Console:
+    """Standard error, for progress and errors."""
+    return Console(file=sys.stderr, highlight=False)
+
+
+def failure(message: str) -> None:
+    """One red line on standard error."""
+    err().print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """Plain JSON, and nothing else, on standard output."""
+    sys.stdout.write(to_json(value))
+
+
+def print_pairs(title: str, pairs: dict[str, object]) -> None:
+    """Names and values, one a line, under a title."""
+    out().print(title)
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in pairs.items():
+        table.add_row(name, escape(str(value)))
+    out().print(table)
+
+
+def mark(outcome: str) -> str:
+    """An outcome in its colour."""
+    return _MARKS[outcome]

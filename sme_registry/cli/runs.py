@@ -1,0 +1,215 @@
+"""`sme evaluate` and `sme train`."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli import names
+from sme_registry.cli.output import err, out, print_json
+from sme_registry.cli.policies import REFERENCES, find_policy
+from sme_registry.errors import OptionError
+from sme_registry.spec import SMESpec
+from sme_registry.spec.resolve import resolve
+
+TaskName = Annotated[str, typer.Argument(metavar="TASK", help="A name, a path, or a digest.")]
+Protocol = Annotated[
+    str, typer.Option(help="Where it is evaluated: a name of `sme list`, or a path.")
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="FIELD=VALUE", help="Change a spec field; repeatable."),
+]
+
+
+def evaluate(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help=f"A model's .zip, module:function, or {', '.join(REFERENCES)}.",
+        ),
+    ],
+    task: TaskName,
+    protocol: Protocol = "paper-v1",
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", help="Folder for evaluation.json and the figures.")
+    ] = None,
+    action_range: Annotated[
+        str | None, typer.Option(help="unit or symmetric; by default a model's own, else unit.")
+    ] = None,
+    set_: Overrides = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an evaluation that is there.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="The report as JSON.")] = False,
+) -> None:
+    """Judge a policy within and out of distribution, beside policies that know nothing or all.
+
+    A function takes observations `[B, S + 2]` and returns actions `[B, A]`. A .zip of
+    Stable-Baselines3 is code: open only those whose author you trust.
+
+    Examples:
+
+      sme evaluate linear Complexity10
+
+      sme evaluate runs/demo/model.zip Default --out runs/demo-again
+
+      sme evaluate mypolicy:act Default --protocol quick-v1 --json
+    """
+    from sme_registry import evaluation
+    from sme_registry.training.progress import Meter
+
+    spec = resolve(task).derive(**names.overrides(set_ or []))
+    judged_by = evaluation.resolve_protocol(protocol)
+    target = None if out_folder is None else out_folder / "evaluation.json"
+    if target is not None and target.exists() and not force:
+        raise OptionError(f"{target}: is there already. Give another --out, or --force.")
+    found = find_policy(policy, spec)
+    states = judged_by.states_per_region * len(judged_by.edges)
+    shown = policy if policy in REFERENCES or ":" in policy else Path(policy).stem
+    with Meter("evaluating", states, unit="states", console=err()) as meter:
+        report = evaluation.evaluate(
+            found,
+            spec,
+            judged_by,
+            action_range=action_range,
+            name=shown,
+            progress=lambda done, total: meter.update(done),
+        )
+    written = [] if target is None else [report.write(target), *_figures(report, found, target)]
+    if json:
+        print_json(report.plain())
+    else:
+        out().print(report.table())
+    _say_where(written)
+
+
+def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
+    if importlib.util.find_spec("matplotlib") is None:
+        err().print("no figures: matplotlib is not installed (pip install 'sme-registry\\[plot]')")
+        return []
+    from sme_registry import plots
+
+    figures = [plots.decay_curve(report, target.with_name("decay_curve.png"))]
+    if report.spec.state_dim == 2:
+        path = target.with_name("similarity_map.png")
+        figures.append(
+            plots.similarity_map(
+                policy,
+                report.spec,
+                path,
+                action_range=report.action_range,
+                name=report.policy,
+            )
+        )
+    return figures
+
+
+def _say_where(written: list[Path]) -> None:
+    for path in written:
+        err().print(f"wrote {escape(str(path))}", soft_wrap=True)
+
+
+def train(
+    task: TaskName,
+    algorithm: Annotated[
+        str, typer.Option("--algorithm", "-a", help="TD3, SAC, DDPG, PPO or A2C.")
+    ] = "TD3",
+    steps: Annotated[int, typer.Option("--steps", "-n", help="Steps of the environment.")] = 20_000,
+    seed: Annotated[int, typer.Option(help="Of the algorithm and of the starts.")] = 0,
+    out_folder: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="By default runs/<task>-<algorithm>-seed<seed>."),
+    ] = None,
+    action_range: Annotated[
+        str, typer.Option(help="symmetric, \\[-1, 1], or unit, \\[0, 1].")
+    ] = "symmetric",
+    num_envs: Annotated[
+        int, typer.Option(help="Environments at once; off-policy, more mean fewer updates.")
+    ] = 1,
+    protocol: Protocol = "paper-v1",
+    set_: Overrides = None,
+    checkpoint_every: Annotated[
+        int | None, typer.Option(help="Steps; by default a twentieth of all, at least 1,000.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the run in the folder.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="The run and its report as JSON.")] = False,
+) -> None:
+    """Train an algorithm of Stable-Baselines3, log the exact regret of each episode, evaluate it.
+
+    SB3's default hyperparameters, on the CPU, one thread (these networks are too small to share).
+    PPO and A2C finish their last rollout. The folder holds episodes.csv, checkpoint.zip,
+    model.zip, run.json, evaluation.json, figures, and what TensorBoard reads.
+
+    --resume goes on from the last checkpoint, with the same networks, optimisers, replay buffer
+    and step count. It is not the uninterrupted run to the bit: random streams are seeded anew, and
+    episodes that were under way begin again.
+
+    Examples:
+
+      sme train Default --steps 20000 --seed 1
+
+      sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10
+
+      sme train mine.json --out runs/mine --resume
+    """
+    from sme_registry import training
+
+    changed = names.overrides(set_ or [])
+    spec = resolve(task).derive(**changed)
+    algorithm = training.known_algorithm(algorithm)
+    if out_folder is None:
+        out_folder = Path("runs") / f"{_label(task, spec, bool(changed))}-{algorithm}-seed{seed}"
+    try:
+        result = training.train(
+            spec,
+            algorithm=algorithm,
+            steps=steps,
+            seed=seed,
+            folder=out_folder,
+            action_range=cast(Any, action_range),
+            num_envs=num_envs,
+            checkpoint_every=checkpoint_every,
+            protocol=protocol,
+            console=err(),
+            resume=resume,
+            force=force,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(how_to_go_on(out_folder)) from None
+    if json:
+        report = result.report.plain()
+        print_json({"folder": str(out_folder), "run": result.record.plain(), "evaluation": report})
+        return
+    out().print(result.report.table())
+    out().print(f"everything is in {escape(str(out_folder))}{os.sep}", soft_wrap=True)
+
+
+def _label(task: str, spec: SMESpec, changed: bool) -> str:
+    """A folder's name for a task: its own name where it has one, else its content's."""
+    if changed or task.startswith("sha256"):
+        return spec.content_name
+    return Path(task).name.removesuffix(".json").removesuffix("-v1")
+
+
+def how_to_go_on(folder: Path) -> str:
+    """What to do after an interrupted training."""
+    from sme_registry.training import RunRecord
+
+    record = RunRecord.read(folder)
+    if record is None:
+        return "interrupted before the training began: nothing was written."
+    kept = f"step {record.steps_done:,} is kept" if record.steps_done else "no checkpoint yet"
+    return (
+        f"interrupted ({kept} in {folder}). Run the same command with --resume to go on, "
+        "or with --force to begin anew."
+    )
