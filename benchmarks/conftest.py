@@ -95,7 +95,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         met = "met" if row.ratio >= row.bar else "[bold]missed[/bold]"
         table.add_row(
             row.title, row.unit, _time(row.ours), row.peer_name, _time(row.peer),
-            f"{row.ratio:.2f} ×", f"{row.bar:g} ×", met,
+            f"{row.ratio:.2f} ×", f"{row.bar:.3g} ×", met,
         )  # fmt: skip
     terminalreporter.write_line("")
     console = Console(file=sys.stdout, width=130)
