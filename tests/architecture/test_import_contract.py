@@ -12,20 +12,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-HEAVY = (
-    "jax",
-    "matplotlib",
-    "numba",
-    "pandas",
-    "pygame",
-    "ray",
-    "scipy.stats",
-    "stable_baselines3",
-    "tensorboard",
-    "torch",
-    "typer",
-)
-
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
     """Run import-linter on the `sme_registry` of a folder, by the pyproject.toml beside it."""
@@ -77,13 +63,3 @@ def test_an_import_against_the_order_breaks_the_contract(
     result = lint_imports(copy)
     assert result.returncode == 1, result.stdout + result.stderr
     assert "BROKEN" in result.stdout
-
-
-def test_importing_the_package_loads_nothing_heavy() -> None:
-    code = "import sme_registry, sys; print(*sorted(sys.modules))"
-    result = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    loaded = set(result.stdout.split())
-    assert "sme_registry.registration" in loaded
-    assert loaded.isdisjoint(HEAVY), sorted(loaded & set(HEAVY))
