@@ -1,0 +1,199 @@
+"""Every engine is the definition: states bit for bit, oracle and rewards to 1e-12."""
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from sme_registry.compiled import chosen_backend, engine
+from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize, observe, step
+from tests.compiled.stepping import Lane, step_batch
+from tests.strategies import specs
+
+BACKENDS = ["numba", "numpy"]
+EXACT = ["state", "observation", "terminated", "truncated"]
+CLOSE = ["optimal_action", "similarity", "step_reward", "reward", "accumulated_reward"]
+DEEP = SMESpec(complexity=50, state_dim=5, action_dim=3, horizon=200)
+WIDE = SMESpec(state_dim=33, action_dim=17, complexity=3, hidden_width=70)
+TEAM = SMESpec(
+    complexity=3, state_dim=5, action_dim=6, k=3, horizon=40,
+    team={"agents": [
+        {"action_dim": 1, "observes": [4]},
+        {"action_dim": 3},
+        {"action_dim": 2, "observes": [0, 2]},
+    ]},
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _needs_numba(request):
+    if "numba" in request.node.name:
+        pytest.importorskip("numba")
+
+
+def near_optimal(task, s, random):
+    """Actions from the optimum to far beyond the range, so that every branch is taken."""
+    best = task.policy(s[:, None, :])[:, 0, :]
+    far = random.random((len(s), 1)) ** 3 * 1.5
+    return best + far * (random.random(best.shape) - 0.5)
+
+
+def assert_same(ours, its, names, tolerance=0.0):
+    for name in names:
+        np.testing.assert_allclose(
+            getattr(ours, name), getattr(its, name), rtol=0, atol=tolerance, err_msg=name
+        )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@settings(max_examples=25)
+@given(spec=specs(), seed=st.integers(0, 100))
+@example(DEEP, 0)
+@example(WIDE, 0)
+@example(TEAM, 0)
+def test_two_hundred_steps_follow_the_definition(backend, spec, seed):
+    task, random = materialize(spec), np.random.default_rng(seed)
+    made, s = engine(task, backend), random.random((2, spec.state_dim))
+    lanes = [Lane(task, made, row) for row in s]
+    r_cum = np.zeros(2)
+    for t in range(200):
+        a = near_optimal(task, s, random)
+        if t % 2:
+            a = a.astype(np.float32).astype(np.float64)
+        # Bits of the oracle differ by rounding, which the gates of the reward may magnify: the
+        # definition goes on from the engine's own r_cum, as a teacher.
+        done = step(task, s, np.full(2, t), r_cum, a)
+        seen = observe(spec, done.state, np.full(2, t + 1), done.accumulated_reward)
+        taken = a.astype(np.float32) if t % 2 else a
+        steps = [lane.step(row) for lane, row in zip(lanes, taken, strict=True)]
+        for i, single in enumerate(steps):
+            np.testing.assert_array_equal(single.state, done.state[i])
+            np.testing.assert_array_equal(single.observation[:-1], seen[i, :-1])
+            np.testing.assert_allclose(single.optimal_action, done.optimal_action[i], atol=1e-12)
+            assert abs(single.similarity - done.similarity[i]) < 1e-12
+            assert single.truncated == done.truncated[i]
+            assert single.regret == 1.0 - single.step_reward
+            edges = np.abs(done.step_reward[i] - np.array([spec.r_min, spec.D]))
+            if edges.min() > 1e-11 and (done.step_reward[i] or spec.r_min == 0.0):
+                assert abs(single.step_reward - done.step_reward[i]) < 1e-11
+                assert abs(single.reward - done.reward[i]) < 1e-11
+                assert single.terminated == done.terminated[i]
+        s, r_cum = done.state, np.array([single.accumulated_reward for single in steps])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@settings(max_examples=25)
+@given(spec=specs(), B=st.sampled_from([1, 2, 63, 64, 65, 130]), seed=st.integers(0, 100))
+@example(DEEP, 65, 0)
+@example(WIDE, 67, 0)
+@example(TEAM, 129, 0)
+def test_a_batch_is_its_singles_bit_for_bit(backend, spec, B, seed):
+    task, random = materialize(spec), np.random.default_rng(seed)
+    made, s = engine(task, backend), random.random((B, spec.state_dim))
+    lanes = [Lane(task, made, row) for row in s]
+    t, r_cum = np.zeros(B, np.int64), np.zeros(B)
+    for _ in range(3):
+        a = near_optimal(task, s, random)
+        whole = step_batch(task, made, s, t, r_cum, a)
+        singles = [lane.step(row) for lane, row in zip(lanes, a, strict=True)]
+        for name in [*EXACT, *CLOSE, "regret"]:
+            expected = np.array([getattr(single, name) for single in singles])
+            np.testing.assert_array_equal(getattr(whole, name), expected, err_msg=name)
+        s, t, r_cum = np.ascontiguousarray(whole.state), t + 1, np.array(whole.accumulated_reward)
+
+
+@settings(max_examples=25)
+@given(spec=specs(), seed=st.integers(0, 100))
+@example(DEEP, 0)
+@example(WIDE, 0)
+@example(TEAM, 0)
+def test_a_batch_of_the_numba_engine_is_that_of_numpys(spec, seed):
+    pytest.importorskip("numba")
+    task, random, B = materialize(spec), np.random.default_rng(seed), 70
+    s, t = random.random((B, spec.state_dim)), random.integers(0, spec.horizon, B)
+    r_cum, a = random.random(B), near_optimal(task, s, random)
+    fast, plain = (step_batch(task, engine(task, b), s, t, r_cum, a) for b in BACKENDS)
+    assert_same(fast, plain, ["state", "truncated"])
+    assert_same(fast, plain, ["optimal_action", "similarity"], 1e-12)
+    graded = 4.0 * (plain.similarity - 0.75)
+    clear = (np.abs(graded - spec.r_min) > 1e-11) & (np.abs(graded - spec.D) > 1e-11)
+    for name in ("step_reward", "regret", "reward", "accumulated_reward", "terminated"):
+        one, other = getattr(fast, name)[clear], getattr(plain, name)[clear]
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11, err_msg=name)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("B", [0, 1, 5000])
+def test_the_oracle_of_any_number_of_states_is_the_definitions(backend, B):
+    for spec in (SMESpec(complexity=2), DEEP, WIDE, TEAM):
+        task = materialize(spec)
+        s = np.random.default_rng(B).uniform(-0.5, 1.5, (B, spec.state_dim))
+        found = engine(task, backend).optimal_action(s)
+        assert found.shape == (B, spec.action_dim)
+        np.testing.assert_allclose(found, task.optimal_action(s), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("spec", [SMESpec(), WIDE, TEAM], ids=["default", "wide", "team"])
+def test_an_action_that_is_not_finite_is_refused_and_nothing_moves(backend, bad, dtype, spec):
+    task = materialize(spec)
+    lane = Lane(task, engine(task, backend), np.full(spec.state_dim, 0.3))
+    lane.step(np.full(spec.action_dim, 0.5, dtype))
+    before = lane.numbers.copy()
+    for channel in (0, spec.action_dim - 1):
+        action = np.full(spec.action_dim, 0.5, dtype)
+        action[channel] = bad
+        assert lane.step(action) is None
+        np.testing.assert_array_equal(lane.numbers, before)
+    assert lane.step(np.full(spec.action_dim, 0.5, dtype)) is not None
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_batch_with_an_action_that_is_not_finite_is_refused(backend):
+    task = materialize(SMESpec())
+    s, t, r_cum = np.full((70, 8), 0.3), np.zeros(70, np.int64), np.zeros(70)
+    a = np.full((70, 4), 0.5)
+    a[69, 3] = np.nan
+    before = s.copy()
+    assert step_batch(task, engine(task, backend), s, t, r_cum, a) is None
+    np.testing.assert_array_equal(s, before)
+    np.testing.assert_array_equal(t, 0)
+    np.testing.assert_array_equal(r_cum, 0.0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_optimum_earns_exactly_one_in_the_engines_own_arithmetic(backend):
+    for spec in (SMESpec(), DEEP, WIDE, TEAM):
+        task = materialize(spec)
+        s = np.random.default_rng(0).random(spec.state_dim)
+        first = Lane(task, engine(task, backend), s).step(np.zeros(spec.action_dim))
+        done = Lane(task, engine(task, backend), s).step(first.optimal_action)
+        assert (done.similarity, done.step_reward, done.regret) == (1.0, 1.0, 0.0)
+
+
+def test_the_back_end_is_chosen_by_the_environment_variable(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.delenv("SME_BACKEND", raising=False)
+    assert chosen_backend() == "numba"
+    for asked, given_back in [("auto", "numba"), ("numba", "numba"), ("numpy", "numpy")]:
+        monkeypatch.setenv("SME_BACKEND", asked)
+        assert chosen_backend() == given_back
+        assert engine(materialize(SMESpec())).backend == given_back
+    monkeypatch.setenv("SME_BACKEND", "jax")
+    with pytest.raises(OptionError, match="SME_BACKEND='jax': must be 'auto', 'numba' or 'numpy'"):
+        chosen_backend()
+
+
+def test_numba_asked_for_and_absent_says_what_to_install(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.setenv("SME_BACKEND", "auto")
+    assert chosen_backend() == "numpy"
+    monkeypatch.setenv("SME_BACKEND", "numba")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[fast\]'"):
+        chosen_backend()

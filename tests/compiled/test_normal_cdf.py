@@ -1,0 +1,57 @@
+"""Φ by table against mpmath's, computed with 40 digits, and against SciPy's over a dense grid."""
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+pytest.importorskip("numba")
+from numba import njit
+
+from sme_registry.compiled.normal_cdf import CELLS_PER_UNIT, LIMIT, normal_cdf
+
+BOUND = 3e-15
+
+
+@njit
+def phi(x):
+    out = np.empty(x.size)
+    for i in range(x.size):
+        out[i] = normal_cdf(x[i])
+    return out
+
+
+def test_the_error_is_below_its_bound_over_a_dense_grid():
+    x = np.linspace(-9.0, 9.0, 1_000_001)
+    assert np.abs(phi(x) - ndtr(x)).max() < BOUND
+
+
+def test_the_error_is_below_its_bound_against_forty_digits():
+    mpmath = pytest.importorskip("mpmath")
+    borders = (np.arange(-137, 138) + 0.5) / CELLS_PER_UNIT  # where a cell meets the next
+    random = np.random.default_rng(0).normal(size=300) * 2.0
+    x = np.concatenate([borders, np.nextafter(borders, 9.0), np.nextafter(borders, -9.0), random])
+    with mpmath.workdps(40):
+        exact = [mpmath.ncdf(mpmath.mpf(float(v))) for v in x]
+        errors = [abs(float(mpmath.mpf(float(y)) - e)) for y, e in zip(phi(x), exact, strict=True)]
+    assert max(errors) < BOUND
+
+
+@pytest.mark.parametrize(
+    "x", [LIMIT, np.nextafter(LIMIT, 0), np.nextafter(LIMIT, 9), 8.6, 38.0, 1e10, 1e300, np.inf]
+)
+def test_beyond_the_table_it_is_zero_or_one(x):
+    low, high = phi(np.array([-x, x]))
+    assert 0.0 <= low < 1e-16
+    assert 1.0 - 1e-15 < high <= 1.0
+
+
+@pytest.mark.parametrize("x", [0.0, -0.0, 5e-324, -5e-324, 2.2e-308, -1e-300, 1e-17])
+def test_tiny_arguments_give_a_half(x):
+    assert phi(np.array([x]))[0] == 0.5
+
+
+def test_its_values_stay_in_the_unit_interval_and_never_fall_by_more_than_rounding():
+    x = np.sort(np.random.default_rng(1).uniform(-9.0, 9.0, 200_000))
+    y = phi(x)
+    assert ((y >= 0.0) & (y <= 1.0)).all()
+    assert np.diff(y).min() > -BOUND

@@ -1,0 +1,101 @@
+"""In fresh processes: everything works without Numba, and its compiled code is kept on disk."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+EPISODE = """
+    import gymnasium, numpy as np, sme_registry
+    states = []
+    for env in (
+        gymnasium.make("SME/Complexity3-v1"),
+        gymnasium.make_vec("SME/Complexity3-v1", num_envs=3),
+    ):
+        env.reset(seed=3)
+        for t in range(20):
+            shape = env.action_space.shape
+            a = np.modf(0.61803 * (t + np.arange(1, 1 + np.prod(shape))))[0].reshape(shape)
+            env.step(a.astype(np.float32))
+        states.append([x.hex() for x in np.ravel(env.unwrapped.state).tolist()])
+"""
+HIDE = "import sys; sys.modules['numba'] = None\n"
+
+
+def run(script, **environment):
+    """The standard output of a script in a fresh process, as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", textwrap.dedent(script)],
+        capture_output=True, text=True, check=False, timeout=120,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_without_numba_the_same_episodes_have_the_same_bits():
+    show = "import json, sys; print(json.dumps([states, sys.modules.get('numba') is not None]))"
+    plain, loaded = run(HIDE + textwrap.dedent(EPISODE) + show)
+    assert not loaded
+    pytest.importorskip("numba")
+    fast, loaded = run(textwrap.dedent(EPISODE) + show)
+    assert loaded
+    assert plain == fast
+
+
+def test_without_numba_tasks_specs_and_evaluation_work(tmp_path):
+    script = HIDE + textwrap.dedent(
+        f"""
+        import json, sme_registry
+        spec = sme_registry.load("Default")
+        path = sme_registry.save(spec, {str(tmp_path / "task.json")!r})
+        task = sme_registry.materialize(spec)
+        report = sme_registry.evaluate(
+            lambda observation: task.optimal_action(observation[:, :-2]), path, "quick-v1"
+        )
+        env = sme_registry.make(path)
+        env.reset(seed=0)
+        _, reward, *_ = env.step(env.action_space.sample())
+        print(json.dumps([reward >= 0.0, report.regions[0].similarity]))
+        """
+    )
+    rewarded, similarity = run(script)
+    assert rewarded
+    assert similarity > 1.0 - 1e-6
+
+
+def test_numba_asked_for_without_numba_is_a_clear_error():
+    script = """
+        import json, sme_registry
+        from sme_registry.errors import MissingDependencyError
+        try:
+            sme_registry.make("SME/Default-v1")
+        except MissingDependencyError as error:
+            print(json.dumps(str(error)))
+    """
+    message = run(HIDE + textwrap.dedent(script), SME_BACKEND="numba")
+    assert message.startswith("SME_BACKEND='numba': Numba is not installed.")
+
+
+def test_a_second_process_loads_the_compiled_code_and_compiles_nothing():
+    pytest.importorskip("numba")
+    from sme_registry.compiled import kernels  # so that the first has been
+
+    script = """
+        import json
+        from numba.core.dispatcher import Dispatcher
+        from sme_registry.compiled import kernels
+        kept = {name: f for name, f in vars(kernels).items() if isinstance(f, Dispatcher)}
+        print(json.dumps({
+            name: [sum(f.stats.cache_hits.values()), sum(f.stats.cache_misses.values())]
+            for name, f in kept.items() if f._cache.cache_path is not None
+        }))
+    """
+    counts = run(script)
+    assert {"step_many", "add_and_normal_cdf"} <= counts.keys()
+    for name, (hits, misses) in counts.items():
+        assert hits == len(getattr(kernels, name).signatures) > 0, name
+        assert misses == 0, name

@@ -1,0 +1,138 @@
+"""The public names of the package, and what those that handle documents promise."""
+
+import importlib
+import inspect
+
+import gymnasium
+import pytest
+
+import sme_registry
+from sme_registry import errors
+from sme_registry.errors import NameTakenError, OptionError, SMEError, SpecError
+from sme_registry.spec import SMESpec
+
+CONTRACT = {
+    "SMEError", "SMESpec", "Task", "EvaluationProtocol", "EvaluationReport", "env_spec", "evaluate",
+    "load", "make", "make_vec", "materialize", "register", "save",
+}  # fmt: skip
+
+
+def test_the_public_names_are_sorted_and_hold_the_contract():
+    assert sme_registry.__all__ == sorted(set(sme_registry.__all__))
+    assert set(sme_registry.__all__) >= CONTRACT
+
+
+@pytest.mark.parametrize("name", sme_registry.__all__)
+def test_a_public_name_can_be_imported_and_is_documented(name):
+    thing = getattr(sme_registry, name)
+    assert inspect.getdoc(thing), name
+    assert thing.__doc__, name  # its own, not its base's
+    assert name in dir(sme_registry)
+
+
+def test_star_import_gives_the_public_names():
+    namespace: dict[str, object] = {}
+    exec("from sme_registry import *", namespace)
+    assert set(sme_registry.__all__) <= namespace.keys()
+
+
+def test_an_unknown_attribute_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'maek'"):
+        sme_registry.maek  # noqa: B018
+
+
+MODULES = [
+    "errors", "files", "registration", "spec", "spec.catalogue", "spec.document", "spec.envelope",
+    "spec.protocol", "spec.resolve", "spec.sme_spec", "spec.suite", "task", "task.draw",
+    "task.fingerprint", "task.memory", "task.step", "task.streams", "task.task",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_what_is_public_in_a_module_is_documented(name):
+    module = importlib.import_module(f"sme_registry.{name}")
+    assert module.__doc__
+    for public, thing in vars(module).items():
+        if public.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
+            continue
+        if inspect.isfunction(thing) or inspect.isclass(thing):
+            assert thing.__doc__, f"{name}.{public}"
+        if inspect.isclass(thing):
+            for method, member in vars(thing).items():
+                if not method.startswith("_") and (
+                    inspect.isfunction(member) or isinstance(member, property)
+                ):
+                    assert member.__doc__, f"{name}.{public}.{method}"
+
+
+def test_every_error_is_ours_documented_and_drawn_in_the_tree():
+    kinds = [
+        kind
+        for kind in vars(errors).values()
+        if inspect.isclass(kind) and kind.__module__ == errors.__name__
+    ]
+    assert len(kinds) > 10
+    for kind in kinds:
+        assert issubclass(kind, SMEError)
+        assert kind.__doc__
+        assert kind.__name__ in errors.__doc__
+
+
+class TestRegister:
+    def test_a_spec_of_your_own_is_made_by_its_name(self):
+        spec = SMESpec(state_dim=3, action_dim=2, seed=101)
+        assert sme_registry.register(spec, "Api-Own_1") == "SME/Api-Own_1-v1"
+        env = gymnasium.make("SME/Api-Own_1-v1")
+        assert env.unwrapped.sme_spec == spec
+        assert env.spec.id == "SME/Api-Own_1-v1"
+        for name in ("SME/Api-Own_1-v1", "Api-Own_1-v1", "Api-Own_1"):
+            assert sme_registry.load(name) == spec
+            assert sme_registry.make(name).unwrapped.sme_spec == spec
+        assert sme_registry.load(spec.digest) == spec
+
+    def test_the_same_spec_again_changes_nothing(self):
+        spec = SMESpec(seed=102)
+        first = sme_registry.register(spec, "ApiAgain")
+        count = len(gymnasium.registry)
+        for name in ("ApiAgain", "ApiAgain-v1", "SME/ApiAgain-v1"):
+            assert sme_registry.register(spec.plain(), name) == first
+        assert sme_registry.register(SMESpec(), "Default") == "SME/Default-v1"
+        assert len(gymnasium.registry) == count
+
+    def test_another_spec_cannot_take_a_name(self):
+        sme_registry.register(SMESpec(seed=103), "ApiTaken")
+        with pytest.raises(NameTakenError, match="a released id never changes its numbers"):
+            sme_registry.register(SMESpec(seed=104), "ApiTaken")
+        with pytest.raises(NameTakenError, match="'SME/Default-v1' stands for another spec"):
+            sme_registry.register(SMESpec(seed=104), "Default")
+        assert sme_registry.load("ApiTaken") == SMESpec(seed=103)
+        assert sme_registry.load("Default") == SMESpec()
+
+    @pytest.mark.parametrize(
+        "name",
+        ["", "a b", "a/b", "SME/a/b", "a:b", "a@1", "ä", "a\n", "x" * 65, "a-v2", "-v1", 5.5],
+    )
+    def test_a_name_that_no_registry_takes_is_refused(self, name):
+        count = len(gymnasium.registry)
+        with pytest.raises(OptionError, match="must be 1 to 64 letters, digits, '_' and '-'"):
+            sme_registry.register(SMESpec(seed=105), name)
+        assert len(gymnasium.registry) == count
+
+    def test_what_is_no_spec_is_refused(self):
+        with pytest.raises(SpecError, match="k=0: must be"):
+            sme_registry.register({"k": 0}, "ApiBad")
+        with pytest.raises(SpecError, match="must be an SMESpec or a mapping"):
+            sme_registry.register("Default", "ApiBad")
+        assert "SME/ApiBad-v1" not in gymnasium.registry
+
+
+def test_a_task_sent_as_a_file_is_the_same_task_at_the_other_end(tmp_path):
+    mine = SMESpec(state_dim=5, complexity=4, seed="0xfeed")
+    theirs = sme_registry.load(sme_registry.save(mine, tmp_path / "sub" / "ours-v1.json"))
+    assert theirs.digest == mine.digest
+    s = [0.1, 0.2, 0.3, 0.4, 0.5]
+    a = sme_registry.materialize(mine).optimal_action(s)
+    assert sme_registry.materialize(theirs).regret(s, a) == 0.0
+    from sme_registry.spec import EnvFile
+
+    assert EnvFile.read(tmp_path / "sub" / "ours-v1.json").name == "ours"
