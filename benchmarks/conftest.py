@@ -90,7 +90,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
     table = Table(title="Medians of interleaved rounds, one core", title_justify="left")
     for heading in ("what", "per", "ours", "peer", "", "ratio", "bar", ""):
-        table.add_column(heading, justify="right" if heading in ("ours", "ratio", "bar") else "left")
+        table.add_column(
+            heading, justify="right" if heading in ("ours", "ratio", "bar") else "left"
+        )
     for row in rows:
         met = "met" if row.ratio >= row.bar else "[bold]missed[/bold]"
         table.add_row(

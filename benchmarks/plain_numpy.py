@@ -1,7 +1,7 @@
 """The baseline: the same environments as a researcher would write them, in plain NumPy.
 
-The same numbers (states bit for bit, `tests/compiled` checks it), the same checks of actions and the
-same `info`, but one operation a line, no tuning and no compiled code. Φ is SciPy's `ndtr`:
+The same numbers (states bit for bit, `tests/compiled` checks it), the same checks of actions and
+the same `info`, but one operation a line, no tuning and no compiled code. Φ is SciPy's `ndtr`:
 `scipy.stats.norm.cdf`, which many would write, costs ninety times as much on four values.
 """
 
