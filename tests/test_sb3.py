@@ -35,6 +35,8 @@ from sme_registry.sb3 import SMEVecEnv
 
 # Ends early and late, pays late, and its lanes drift apart.
 HARD = sme_registry.SMESpec(horizon=12, k=5, D=0.2, r_min=0.1, complexity=2, seed=4)
+# Many a last step is terminated and truncated at once, or either alone.
+BOTH = sme_registry.SMESpec(horizon=2, k=5, D=0.5)
 
 
 def dummy(spec: Any = HARD, lanes: int = 3, **kwargs: Any) -> DummyVecEnv:
@@ -61,7 +63,11 @@ def assert_same(got: Any, expected: Any) -> None:
 
 
 @pytest.mark.parametrize("action_range", ["symmetric", "unit"])
-@pytest.mark.parametrize("spec", [HARD, "Default", "Interval25", "HardFragile"], ids=str)
+@pytest.mark.parametrize(
+    "spec",
+    [HARD, BOTH, "Default", "Interval25", "HardFragile"],
+    ids=["hard", "both-flags", "Default", "Interval25", "HardFragile"],
+)
 def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_range: Any) -> None:
     ours = SMEVecEnv(spec, 3, action_range=action_range)
     theirs = dummy(spec, action_range=action_range)
@@ -196,6 +202,7 @@ def test_options_begin_lanes_where_they_say() -> None:
         action = np.zeros((3, 2), np.float32)
         for _ in range(101):
             assert_same(ours.step(action), theirs.step(action))
+        assert_same(ours.reset(), theirs.reset())  # options, like seeds, are used once
     ours.set_options({"state": [2.0, 0.0]})
     with pytest.raises(StateError):
         ours.reset()

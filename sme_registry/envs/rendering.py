@@ -6,8 +6,6 @@ similarity of each step and the regret that has added up.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import itertools
 import warnings
 from collections.abc import Sequence
@@ -37,9 +35,8 @@ _OPTIMAL, _ACTION, _REGRET, _STATE = (0, 158, 115), (0, 114, 178), (213, 94, 0),
 
 def _import_pygame() -> Any:
     try:
-        # Its greeting would land in the output of every script that renders, and with some
-        # versions of setuptools its import warns of what is no fault of the user's.
-        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        # With some versions of setuptools its import warns of what is no fault of the user's.
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import pygame
             import pygame.font
