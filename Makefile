@@ -31,7 +31,7 @@ check: $(INSTALLED)    ## style, formatting, types, and which module may import 
 	$(VENV)/bin/lint-imports
 
 bench: $(INSTALLED)    ## speed beside peers measured in the same run
-	$(PY) -m benchmarks
+	$(PY) -m pytest benchmarks --benchmark-enable --benchmark-quiet -q
 
 docs: $(INSTALLED)     ## write the generated pages of docs/ anew
 	$(PY) docs/generate.py
