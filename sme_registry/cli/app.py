@@ -28,8 +28,7 @@ class _Commands(TyperGroup):
             code = super().main(*args, **options)
             sys.stdout.flush()
         except BrokenPipeError:
-            _leave_the_pipe()
-            sys.exit(0)
+            sys.exit(_leave_the_pipe())
         except Exception as error:
             # A usage error is Click's, which Typer brings along in some versions and not in
             # others: what tells it apart is that it can format itself.
@@ -48,15 +47,21 @@ class _Commands(TyperGroup):
         except SMEError as error:
             failure(str(error))
             raise typer.Exit(2) from None
+        except BrokenPipeError:
+            raise typer.Exit(_leave_the_pipe()) from None
         except KeyboardInterrupt as stopped:
             failure(str(stopped) or "interrupted: what was being written is whole or absent.")
             raise typer.Exit(130) from None
 
 
-def _leave_the_pipe() -> None:
-    """Whoever read our output has left (`sme list | head`); Python would complain at its end."""
+def _leave_the_pipe() -> int:
+    """Whoever read our output has left (`sme list | head`), which is no error: exit code 0.
+
+    Python would complain at its end that it cannot write what it still holds.
+    """
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
 
 
 app = typer.Typer(

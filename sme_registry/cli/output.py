@@ -19,9 +19,16 @@ _MARKS = {
 }
 
 
+class _Out(Console):
+    """Rich would exit with 1 where the reader has left; `app` decides that."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
 def out() -> Console:
     """Standard output, looked up anew: tests and pipes replace it."""
-    return Console(file=sys.stdout, highlight=False)
+    return _Out(file=sys.stdout, highlight=False)
 
 
 def err() -> Console:

@@ -208,8 +208,10 @@ def how_to_go_on(folder: Path) -> str:
     record = RunRecord.read(folder)
     if record is None:
         return "interrupted before the training began: nothing was written."
-    kept = f"step {record.steps_done:,} is kept" if record.steps_done else "no checkpoint yet"
+    from sme_registry.training.checkpoint import FILE
+
+    kept = "up to its last checkpoint" if (folder / FILE).exists() else "and holds no checkpoint"
     return (
-        f"interrupted ({kept} in {folder}). Run the same command with --resume to go on, "
-        "or with --force to begin anew."
+        f"interrupted: the run is in {folder}, {kept}. Run the same command with --resume "
+        "to go on, or with --force to begin anew."
     )

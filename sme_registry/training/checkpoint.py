@@ -47,17 +47,22 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
       algorithm: the SB3 class that saved it.
       path: the file. Loading one can run code of whoever made it.
       env: the environment that it goes on in.
-      **kwargs: fields of the model to change, such as `buffer_size`.
+      **kwargs: fields of the model to change, such as `buffer_size`; that one is raised to what
+        the checkpoint holds.
 
     Raises:
       PolicyError: not a checkpoint that can be loaded.
     """
     try:
-        model = algorithm.load(path, env=env, device="cpu", **kwargs)
         with zipfile.ZipFile(path) as members:
-            if _MEMBER in members.namelist():
-                replay = np.load(io.BytesIO(members.read(_MEMBER)), allow_pickle=False)
-                _refill(model.replay_buffer, replay)
+            has_replay = _MEMBER in members.namelist()
+            stored = io.BytesIO(members.read(_MEMBER)) if has_replay else None
+        replay = None if stored is None else dict(np.load(stored, allow_pickle=False))
+        if replay is not None and "buffer_size" in kwargs:
+            kwargs["buffer_size"] = max(kwargs["buffer_size"], replay["rewards"].size)
+        model = algorithm.load(path, env=env, device="cpu", **kwargs)
+        if replay is not None:
+            _refill(model.replay_buffer, replay)
     except Exception as error:
         raise PolicyError(
             f"{path}: cannot be resumed from: {type(error).__name__}: {error}. "
@@ -66,7 +71,7 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
     return model
 
 
-def _refill(buffer: Any, replay: Any) -> None:
+def _refill(buffer: Any, replay: dict[str, Any]) -> None:
     filled = len(replay["rewards"])
     for name in _ARRAYS:
         getattr(buffer, name)[:filled] = replay[name]

@@ -28,7 +28,7 @@ from rich.console import Console
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.files import write_atomically
-from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec import EnvFile, EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
 from sme_registry.training import checkpoint
@@ -330,13 +330,19 @@ def _draw(report: EvaluationReport, folder: Path, model: Any) -> tuple[Path, ...
     figures = []
     log = folder / episode_files.FILE
     if episode_files.read_episodes(log):
-        title = f"{report.policy} on SME/{report.spec.content_name}"
+        title = f"{report.policy} on SME/{_name_of(report.spec)}"
         figures.append(plots.training_curve(log, folder / TRAINING_CURVE, title=title))
     figures.append(plots.decay_curve(report, folder / DECAY_CURVE))
     if report.spec.state_dim == 2:
         path = folder / SIMILARITY_MAP
         figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
     return tuple(figures)
+
+
+def _name_of(spec: SMESpec) -> str:
+    """A task's name in the catalogue, else by its content."""
+    named = {file.digest: file.versioned_name for file in catalogue.entries(EnvFile)}
+    return named.get(spec.digest, spec.content_name)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,172 @@
+"""Certificates: sound tasks pass, trivial and broken ones do not, and each check can fail."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, load
+from sme_registry.errors import OptionError
+from sme_registry.task import Layer, Task, materialize
+from sme_registry.task.certify import Certificate, Check, certify
+
+SMALL = SMESpec(state_dim=3, action_dim=2, seed=1)
+
+
+def check(certificate: Certificate, name: str) -> Check:
+    (found,) = [check for check in certificate.checks if check.name == name]
+    return found
+
+
+def with_layers(task: Task, *layers: Layer) -> Task:
+    return dataclasses.replace(task, policies=(layers,))
+
+
+@pytest.mark.parametrize("name", ["Default", "Complexity10", "Plane10", "StateDim64", "HardSparse"])
+def test_sound_tasks_of_the_catalogue_pass_without_a_warning(name: str) -> None:
+    assert certify(load(name)).outcome == "passed"
+
+
+def test_the_papers_near_trivial_settings_warn_and_still_pass() -> None:
+    certificate = certify(load("Complexity2"))
+    assert certificate.passed
+    assert certificate.outcome == "warning"
+    assert check(certificate, "constant_policy_similarity").outcome == "warning"
+
+
+def test_a_trivial_target_is_refused() -> None:
+    certificate = certify(SMESpec(state_dim=2, action_dim=2, complexity=3))
+    assert not certificate.passed
+    assert check(certificate, "constant_policy_similarity").value > 0.9  # type: ignore[operator]
+    assert check(certificate, "constant_policy_similarity").outcome == "refused"
+
+
+def test_a_collapsed_action_channel_is_refused() -> None:
+    task = materialize(SMALL)
+    ((W, b),) = task.policies[0]
+    W, b = W.copy(), b.copy()
+    W[1] *= 0.05
+    b[1] *= 0.05
+    found = check(certify(with_layers(task, Layer(W, b))), "channel_spread")
+    assert found.outcome == "refused"
+
+
+def test_rows_that_lose_an_actions_mass_are_refused() -> None:
+    task = materialize(SMALL)
+    broken = dataclasses.replace(task, W=task.W * (1 + 2.0**-29))
+    assert check(certify(broken), "transition_row_sums").outcome == "refused"
+
+
+def test_a_layer_that_is_not_orthogonal_is_refused() -> None:
+    task = materialize(SMALL)
+    ((W, b),) = task.policies[0]
+    W = W.copy()
+    W[0, 0] += 1e-6
+    found = certify(with_layers(task, Layer(W, b)))
+    assert check(found, "layers_orthogonal").outcome == "refused"
+
+
+def test_a_layer_off_centre_is_refused() -> None:
+    task = materialize(SMALL)
+    ((W, b),) = task.policies[0]
+    found = certify(with_layers(task, Layer(W, b + 1e-6)))
+    assert check(found, "layers_centred").outcome == "refused"
+
+
+@pytest.mark.parametrize("init", ["semi_orthogonal", "unit_variance"])
+def test_layers_that_widen_are_judged_by_their_own_rule(init: str) -> None:
+    spec = SMESpec(state_dim=3, action_dim=5, complexity=3, hidden_width=8, policy_init=init)
+    assert check(certify(spec), "layers_orthogonal").outcome == "passed"
+
+
+class Folding(Task):
+    """A transition that keeps to half of the cube."""
+
+    def transition(self, s, a):  # type: ignore[no-untyped-def, override]
+        return super().transition(s, a) / 2.0
+
+
+class Merging(Task):
+    """A transition that sends every lane where the first one goes."""
+
+    def transition(self, s, a):  # type: ignore[no-untyped-def, override]
+        return np.broadcast_to(super().transition(s[:1], a[:1]), s.shape)
+
+
+def recast(task: Task, kind: type[Task]) -> Task:
+    return kind(task.spec, task.W, task.b, task.policies, task.observed)
+
+
+def test_states_that_do_not_stay_uniform_are_refused() -> None:
+    certificate = certify(recast(materialize(SMALL), Folding))
+    assert check(certificate, "uniform_states").outcome == "refused"
+    assert check(certificate, "coverage").value <= 0.25  # type: ignore[operator]
+    assert check(certificate, "coverage").outcome == "refused"
+
+
+def test_lanes_that_merge_are_refused() -> None:
+    certificate = certify(recast(materialize(SMALL), Merging))
+    found = check(certificate, "distinct_states")
+    assert found.outcome == "refused"
+    assert found.value == pytest.approx(1 / 64)
+
+
+def test_a_dyadic_offset_collapses_and_is_refused() -> None:
+    task = materialize(SMALL)
+    broken = dataclasses.replace(task, b=np.array([0.0, 0.25, 0.5]))
+    assert check(certify(broken), "distinct_states").outcome == "refused"
+
+
+def test_states_in_float32_collapse_and_float64_do_not() -> None:
+    class Float32(Task):
+        def transition(self, s, a):  # type: ignore[no-untyped-def, override]
+            y = (s + self.b + a @ self.W).astype(np.float32)
+            return (np.float32(2) * np.abs(y - np.rint(y))).astype(np.float64)
+
+    task = materialize(SMESpec())
+    assert check(certify(task), "distinct_states").value == 1.0
+    assert check(certify(recast(task, Float32)), "distinct_states").outcome == "refused"
+
+
+def test_the_linear_policy_is_reported_and_near_optimal_only_for_one_layer() -> None:
+    shallow = check(certify(load("Default")), "linear_policy_reward")
+    deep = check(certify(load("Complexity50")), "linear_policy_reward")
+    assert shallow.outcome == deep.outcome == "reported"
+    assert shallow.value == pytest.approx(0.87, abs=0.02)  # METHOD, section 2
+    assert deep.value < 0.3  # type: ignore[operator]
+
+
+def test_the_same_seed_gives_the_same_certificate_and_another_one_other_numbers() -> None:
+    assert certify(SMALL, seed=3) == certify(materialize(SMALL), seed=3)
+    assert certify(SMALL, seed=3).checks != certify(SMALL, seed=4).checks
+
+
+def test_measuring_does_not_depend_on_the_tasks_own_streams() -> None:
+    values = [check(certify(SMALL, seed=s), "uniform_states").value for s in range(12)]
+    assert max(values) < 2.6  # type: ignore[type-var]
+    assert len(set(values)) == 12
+
+
+def test_a_team_and_a_single_channel_can_be_certified() -> None:
+    team = {"agents": [{"action_dim": 1}, {"action_dim": 1, "observes": [0, 2]}]}
+    assert certify(SMESpec(state_dim=8, action_dim=2, team=team)).passed
+    assert certify(SMESpec(state_dim=1, action_dim=1)).passed
+
+
+@pytest.mark.parametrize("seed", [-1, 2**53, 0.5, "0", True])
+def test_a_seed_out_of_range_is_refused(seed: object) -> None:
+    with pytest.raises(OptionError, match="seed="):
+        certify(SMALL, seed=seed)  # type: ignore[arg-type]
+
+
+def test_a_certificate_is_plain_json_that_names_every_bound() -> None:
+    plain = json.loads(json.dumps(certify(SMALL).plain(), allow_nan=False))
+    assert plain["outcome"] == "passed"
+    assert plain["digest"] == SMALL.digest
+    for entry in plain["checks"]:
+        assert entry["meaning"]
+        judged = entry["outcome"] != "reported"
+        assert judged == (entry["low"] is not None or entry["high"] is not None)

@@ -1,0 +1,504 @@
+"""The command line, as it is typed: what it prints, what it refuses, what it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import sme_registry
+from sme_registry import EvaluationReport, SMESpec, load
+from sme_registry.cli import app
+from sme_registry.spec import EnvFile, ProtocolFile, SuiteFile, catalogue
+from sme_registry.task.certify import certify
+
+SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
+KINDS = (EnvFile, SuiteFile, ProtocolFile)
+COMMANDS = ["list", "show", "new", "validate", "certify", "evaluate", "train", "demo"]
+
+
+def sme(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def good(*arguments: str | Path) -> Result:
+    result = sme(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def refused(*arguments: str | Path) -> str:
+    """The message of a command that must refuse, after the rules that hold for all of them."""
+    result = sme(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every command runs in an empty folder, on a terminal of known width."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("PYTHONPATH", str(Path(sme_registry.__file__).parents[1]))
+
+
+def test_help_lists_every_command_and_the_version_is_the_packages() -> None:
+    text = good("--help").stdout
+    assert all(command in text for command in COMMANDS)
+    assert good("--version").stdout.strip() == f"sme {sme_registry.__version__}"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_each_command_has_examples(command: str) -> None:
+    text = good(command, "--help").stdout
+    assert "Examples:" in text
+    assert text.count(f"sme {command}") >= 3  # the usage line and two examples
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("frob",), ("train",), ("list", "--kind", "x"), ("new",), ("train", "Default", "-n", "many")],
+)
+def test_a_usage_error_is_one_line_that_points_to_the_help(arguments: tuple[str, ...]) -> None:
+    message = refused(*arguments)
+    assert len(message.splitlines()) == 1
+    assert "--help` shows how." in message
+
+
+class TestList:
+    def test_json_holds_the_whole_catalogue_and_nothing_else(self) -> None:
+        entries = json.loads(good("list", "--json").stdout)
+        expected = [name for kind in KINDS for name in catalogue.names(kind)]
+        assert [entry["name"] for entry in entries] == expected
+        for entry in entries:
+            if entry["kind"] == "env":
+                assert SMESpec.parse(entry["spec"]).digest == entry["digest"]
+
+    def test_tables_name_every_environment_suite_and_protocol(self) -> None:
+        text = good("list").stdout
+        for kind in KINDS:
+            assert all(name in text for name in catalogue.names(kind))
+
+    def test_filters_by_kind_and_tag(self) -> None:
+        suites = json.loads(good("list", "--kind", "suite", "--json").stdout)
+        assert {entry["kind"] for entry in suites} == {"suite"}
+        tagged = json.loads(good("list", "--tag", "paper", "--json").stdout)
+        assert 0 < len(tagged) < len(json.loads(good("list", "--json").stdout))
+        assert all("paper" in entry["tags"] for entry in tagged)
+
+    def test_an_unknown_tag_is_refused_and_the_known_ones_are_named(self) -> None:
+        assert "paper" in refused("list", "--tag", "papre")
+
+    def test_an_unknown_tag_is_an_empty_list_in_json(self) -> None:
+        assert json.loads(good("list", "--tag", "papre", "--json").stdout) == []
+
+
+class TestShow:
+    @pytest.mark.parametrize(
+        "name", ["Default", "Default-v1", "SME/Default-v1", "sha256:66e9b7a9a266"]
+    )
+    def test_a_task_is_found_under_each_of_its_names(self, name: str) -> None:
+        shown = json.loads(good("show", name, "--json").stdout)
+        assert shown["name"] == "Default-v1"
+        assert shown["digest"] == load("Default").digest
+        assert SMESpec.parse(shown["spec"]) == load("Default")
+
+    def test_derived_facts_are_those_of_the_environment(self) -> None:
+        facts = json.loads(good("show", "Interval25", "--json").stdout)["derived"]
+        task = sme_registry.materialize(load("Interval25"))
+        numbers = task.W.size + task.b.size + sum(W.size + b.size for W, b in task.policies[0])
+        assert facts["parameters"] == numbers
+        assert facts["parameter_memory_bytes"] == 8 * numbers
+        assert (facts["largest_return"], facts["payouts_in_a_full_episode"]) == (100, 4)
+
+    def test_people_see_fields_digest_and_facts(self) -> None:
+        text = good("show", "Survival25").stdout
+        for words in ("state_dim", load("Survival25").digest, "largest_return", "0.25"):
+            assert words in text
+
+    def test_suites_and_protocols_are_shown_too(self) -> None:
+        assert "complexity=10" in good("show", "core").stdout
+        assert "epsilons" in good("show", "paper-v1").stdout
+        shown = json.loads(good("show", "smoke", "--json").stdout)
+        assert shown == catalogue.find(SuiteFile, "smoke").plain()
+        assert json.loads(good("show", shown["digest"], "--json").stdout) == shown
+
+    def test_an_instance_of_a_suite_is_found_by_its_digest(self) -> None:
+        spec = catalogue.find(SuiteFile, "core").suite.instances[-1]
+        assert json.loads(good("show", spec.digest, "--json").stdout)["spec"] == spec.plain()
+
+    def test_the_exported_schema_is_the_models(self) -> None:
+        schema = json.loads(good("show", "--json-schema", "spec").stdout)
+        assert schema["properties"].keys() == SMESpec.model_fields.keys()
+        assert schema["additionalProperties"] is False
+        for kind in ("env-file", "suite", "suite-file", "protocol", "protocol-file"):
+            assert "properties" in json.loads(good("show", "--json-schema", kind).stdout)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("Defalt",), "Did you mean 'Default"),
+            (("cor",), "Did you mean 'core'"),
+            (("sha256:000000000000",), "no task"),
+            (("nowhere.json",), "cannot be read"),
+            ((), "NAME: missing"),
+            (("Default", "--json-schema", "spec"), "one or the other"),
+        ],
+    )
+    def test_bad_input(self, arguments: tuple[str, ...], message: str) -> None:
+        assert message in refused("show", *arguments)
+
+
+class TestNew:
+    def test_every_field_given_is_in_the_file_and_the_rest_is_default(self, tmp_path: Path) -> None:
+        fields = {
+            "--state-dim": 5, "--action-dim": 3, "--k": 4, "--r-min": 0.25, "--D": 0.5,
+            "--complexity": 2, "--horizon": 40, "--hidden-width": 16,
+            "--policy-init": "unit_variance", "--seed": 9,
+        }  # fmt: skip
+        options = [str(part) for pair in fields.items() for part in pair]
+        about = ("--name", "Mine", "--description", "A task.", "--tag", "a")
+        good("new", "mine.json", *options, *about)
+        file = EnvFile.read(tmp_path / "mine.json")
+        given = {name.strip("-").replace("-", "_"): value for name, value in fields.items()}
+        assert file.spec == SMESpec(**given)  # type: ignore[arg-type]
+        assert (file.name, file.description, file.tags) == ("Mine", "A task.", ("a",))
+        good("validate", "mine.json")
+        good("new", "plain.json")
+        assert load(tmp_path / "plain.json") == SMESpec()
+
+    def test_from_derives_and_its_file_is_loaded_by_its_path(self, tmp_path: Path) -> None:
+        printed = good("new", "a.json", "--from", "HardDeep", "--k", "5").stdout
+        spec = load(tmp_path / "a.json")
+        assert spec == load("HardDeep").derive(k=5)
+        assert spec.digest in printed
+        good("new", "b.json", "--from", "a.json", "--seed", "0x1F")
+        assert load(tmp_path / "b.json") == spec.derive(seed="0x1f")
+
+    def test_a_team_is_given_as_json(self, tmp_path: Path) -> None:
+        team = '{"agents": [{"action_dim": 1}, {"action_dim": 3}], "reward": "team"}'
+        good("new", "team.json", "--team", team)
+        found = load(tmp_path / "team.json").team
+        assert found is not None
+        assert [agent.action_dim for agent in found.agents] == [1, 3]
+
+    def test_a_file_that_is_there_is_replaced_only_by_force(self, tmp_path: Path) -> None:
+        good("new", "a.json", "--seed", "1")
+        before = (tmp_path / "a.json").read_bytes()
+        assert "--force" in refused("new", "a.json", "--seed", "2")
+        assert (tmp_path / "a.json").read_bytes() == before
+        good("new", "a.json", "--seed", "2", "--force")
+        assert load(tmp_path / "a.json").seed == 2
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (("--complexity", "0"), "complexity=0: must be"),
+            (("--r-min", "1"), "r_min=1.0"),
+            (("--r-min", "nan"), "r_min=nan"),
+            (("--seed", "-3"), "seed=-3"),
+            (("--seed", "abc"), "seed='abc'"),
+            (("--policy-init", "haar"), "policy_init='haar'"),
+            (("--state-dim", "1000000", "--action-dim", "1000000"), "GiB"),
+            (("--team", '{"agents": [{"action_dim": 3}]}'), "action_dim=4"),
+            (("--team", "two"), "got 'two'"),
+            (("--from", "Defalt"), "Did you mean"),
+            (("--name", "a b"), "name='a b'"),
+            (("--tag", "a/b"), "tags"),
+        ],
+    )
+    def test_bad_input_leaves_no_file(
+        self, options: tuple[str, ...], message: str, tmp_path: Path
+    ) -> None:
+        assert message in refused("new", "a.json", *options)
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestValidate:
+    def test_each_kind_is_told_and_folders_are_searched(self) -> None:
+        results = json.loads(good("validate", catalogue.spec_folder(), "--json").stdout)
+        assert {result["kind"] for result in results} == {"env", "suite", "protocol"}
+        assert all(result["valid"] for result in results)
+        assert len(results) == sum(len(catalogue.paths(kind)) for kind in KINDS)
+
+    def test_all_files_are_checked_and_each_bad_one_says_why(self, tmp_path: Path) -> None:
+        good("new", "good.json")
+        data = json.loads((tmp_path / "good.json").read_text())
+        broken: dict[str, Any] = {
+            "digest.json": {**data, "digest": "sha256:" + "0" * 64},
+            "fingerprint.json": {
+                **data, "fingerprint": {**data["fingerprint"], "optimal_action": [[0.5] * 4] * 3}
+            },
+            "field.json": {**data, "spec": {**data["spec"], "kk": 1}},
+            "bare.json": data["spec"],
+            "list.json": [],
+        }  # fmt: skip
+        for name, content in broken.items():
+            (tmp_path / name).write_text(json.dumps(content))
+        (tmp_path / "nan.json").write_text('{"spec": NaN}')
+        (tmp_path / "cut.json").write_text('{"spec": {')
+        names = [*broken, "nan.json", "missing.json", "cut.json", "good.json"]
+
+        result = sme("validate", *names, "--json")
+        assert result.exit_code == 2
+        results = {entry["path"]: entry for entry in json.loads(result.stdout)}
+        assert list(results) == names
+        assert [name for name in names if results[name]["valid"]] == ["good.json"]
+        expected = {
+            "digest.json": "digest=", "fingerprint.json": "fingerprint.optimal_action",
+            "field.json": "Did you mean 'k'", "bare.json": "bare spec", "list.json": "must be",
+            "nan.json": "NaN", "missing.json": "cannot be read", "cut.json": "line 1",
+        }  # fmt: skip
+        for name, words in expected.items():
+            assert words in results[name]["error"]
+            assert name in results[name]["error"]
+        assert "8 of 9 files are bad" in result.stderr
+
+    def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path: Path) -> None:
+        plain = catalogue.find(SuiteFile, "smoke").plain()
+        plain["suite"]["classes"][0]["seeds"] = [77]
+        (tmp_path / "suite.json").write_text(json.dumps(plain))
+        assert "digest=" in sme("validate", "suite.json").stdout
+        refused("validate", "suite.json")
+
+    def test_an_empty_folder_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        assert "no .json" in refused("validate", "empty")
+
+
+class TestCertify:
+    def test_a_sound_task_passes_with_its_numbers(self) -> None:
+        (made,) = json.loads(good("certify", "Default", "--json").stdout)
+        assert made == {"task": "Default", **certify(load("Default")).plain()}
+        text = good("certify", "Default").stdout
+        assert all(check.name in text for check in certify(load("Default")).checks)
+
+    def test_a_trivial_task_exits_with_one(self) -> None:
+        good("new", "trivial.json", "--state-dim", "2", "--action-dim", "2", "--complexity", "3")
+        result = sme("certify", "trivial.json")
+        assert result.exit_code == 1
+        assert "refused for constant_policy_similarity" in result.stderr
+        assert sme("certify", "Default", "trivial.json").exit_code == 1
+
+    def test_a_suite_is_certified_task_by_task(self) -> None:
+        text = good("certify", "smoke").stdout
+        assert len(text.splitlines()) == len(catalogue.find(SuiteFile, "smoke").suite.instances)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("Defalt",), "Did you mean"),
+            (("paper-v1",), "is a protocol"),
+            (("Default", "--seed", "-1"), "seed=-1"),
+        ],
+    )
+    def test_bad_input(self, arguments: tuple[str, ...], message: str) -> None:
+        assert message in refused("certify", *arguments)
+
+
+QUICK = ("--protocol", "quick-v1")
+
+
+class TestEvaluate:
+    @pytest.mark.parametrize(
+        ("policy", "reference"),
+        [("optimal", "optimal"), ("constant", "constant_half")],
+    )
+    def test_a_reference_policy_scores_as_in_every_report(
+        self, policy: str, reference: str
+    ) -> None:
+        report = json.loads(good("evaluate", policy, "Default", *QUICK, "--json").stdout)
+        similarity = [region["similarity"] for region in report["regions"]]
+        expected = [region["similarity"] for region in report["references"][reference]]
+        assert similarity == pytest.approx(expected, abs=1e-12)
+
+    @pytest.mark.parametrize(
+        ("policy", "reference"), [("random", "uniform_random"), ("linear", "linear_least_squares")]
+    )
+    def test_other_draws_of_a_reference_score_nearly_the_same(
+        self, policy: str, reference: str
+    ) -> None:
+        report = json.loads(good("evaluate", policy, "Default", *QUICK, "--json").stdout)
+        similarity = report["regions"][0]["similarity"]
+        expected = report["references"][reference][0]["similarity"]
+        assert similarity == pytest.approx(expected, abs=0.01)
+
+    def test_the_folder_gets_report_and_figures_and_is_not_overwritten(
+        self, tmp_path: Path
+    ) -> None:
+        good("evaluate", "constant", "Plane1", *QUICK, "--out", "ev")
+        names = sorted(path.name for path in (tmp_path / "ev").iterdir())
+        assert names == ["decay_curve.png", "evaluation.json", "similarity_map.png"]
+        assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"
+        assert "--force" in refused("evaluate", "random", "Plane1", *QUICK, "--out", "ev")
+        assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"
+        good("evaluate", "random", "Plane1", *QUICK, "--out", "ev", "--force")
+        assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "random"
+
+    def test_a_function_of_ones_own_is_evaluated_in_the_range_it_says(self, tmp_path: Path) -> None:
+        (tmp_path / "mine_for_the_test.py").write_text(
+            "import numpy as np\n"
+            "def act(observations):\n    return np.zeros((len(observations), 4))\n"
+        )
+        arguments = ("evaluate", "mine_for_the_test:act", "Default", *QUICK, "--json")
+        report = json.loads(good(*arguments, "--action-range", "symmetric").stdout)
+        half = report["references"]["constant_half"][0]["similarity"]
+        assert report["regions"][0]["similarity"] == pytest.approx(half, abs=1e-12)
+        lower = json.loads(good(*arguments).stdout)["regions"][0]["similarity"]
+        assert lower < half - 0.1
+
+    def test_overrides_evaluate_the_derived_task(self) -> None:
+        text = good(
+            "evaluate", "constant", "Default", *QUICK, "--set", "complexity=3", "--json"
+        ).stdout
+        assert json.loads(text)["spec_digest"] == load("Default").derive(complexity=3).digest
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("optmal", "Default"), "Did you mean 'optimal'"),
+            (("no_such_module:act", "Default"), "cannot be imported"),
+            (("math:nothing", "Default"), "cannot be imported"),
+            (("math:pi", "Default"), "must be a function"),
+            (("math:sqrt", "Default"), "failed on observations"),
+            (("nowhere.zip", "Default"), "no such file"),
+            (("optimal", "Defalt"), "Did you mean"),
+            (("optimal", "Default", "--protocol", "papr-v1"), "Did you mean 'paper-v1'"),
+            (("optimal", "Default", "--action-range", "both"), "action_range='both'"),
+            (("optimal", "Default", "--set", "complexity"), "field=value"),
+            (("optimal", "Default", "--set", "complexty=2"), "Did you mean 'complexity'"),
+            (("optimal", "Default", "--set", "k=2", "--set", "k=3"), "twice"),
+        ],
+    )
+    def test_bad_input_writes_nothing(
+        self, arguments: tuple[str, ...], message: str, tmp_path: Path
+    ) -> None:
+        assert message in refused("evaluate", *arguments, "--out", "ev")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_zip_that_is_no_model_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "a.zip").write_bytes(b"not a zip")
+        assert "not a model" in refused("evaluate", "a.zip", "Default")
+
+
+SHORT = ("train", "Plane1", "-n", "120", *QUICK)
+
+
+class TestTrain:
+    def test_it_trains_reports_and_says_where(self, tmp_path: Path) -> None:
+        pytest.importorskip("stable_baselines3")
+        result = good(*SHORT, "--json")
+        printed = json.loads(result.stdout)
+        assert printed["folder"] == "runs/Plane1-TD3-seed0"
+        folder = tmp_path / printed["folder"]
+        assert printed["run"]["status"] == "finished"
+        assert printed["evaluation"] == json.loads((folder / "evaluation.json").read_text())
+        assert "training TD3: 120 of 120 steps" in result.stderr
+        assert "Warning" not in result.stderr
+        assert "finished run" in refused(*SHORT)
+        again = json.loads(
+            good("evaluate", folder / "model.zip", "Plane1", *QUICK, "--json").stdout
+        )
+        assert again["regions"] == printed["evaluation"]["regions"]
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (("-a", "TD33"), "Did you mean 'TD3'"),
+            (("--seed", "-1"), "seed=-1"),
+            (("--num-envs", "0"), "num_envs=0"),
+            (("--action-range", "unti"), "action_range='unti'"),
+            (("--set", "state_dim=x"), "state_dim='x'"),
+            (("--protocol", "papr-v1"), "Did you mean"),
+            (("--checkpoint-every", "0"), "checkpoint_every=0"),
+        ],
+    )
+    def test_bad_input_writes_nothing(
+        self, options: tuple[str, ...], message: str, tmp_path: Path
+    ) -> None:
+        pytest.importorskip("stable_baselines3")
+        assert message in refused(*SHORT, *options)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_an_interrupt_says_how_to_go_on_and_going_on_works(self, tmp_path: Path) -> None:
+        pytest.importorskip("stable_baselines3")
+        command = ("train", "Plane1", "--out", "run", "--checkpoint-every", "50", *QUICK)
+        process = subprocess.Popen(
+            [*SME, *command, "-n", "100000"],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+        )
+        try:
+            deadline = time.monotonic() + 60
+            while time.monotonic() < deadline and process.poll() is None:
+                if (tmp_path / "run/checkpoint.zip").exists():
+                    process.send_signal(signal.SIGINT)
+                    break
+                time.sleep(0.05)
+            _, stderr = process.communicate(timeout=60)
+        finally:
+            process.kill()
+        assert process.returncode == 130
+        (last,) = [line for line in stderr.splitlines() if line.startswith("error:")]
+        assert "--resume" in last
+        assert "Traceback" not in stderr
+        run = json.loads((tmp_path / "run/run.json").read_text())
+        assert run["status"] == "running"
+        steps = str(run["steps_done"] + 30)
+        printed = json.loads(good(*command, "-n", steps, "--resume", "--json").stdout)
+        assert printed["run"]["sessions"] == 2
+        assert printed["run"]["steps_done"] == int(steps)
+
+
+class TestDemo:
+    def test_it_leaves_figures_and_a_report_that_links_them(self, tmp_path: Path) -> None:
+        pytest.importorskip("stable_baselines3")
+        result = good("demo", "--quick", "--steps", "200", "--out", "demo")
+        names = {path.name for path in (tmp_path / "demo").iterdir()}
+        assert names >= {"report.md", "training_curve.png", "decay_curve.png", "model.zip"}
+        text = (tmp_path / "demo/report.md").read_text()
+        linked = {part.split(")")[0] for part in text.split("](")[1:]}
+        assert linked <= names
+        assert load("Default").digest in text
+        assert "demo/report.md" in result.stdout
+        assert "Mean regret while training" in result.stdout
+        again = sme("demo", "--quick", "--out", "demo")
+        assert again.exit_code == 2
+        assert "error: folder='demo': holds a finished run" in again.stderr
+
+
+def test_the_installed_command_answers_in_pure_json_on_standard_output() -> None:
+    process = subprocess.run([*SME, "list", "--json"], capture_output=True, check=False, text=True)
+    assert process.returncode == 0
+    assert process.stderr == ""
+    assert len(json.loads(process.stdout)) > 30
+
+
+def test_the_exit_code_and_the_one_line_reach_the_shell() -> None:
+    process = subprocess.run([*SME, "show", "Defalt"], capture_output=True, check=False, text=True)
+    assert process.returncode == 2
+    assert process.stdout == ""
+    assert process.stderr.startswith("error: ")
+    assert len(process.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [("list",), ("show", "core", "--json")])
+def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> None:
+    read, write = os.pipe()
+    process = subprocess.Popen([*SME, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    os.close(read)
+    _, stderr = process.communicate(timeout=60)
+    assert stderr == ""
+    assert process.returncode == 0
