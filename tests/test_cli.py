@@ -493,7 +493,9 @@ def test_the_exit_code_and_the_one_line_reach_the_shell() -> None:
     assert len(process.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("arguments", [("list",), ("show", "core", "--json")])
+@pytest.mark.parametrize(
+    "arguments", [("list",), ("show", "core", "--json"), ("show", "Default", "--json")]
+)
 def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> None:
     read, write = os.pipe()
     process = subprocess.Popen([*SME, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)

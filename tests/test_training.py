@@ -19,7 +19,15 @@ import pytest
 from rich.console import Console
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
-from sme_registry.errors import OptionError, PolicyError, SMEError, UnknownNameError
+from sme_registry.errors import (
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    ResourceLimitError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+)
 from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, train
 from sme_registry.training.algorithms import known_algorithm
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
@@ -193,6 +201,11 @@ def test_a_killed_run_goes_on_from_its_checkpoint(killed: Path, tmp_path: Path) 
     assert numbers == list(range(1, len(numbers) + 1))
     assert result.episodes[-1].step > before.steps_done
     assert result.episodes[-1].wall_seconds > kept[-1].wall_seconds
+    # Its starts are drawn from another stream than those of the first session.
+    with zipfile.ZipFile(folder / "checkpoint.zip") as archive:
+        replay = np.load(io.BytesIO(archive.read("sme_replay_buffer.npz")))
+    starts = replay["observations"][[0, before.steps_done], 0, :2]
+    assert not np.array_equal(starts[0], starts[1])
 
 
 def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(
@@ -319,15 +332,44 @@ def test_bad_input_is_a_typed_error_and_makes_no_folder(
     assert not (tmp_path / "run").exists()
 
 
+def test_without_stable_baselines_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(MissingDependencyError, match=r"sme-registry\[train\]"):
+        short(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_matplotlib_a_run_has_no_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = short(tmp_path / "run", steps=30)
+    assert result.figures == ()
+    assert not list((tmp_path / "run").glob("*.png"))
+    assert result.record.status == "finished"
+
+
 def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
     with pytest.raises(OptionError, match="is a file"):
         short(tmp_path / "run")
 
 
-def test_an_unknown_task_makes_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError):
-        train("Defalt", folder=tmp_path / "run")
+@pytest.mark.parametrize(
+    ("task", "error"),
+    [
+        ("Defalt", UnknownNameError),
+        ({"state_dim": 2**20, "action_dim": 2**20}, ResourceLimitError),
+        ({"state_dim": 0}, SpecError),
+    ],
+)
+def test_a_task_that_cannot_be_drawn_makes_no_folder(
+    task: Any, error: type[Exception], tmp_path: Path
+) -> None:
+    with pytest.raises(error):
+        train(task, folder=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 TASK = "Default-v1"
 FOLDER = Path("runs/demo")
-REPORT = "report.md"
 _STEPS, _QUICK_STEPS = 15_000, 2_000
 _STAGES = 10
 
@@ -48,6 +47,7 @@ def demo(
     """
     from sme_registry import training
     from sme_registry.cli.runs import how_to_go_on
+    from sme_registry.training.run import REPORT
 
     if steps is None:
         steps = _QUICK_STEPS if quick else _STEPS

@@ -19,11 +19,12 @@ _PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch
 
 
 class RunRecord(StrictModel):
-    """A training run. What `Plan` in its comment names must agree for a run to be resumed.
+    """A training run: its plan, and what came of it.
 
     Attributes:
       status: "running" (or killed), then "finished".
-      spec, spec_digest, algorithm, seed, action_range, num_envs: the plan.
+      spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which a resumption
+        must agree with.
       hyperparameters: whose.
       steps: environment steps asked for, over all lanes.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their

@@ -51,10 +51,11 @@ EVALUATION = "evaluation.json"
 TRAINING_CURVE = "training_curve.png"
 DECAY_CURVE = "decay_curve.png"
 SIMILARITY_MAP = "similarity_map.png"
+REPORT = "report.md"  # which `sme demo` adds
 TENSORBOARD = "tensorboard"
 _OWN_FILES = (
     RECORD, episode_files.FILE, checkpoint.FILE, MODEL, EVALUATION,
-    TRAINING_CURVE, DECAY_CURVE, SIMILARITY_MAP,
+    TRAINING_CURVE, DECAY_CURVE, SIMILARITY_MAP, REPORT,
 )  # fmt: skip
 
 MAX_STEPS = 10**10
@@ -219,7 +220,7 @@ def _claim(folder: Path, asked: RunRecord, *, resume: bool, force: bool) -> dict
 
 def _removable(force: bool) -> tuple[str, ...]:
     """What may lie in a folder without being a stranger: with `force`, all that a run writes."""
-    return (*_OWN_FILES, TENSORBOARD, "report.md") if force else ()
+    return (*_OWN_FILES, TENSORBOARD) if force else ()
 
 
 def _learn(
@@ -364,16 +365,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def run_of(folder: str | os.PathLike[str]) -> RunRecord:
-    """The record of a run's folder.
-
-    Raises:
-      OptionError: there is none.
-      MalformedDocumentError, SpecError: its `run.json` is no record.
-    """
-    found = RunRecord.read(Path(folder))
-    if found is None:
-        raise OptionError(f"folder={os.fspath(folder)!r}: holds no {RECORD}. Give a run's folder.")
-    return found
