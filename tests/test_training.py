@@ -28,7 +28,7 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
-from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, train
+from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, checkpoint, train
 from sme_registry.training.algorithms import known_algorithm
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
 from sme_registry.training.progress import Meter, duration
@@ -269,6 +269,20 @@ def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], fi
     with pytest.raises(OptionError, match=f"^{field}="):
         short(killed, **{"seed": 3, "resume": True, **change})
     assert (killed / "run.json").read_bytes() == before
+
+
+def test_an_interrupt_waits_until_what_is_being_saved_is_written() -> None:
+    written, before = [], signal.getsignal(signal.SIGINT)
+
+    def save() -> None:
+        with checkpoint.uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            written.append("checkpoint and record")
+
+    with pytest.raises(KeyboardInterrupt):
+        save()
+    assert written == ["checkpoint and record"]
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_broken_checkpoint_is_refused_with_the_way_out(killed: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.files import read_json
 from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, SuiteFile
+from sme_registry.spec.sme_spec import SMESpec
 
 NAMESPACE = "SME"
 
@@ -79,6 +80,12 @@ def find(kind: type[_E], name: str) -> _E:
         + (did_you_mean(name, known) or did_you_mean(name, short))
         + " `sme list` shows what there is."
     )
+
+
+def title(spec: SMESpec) -> str:
+    """What a reader calls a task: `SME/Default-v1` where the catalogue has it, else its content."""
+    named = {file.digest: file.versioned_name for file in entries(EnvFile)}
+    return f"{NAMESPACE}/{named.get(spec.digest, spec.content_name)}"
 
 
 def released() -> Iterator[tuple[str, str]]:

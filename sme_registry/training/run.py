@@ -28,7 +28,7 @@ from rich.console import Console
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.files import write_atomically
-from sme_registry.spec import EnvFile, EvaluationProtocol, SMESpec, catalogue
+from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
 from sme_registry.training import checkpoint
@@ -258,8 +258,9 @@ def _learn(
     wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
 
     def save_checkpoint(steps_done: int) -> None:
-        checkpoint.save(model, path)
-        record.updated(**_so_far(steps_done, log, callback)).write(folder)
+        with checkpoint.uninterrupted():
+            checkpoint.save(model, path)
+            record.updated(**_so_far(steps_done, log, callback)).write(folder)
 
     # What will be done: on-policy algorithms collect whole rollouts.
     rollout = 1 if "buffer_size" in settings else model.n_steps
@@ -283,9 +284,10 @@ def _learn(
             env.close()
     record = record.updated(**_so_far(int(model.num_timesteps), log, callback))
     saved = io.BytesIO()
-    model.save(saved)
-    write_atomically(folder / MODEL, saved.getvalue())
-    record.write(folder)
+    with checkpoint.uninterrupted():
+        model.save(saved)
+        write_atomically(folder / MODEL, saved.getvalue())
+        record.write(folder)
     return record, log.episodes, model
 
 
@@ -331,19 +333,13 @@ def _draw(report: EvaluationReport, folder: Path, model: Any) -> tuple[Path, ...
     figures = []
     log = folder / episode_files.FILE
     if episode_files.read_episodes(log):
-        title = f"{report.policy} on SME/{_name_of(report.spec)}"
+        title = f"{report.policy} on {catalogue.title(report.spec)}"
         figures.append(plots.training_curve(log, folder / TRAINING_CURVE, title=title))
     figures.append(plots.decay_curve(report, folder / DECAY_CURVE))
     if report.spec.state_dim == 2:
         path = folder / SIMILARITY_MAP
         figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
     return tuple(figures)
-
-
-def _name_of(spec: SMESpec) -> str:
-    """A task's name in the catalogue, else by its content."""
-    named = {file.digest: file.versioned_name for file in catalogue.entries(EnvFile)}
-    return named.get(spec.digest, spec.content_name)
 
 
 @contextlib.contextmanager
