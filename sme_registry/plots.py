@@ -22,7 +22,7 @@ from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.evaluation.report import LABELS
 from sme_registry.files import write_atomically
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
 from sme_registry.task.draw import Array
@@ -99,6 +99,9 @@ def decay_curve(
         panels = figure.subplots(1, len(measures), squeeze=False)[0]
         for axes, measure in zip(panels, measures, strict=True):
             _decay_panel(axes, reports, measure, references)
+        tasks = {report.spec_digest: catalogue.title(report.spec) for report in reports}
+        if len(tasks) == 1:
+            figure.suptitle(*tasks.values(), fontsize=10)
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside right center")
     return Path(path)
@@ -213,7 +216,7 @@ def similarity_map(
         inside = (side >= 0.0) & (side <= 1.0)
         means = [similarity[np.ix_(inside, inside)].mean(), similarity.mean()]
         axes.set_title(
-            f"{_literal(asked.name)}, L = {spec.complexity}\n"
+            f"{_literal(asked.name)} on {catalogue.title(spec)}, L = {spec.complexity}\n"
             f"mean r̃ {means[0]:.3f} in the unit square, {means[1]:.3f} in all shown"
         )
         axes.locator_params(nbins=5)

@@ -111,6 +111,16 @@ def test_decay_curve_shows_the_reports_numbers_and_every_reference(tmp_path, rep
         assert "not comparable" in axes.get_xlabel()
 
 
+def test_figures_say_which_task_they_are_of(tmp_path, report, figures):
+    plots.decay_curve(report, tmp_path / "decay.png")
+    plots.similarity_map(half, "Plane1", tmp_path / "map.png", resolution=4)
+    assert figures[0].get_suptitle() == f"SME/{report.spec.content_name}"
+    assert "half on SME/Plane1-v1, L = 1" in figures[1].axes[0].get_title()
+    other = evaluate(half, PLANE.derive(seed=1), PROTOCOL)
+    plots.decay_curve([report, other], tmp_path / "two.png")
+    assert figures[2].get_suptitle() == ""
+
+
 def test_a_policys_name_is_not_read_as_a_formula(tmp_path, report, figures):
     plots.decay_curve(report, tmp_path / "figure.png")  # "$\\frac$" would be an error
     assert figures[0].legends[0].get_texts()[0].get_text() == r"a \$\frac\$ name"

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.files import read_json, to_json, write_atomically
-from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel
 
 if TYPE_CHECKING:
@@ -145,9 +145,9 @@ class EvaluationReport(StrictModel):
 
         spec, own_name = self.spec, escape(self.policy)
         table = Table(
-            title=f"{own_name} on SME/{spec.content_name} (S={spec.state_dim}, "
+            title=f"{own_name} on {catalogue.title(spec)} (S={spec.state_dim}, "
             f"A={spec.action_dim}, L={spec.complexity})\n"
-            f"{self.regions[0].states:,} states a region",
+            f"{spec.digest}\n{self.regions[0].states:,} states a region",
             caption=NOT_COMPARABLE,
             title_justify="left",
             caption_justify="left",

@@ -248,6 +248,14 @@ def test_the_table_fits_80_columns_and_shows_references_beside_the_policy(report
     assert f"{report.references['linear_least_squares'][5].normalised_regret:.3f}" in text
 
 
+def test_the_table_goes_by_the_catalogues_name_where_there_is_one_and_shows_the_digest():
+    named, derived = SMESpec(), SMESpec(seed=12345)
+    for spec, title in ((named, "SME/Default-v1"), (derived, f"SME/{derived.content_name}")):
+        text = rendered(evaluate(optimal_of(spec), spec, PROTOCOL, name="mine"))
+        assert f"mine on {title} (S=8, A=4, L=1)" in text
+        assert spec.digest in text
+
+
 def test_a_policys_name_is_not_read_as_markup(report):
     text = rendered(evaluate(half, SPEC, "quick-v1", name="[red]x[/blue]"))
     assert "[red]x[/blue]" in text
