@@ -58,6 +58,13 @@ def test_help_lists_every_command_and_the_version_is_the_packages() -> None:
     assert good("--version").stdout.strip() == f"sme {sme_registry.__version__}"
 
 
+def test_the_command_alone_shows_the_help_and_nothing_else() -> None:
+    result = sme()
+    assert result.exit_code == 2
+    assert "Commands" in result.output
+    assert "error" not in result.output
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_each_command_has_examples(command: str) -> None:
     text = good(command, "--help").stdout
@@ -221,6 +228,12 @@ class TestNew:
         self, options: tuple[str, ...], message: str, tmp_path: Path
     ) -> None:
         assert message in refused("new", "a.json", *options)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_file_without_the_ending_that_makes_it_a_path_is_refused(
+        self, tmp_path: Path
+    ) -> None:
+        assert "must end in .json" in refused("new", "mine")
         assert list(tmp_path.iterdir()) == []
 
 

@@ -37,7 +37,8 @@ class _Commands(TyperGroup):
             context = getattr(error, "ctx", None)
             command = context.command_path if context is not None else "sme"
             message = error.format_message().replace("Value error, ", "").rstrip(".")
-            failure(f"{message}. `{command} --help` shows how.")
+            if message:  # none where `sme` stood alone: the help is out already
+                failure(f"{message}. `{command} --help` shows how.")
             sys.exit(getattr(error, "exit_code", 2))
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -69,7 +70,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -91,9 +92,9 @@ def _top(
 ) -> None:
     """Synthetic Monitoring Environments: control tasks whose optimal policy is known exactly.
 
-    A first look:  [bold]sme list[/]  ·  [bold]sme show Default[/]  ·  [bold]sme demo[/]
+    A first look:  **sme list**  ·  **sme show Default**  ·  **sme demo**
 
-    Your own task:  [bold]sme new mine.json --complexity 10 --seed 3[/]
+    Your own task:  **sme new mine.json --complexity 10 --seed 3**
     """
 
 

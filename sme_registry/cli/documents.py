@@ -309,6 +309,8 @@ def new(
         "team": None if team is None else names.json_or_text(team),
     }
     fields = {field: value for field, value in given.items() if value is not None}
+    if path.suffix != ".json":
+        raise OptionError(f"{path}: must end in .json, by which every command knows a path.")
     if path.exists() and not force:
         raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
     spec = (resolve(base) if base is not None else SMESpec()).derive(**fields)

@@ -16,7 +16,7 @@ from sme_registry.errors import (
 from sme_registry.files import parse_json, read_json
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, SuiteFile, catalogue
 from sme_registry.spec.envelope import Envelope
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec.resolve import refuse_bare_spec, resolve
 
 KINDS: dict[str, type[Envelope]] = {"env": EnvFile, "suite": SuiteFile, "protocol": ProtocolFile}
 
@@ -32,13 +32,9 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
             return kind.open(data, os.fspath(path))
+    refuse_bare_spec(data, os.fspath(path))
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
-    hint = ""
-    if isinstance(data, dict) and data.keys() & SMESpec.model_fields.keys():
-        hint = " It looks like a bare spec: `sme new` writes it with its envelope."
-    raise MalformedDocumentError(
-        f"{os.fspath(path)}: must be an object with one of {contents}.{hint}"
-    )
+    raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
 
 
 def is_path(name: str) -> bool:

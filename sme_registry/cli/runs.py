@@ -125,10 +125,10 @@ def train(
     seed: Annotated[int, typer.Option(help="Of the algorithm and of the starts.")] = 0,
     out_folder: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="By default runs/<task>-<algorithm>-seed<seed>."),
+        typer.Option("--out", "-o", help="By default `runs/<task>-<algorithm>-seed<seed>`."),
     ] = None,
     action_range: Annotated[
-        str, typer.Option(help="symmetric, \\[-1, 1], or unit, \\[0, 1].")
+        str, typer.Option(help="symmetric, [-1, 1], or unit, [0, 1].")
     ] = "symmetric",
     num_envs: Annotated[
         int, typer.Option(help="Environments at once; off-policy, more mean fewer updates.")

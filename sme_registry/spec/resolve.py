@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.errors import MalformedDocumentError, UnknownNameError, did_you_mean
 from sme_registry.files import read_json
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile, SuiteFile
@@ -61,9 +61,25 @@ def read_env_file(path: str | os.PathLike[str]) -> EnvFile:
     """Read a task's file; a bare spec without an envelope is refused with the way out.
 
     Raises:
-      MalformedDocumentError, SpecError, DigestMismatchError: see `EnvFile.read`.
+      MalformedDocumentError: not readable, not strict JSON, or a bare spec.
+      SpecError, DigestMismatchError: see `EnvFile.open`.
     """
-    return EnvFile.open(read_json(path), str(path))
+    data = read_json(path)
+    refuse_bare_spec(data, str(path))
+    return EnvFile.open(data, str(path))
+
+
+def refuse_bare_spec(data: Any, source: str) -> None:
+    """Raise where plain data is a spec alone, such as `SMESpec.model_dump_json` writes.
+
+    Raises:
+      MalformedDocumentError: says how to get its file.
+    """
+    if isinstance(data, dict) and data and data.keys() <= SMESpec.model_fields.keys():
+        raise MalformedDocumentError(
+            f"{source}: is a bare spec, without the digest and fingerprint of a task's file. "
+            "In Python, `sme_registry.save(SMESpec(**fields), path)` writes that."
+        )
 
 
 def with_fingerprint(file: EnvFile) -> SMESpec:

@@ -92,6 +92,13 @@ def test_a_missing_file_says_so(path):
         resolve(path)
 
 
+def test_a_bare_spec_is_told_from_a_file(tmp_path):
+    path = tmp_path / "bare.json"
+    path.write_text(SMESpec(k=5).model_dump_json())
+    with pytest.raises(MalformedDocumentError, match=r"bare spec.*sme_registry\.save"):
+        resolve(path)
+
+
 def test_nothing_but_our_errors_comes_of_odd_names():
     for name in ("/", "//", "SME/", ":", "SME/Default-v1-v1", "\0", "é" * 1000, "sha256:", "-v1"):
         with pytest.raises(SMEError):
