@@ -1,4 +1,4 @@
-"""The benchmarks' plain NumPy baseline is the same environment: only then is its speed a measure."""
+"""The benchmarks' plain NumPy baseline is the same environment: only then is it a measure."""
 
 from __future__ import annotations
 
