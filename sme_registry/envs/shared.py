@@ -12,6 +12,8 @@ agents, a_i the channels that agent i owns.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -27,7 +29,7 @@ def shared_observation_dim(task: Task) -> int:
 
 def shared_action_dim(task: Task) -> int:
     """Entries of a shared policy's action: of the agent that owns most."""
-    return max(own.stop - own.start for own in task.owned)
+    return int(max(own.stop - own.start for own in task.owned))
 
 
 def shared_observation(task: Task, joint: Observation) -> Observation:
@@ -40,18 +42,29 @@ def shared_observation(task: Task, joint: Observation) -> Observation:
     Returns:
       `[B, n, S + 2 + n]` float32, a fresh array.
     """
-    n = len(task.observed)
-    shown = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
-    for agent in range(n):
-        shown[:, agent] = shared_observation_of(task, joint, agent)
+    shown = np.empty((len(joint), len(task.observed), shared_observation_dim(task)), np.float32)
+    for agent, observed in enumerate(task.observed):
+        shown[:, agent] = shared_observation_of(agent, observed, task.spec.state_dim, joint)
     return shown
 
 
-def shared_observation_of(task: Task, joint: Observation, agent: int) -> Observation:
-    """What a shared policy is shown for one agent, `[B, S + 2 + n]`; see `shared_observation`."""
-    S, observed = task.spec.state_dim, list(task.observed[agent])
-    shown = np.zeros((len(joint), shared_observation_dim(task)), np.float32)
-    shown[:, observed] = joint[:, observed]
+def shared_observation_of(
+    agent: int, observed: Sequence[int], state_dim: int, joint: Observation
+) -> Observation:
+    """What a shared policy is shown for one agent.
+
+    Args:
+      agent: which, in [0, n).
+      observed: the state channels that it observes.
+      state_dim: S.
+      joint: `[B, S + 1 + n]` as in `shared_observation`.
+
+    Returns:
+      `[B, S + 2 + n]` float32, a fresh array.
+    """
+    S, channels = state_dim, list(observed)
+    shown = np.zeros((len(joint), joint.shape[1] + 1), np.float32)
+    shown[:, channels] = joint[:, channels]
     shown[:, S] = joint[:, S]
     shown[:, S + 1] = joint[:, S + 1 + agent]
     shown[:, S + 2 + agent] = 1.0
