@@ -156,20 +156,36 @@ def test_the_optimum_of_each_agent_earns_it_the_horizon() -> None:
     assert max(info["regret"] for info in infos) < 1e-5
 
 
-def test_wrappers_and_pickled_copies_go_on_as_the_original() -> None:
+def test_sb3s_wrappers_work_on_it() -> None:
     env: Any = VecNormalize(VecMonitor(SMETeamVecEnv(UNEQUAL, 2)))
+    env.seed(0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    episodes = 0
+    for _ in range(20):
+        observations, _, dones, infos = env.step(rng.uniform(-1, 1, (6, 3)).astype(np.float32))
+        assert observations.shape == (6, 5 + 2 + 3)
+        episodes += sum("episode" in info for info in infos)
+        assert all(("terminal_observation" in i) == d for i, d in zip(infos, dones, strict=True))
+    assert episodes > 0
+    assert episodes % 3 == 0
+
+
+def test_a_pickled_copy_goes_on_as_the_original() -> None:
+    env = SMETeamVecEnv(UNEQUAL, 2)
     env.seed(7)
     env.reset()
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (30, 6, 3)).astype(np.float32)
     for action in actions[:5]:
         env.step(action)
-    twin = pickle.loads(pickle.dumps(env.venv))
+    twin = pickle.loads(pickle.dumps(env))
     for action in actions[5:]:
-        got, expected = twin.step(action), env.venv.step(action)
+        got, expected = twin.step(action), env.step(action)
         for mine, other in zip(got[:3], expected[:3], strict=True):
             np.testing.assert_array_equal(mine, other)
         assert [i["regret"] for i in got[3]] == [i["regret"] for i in expected[3]]
+    np.testing.assert_array_equal(twin.get_attr("state"), env.get_attr("state"))
 
 
 def test_options_begin_teams_where_they_say_and_are_used_once() -> None:
