@@ -1,4 +1,4 @@
-"""The benchmarks' plain NumPy baseline is the same environment: only then is its speed a measure."""
+"""The benchmarks' plain NumPy baseline is the same environment: so its speed is a measure."""
 
 from __future__ import annotations
 
