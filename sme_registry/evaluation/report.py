@@ -172,9 +172,10 @@ class EvaluationReport(StrictModel):
         from rich.table import Table
 
         spec, own_name = self.spec, escape(self.policy)
+        team = f", {len(self.agents)} agents" if self.agents else ""
         table = Table(
             title=f"{own_name} on SME/{spec.content_name} (S={spec.state_dim}, "
-            f"A={spec.action_dim}, L={spec.complexity})\n"
+            f"A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{self.regions[0].states:,} states a region",
             caption=NOT_COMPARABLE,
             title_justify="left",
@@ -208,5 +209,5 @@ class EvaluationReport(StrictModel):
             row("  normalised regret", found.regions, "normalised_regret", ".3f")
             linear = found.references.get("linear_least_squares")
             if linear is not None:
-                row(f"  {LABELS['linear_least_squares']}", linear, "normalised_regret", ".3f")
+                row(f"  of {LABELS['linear_least_squares']}", linear, "normalised_regret", ".3f")
         return table
