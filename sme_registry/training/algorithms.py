@@ -10,6 +10,7 @@ import warnings
 from typing import Any
 
 from sme_registry.errors import MissingDependencyError, UnknownNameError, did_you_mean
+from sme_registry.spec import SMESpec
 
 # Each with what `sme train --help` says of it. The value's class is in `stable_baselines3`.
 ALGORITHMS = {
@@ -19,6 +20,21 @@ ALGORITHMS = {
     "PPO": "on-policy; ten times faster a step, and many more steps to learn",
     "A2C": "on-policy",
 }
+_ON_POLICY = ("PPO", "A2C")
+_TEAMS_AT_ONCE = 8
+
+
+def default_algorithm(spec: SMESpec) -> str:
+    """What trains where nothing else is asked for: TD3, and on a team PPO."""
+    return "TD3" if spec.team is None else "PPO"
+
+
+def default_num_envs(spec: SMESpec, algorithm: str) -> int:
+    """Environments at once where nothing else is asked for: 1, and of a team on-policy 8.
+
+    Off-policy more of them would mean fewer updates.
+    """
+    return _TEAMS_AT_ONCE if spec.team is not None and algorithm in _ON_POLICY else 1
 
 
 def known_algorithm(name: str) -> str:

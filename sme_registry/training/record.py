@@ -26,7 +26,9 @@ class RunRecord(StrictModel):
       spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which a resumption
         must agree with.
       hyperparameters: whose.
-      steps: environment steps asked for, over all lanes.
+      agents: of the task; more than 1 in a team. They share the one policy that is trained.
+      steps: environment steps asked for, over all environments. A step of a team is one step of
+        all its agents, so the algorithm learns from `agents` times as many transitions.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their
         last rollout, so it can be above `steps`.
       checkpoint_every: steps between checkpoints.
@@ -46,6 +48,7 @@ class RunRecord(StrictModel):
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
+    agents: Integer = 1
     steps: Integer
     steps_done: Integer = 0
     checkpoint_every: Integer
