@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from sme_registry.envs import actions as action_ranges
@@ -229,15 +229,31 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
                 action = actions[name]
             except (KeyError, TypeError, IndexError):
                 raise self._bad_keys(actions) from None
-            try:
-                joint[0, own] = action_ranges.checked(
-                    action, (own.stop - own.start,), self._rescaled
-                )
-            except ActionError as error:
-                raise ActionError(f"{name}: {error}") from None
+            joint[0, own] = self._checked(name, action)
         if len(actions) != len(self.possible_agents):
             raise self._bad_keys(actions)
         return joint
+
+    def _checked(self, name: str, action: Any) -> Array:
+        shape = self._action_spaces[name].shape
+        try:
+            return action_ranges.checked(action, shape, self._rescaled)
+        except ActionError as error:
+            raise ActionError(f"{name}: {error}") from None
+
+    def check_action(self, agent: str, action: npt.NDArray[Any]) -> None:
+        """Raise what `step` would raise of this action.
+
+        Args:
+          agent: whose it is.
+          action: `[a_i]`, finite.
+
+        Raises:
+          ActionError: of the wrong shape, not numbers, or not finite.
+          OptionError: there is no such agent.
+        """
+        if not np.isfinite(self._checked(self._known(agent), action)).all():
+            raise ActionError(f"{agent}: {action_ranges.not_finite()}")
 
     def _bad_keys(self, actions: Any) -> ActionError:
         """What to raise where the actions are not one for each agent."""
@@ -317,6 +333,22 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
     __str__ = __repr__
 
 
+class _Turns(OrderEnforcingWrapper):  # type: ignore[misc]
+    """A team in turns that refuses a bad action in its agent's own turn, where it can be mended."""
+
+    def step(self, action: npt.NDArray[Any] | None) -> None:
+        if not self._has_reset:
+            raise EpisodeError("step: the episode has not begun. Call reset() first.")
+        if not self.agents:
+            raise EpisodeError("step: the episode has ended. Call reset() first.")
+        name = self.agent_selection
+        if not (self.terminations[name] or self.truncations[name]):
+            self.unwrapped.check_action(name, action)
+        elif action is not None:
+            raise EpisodeError(f"{name}: the episode has ended. Give None, or call reset().")
+        super().step(action)
+
+
 def parallel_env(
     spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Team2-v1", **kwargs: Any
 ) -> SMETeamEnv:
@@ -328,4 +360,4 @@ def env(
     spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Team2-v1", **kwargs: Any
 ) -> AECEnv[str, Observation, npt.NDArray[Any]]:
     """The team of a spec as a PettingZoo AEC environment: agents act in turn, the step is joint."""
-    return OrderEnforcingWrapper(parallel_to_aec(SMETeamEnv(spec, **kwargs)))
+    return _Turns(parallel_to_aec_wrapper(SMETeamEnv(spec, **kwargs)))
