@@ -41,11 +41,12 @@ from sme_registry.training.algorithms import (
     known_algorithm,
     load_algorithm,
     refuse_without_dependencies,
+    rollout_steps,
 )
 from sme_registry.training.episodes import Episode, EpisodeLog
 from sme_registry.training.progress import Meter
+from sme_registry.training.record import DEFAULTS, RunRecord, installed_versions
 from sme_registry.training.record import FILE as RECORD
-from sme_registry.training.record import RunRecord, installed_versions
 
 if TYPE_CHECKING:
     from sme_registry.training.callback import RunCallback
@@ -110,6 +111,9 @@ def train(
 ) -> TrainingResult:
     """Train one SB3 algorithm, with SB3's default hyperparameters, on the CPU.
 
+    One exception: on a team PPO's rollout of 2,048 transitions is shared out over the agents of
+    all teams, at least 16 steps each, instead of 2,048 for each of them.
+
     A resumed run goes on from its last checkpoint: the same networks, optimisers, replay buffer
     and step count. It is not the run that would have been without the kill, to the bit: random
     streams are seeded anew, and the episodes under way (and for PPO and A2C the rollout) begin
@@ -159,8 +163,10 @@ def train(
     if action_range not in ("unit", "symmetric"):
         raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
     judged_by = resolve_protocol(protocol)
+    n_steps = rollout_steps(resolved, algorithm, num_envs)
     asked = RunRecord(
         status="running",
+        hyperparameters=DEFAULTS if n_steps is None else f"{DEFAULTS}, but n_steps={n_steps}",
         spec=resolved,
         spec_digest=resolved.digest,
         algorithm=algorithm,
@@ -256,6 +262,10 @@ def _learn(
         # Never smaller than what is stored, so nothing that SB3's default would do changes.
         transitions = (record.steps + record.num_envs) * record.agents
         settings["buffer_size"] = min(_MAX_REPLAY, transitions)
+
+    n_steps = rollout_steps(record.spec, record.algorithm, record.num_envs)
+    if n_steps is not None:
+        settings["n_steps"] = n_steps
 
     path = folder / checkpoint.FILE
     if record.sessions > 1 and path.exists():
