@@ -51,7 +51,7 @@ def optimal(agent):
 
 def slanted(agent):
     width = AGENTS[agent]["action_dim"]
-    return lambda observations: 0.3 + (0.2 + 0.1 * agent) * observations[:, -3:-2] * np.ones(width)
+    return lambda observations: 0.3 + (0.3 + 0.3 * agent) * observations[:, -3:-2] * np.ones(width)
 
 
 SLANTED = {name: slanted(agent) for agent, name in enumerate(NAMES)}
@@ -105,7 +105,7 @@ def test_an_agents_numbers_are_those_of_the_definition(report):
     for index in range(3):
         o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
         best = TASK.optimal_action(o[:, :4].astype(np.float64))
-        parts = []
+        parts, clipped = [], []
         for agent, (name, own) in enumerate(zip(NAMES, TASK.owned, strict=True)):
             seen = o[:, [*TASK.observed[agent], 4, 5]]
             raw = SLANTED[name](seen).astype(np.float64)
@@ -118,10 +118,14 @@ def test_an_agents_numbers_are_those_of_the_definition(report):
             floor = np.abs(0.5 - best[:, own]).mean()
             assert region.normalised_regret == pytest.approx(missed.mean() / floor, abs=1e-12)
             assert region.clipped_share == np.mean(raw != a)
+            clipped.append(raw != a)
             assert len(region.channels) == a.shape[1]
             parts.append(a)
         whole = TASK.similarity(o[:, :4].astype(np.float64), np.concatenate(parts, axis=1))
         assert report.regions[index].similarity == pytest.approx(whole.mean(), abs=1e-12)
+        share = np.mean(np.concatenate(clipped, axis=1))
+        assert report.regions[index].clipped_share == pytest.approx(share, abs=1e-12)
+        assert index == 0 or share > 0.0
 
 
 def test_only_the_agent_whose_policy_changes_has_other_numbers(report):
