@@ -84,7 +84,7 @@ class Batch:
     @property
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
-        return np.ascontiguousarray(self._s.T)
+        return self._s.T.copy()  # also where the transpose is contiguous as it stands
 
     def observe(self) -> Observation:
         """The joint observations of all lanes as they stand, `[B, S + 1 + n]`."""

@@ -133,6 +133,15 @@ def test_what_a_step_gives_is_not_written_into_by_the_next() -> None:
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize(("lanes", "state_dim"), [(1, 8), (5, 1), (1, 1), (5, 8)])
+def test_the_state_that_is_handed_out_is_a_copy(lanes: int, state_dim: int) -> None:
+    batch = Batch(materialize(SMESpec(state_dim=state_dim)), lanes)
+    batch.begin(np.arange(lanes), batch.observe())
+    before = batch.state
+    batch.state[:] = -7.0
+    np.testing.assert_array_equal(batch.state, before)
+
+
 def test_a_batch_too_large_for_memory_is_refused() -> None:
     with pytest.raises(ResourceLimitError, match="num_envs=1000000000"):
         Batch(materialize(SPECS["individual"]), 10**9)
