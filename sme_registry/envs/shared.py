@@ -42,30 +42,32 @@ def shared_observation(task: Task, joint: Observation) -> Observation:
     Returns:
       `[B, n, S + 2 + n]` float32, a fresh array.
     """
-    shown = np.empty((len(joint), len(task.observed), shared_observation_dim(task)), np.float32)
+    S, n = task.spec.state_dim, len(task.observed)
+    shown = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
+    single = joint[:, : S + 2].copy()
     for agent, observed in enumerate(task.observed):
-        shown[:, agent] = shared_observation_of(agent, observed, task.spec.state_dim, joint)
+        single[:, S + 1] = joint[:, S + 1 + agent]
+        shown[:, agent] = shared_observation_of(agent, n, observed, single)
     return shown
 
 
 def shared_observation_of(
-    agent: int, observed: Sequence[int], state_dim: int, joint: Observation
+    agent: int, agents: int, observed: Sequence[int], single: Observation
 ) -> Observation:
     """What a shared policy is shown for one agent.
 
     Args:
       agent: which, in [0, n).
+      agents: n.
       observed: the state channels that it observes.
-      state_dim: S.
-      joint: `[B, S + 1 + n]` as in `shared_observation`.
+      single: `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
 
     Returns:
       `[B, S + 2 + n]` float32, a fresh array.
     """
-    S, channels = state_dim, list(observed)
-    shown = np.zeros((len(joint), joint.shape[1] + 1), np.float32)
-    shown[:, channels] = joint[:, channels]
-    shown[:, S] = joint[:, S]
-    shown[:, S + 1] = joint[:, S + 1 + agent]
-    shown[:, S + 2 + agent] = 1.0
+    width = single.shape[1]
+    seen = [*observed, width - 2, width - 1]
+    shown = np.zeros((len(single), width + agents), np.float32)
+    shown[:, seen] = single[:, seen]
+    shown[:, width + agent] = 1.0
     return shown

@@ -245,7 +245,7 @@ def _shared(policy: Any, spec: SMESpec, action_range: str | None, name: str | No
         f"[B, {dims[0]}] to [B, {dims[1]}]; for separate policies give a dict by agent.",
     )
     members = tuple(
-        Member(agent.name, one, _shared_view(index, observed, spec, len(agents)), agent.action_dim)
+        Member(agent.name, one, _shown(index, len(agents), observed), agent.action_dim)
         for index, (agent, observed) in enumerate(
             zip(agents, draw.observed_channels(spec), strict=True)
         )
@@ -257,17 +257,10 @@ def _columns(columns: list[int]) -> Callable[[Observations], Observations]:
     return lambda observations: observations[:, columns]
 
 
-def _shared_view(
-    index: int, observed: tuple[int, ...], spec: SMESpec, agents: int
+def _shown(
+    agent: int, agents: int, observed: tuple[int, ...]
 ) -> Callable[[Observations], Observations]:
-    S = spec.state_dim
-
-    def seen(observations: Observations) -> Observations:
-        # Each agent's r_cum/k is what the protocol says of it, and no agent sees another's.
-        joint = observations[:, [*range(S + 1), *[S + 1] * agents]]
-        return shared_observation_of(index, observed, S, joint)
-
-    return seen
+    return lambda observations: shared_observation_of(agent, agents, observed, observations)
 
 
 def _refuse_other_names(policies: Mapping[str, Any], names: list[str]) -> None:

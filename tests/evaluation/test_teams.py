@@ -183,6 +183,23 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
         assert list(numbers(found.agents["agent_0"])) == list(numbers(alone))
 
 
+def test_the_references_of_the_command_line_act_for_teams_as_the_reports_own():
+    from sme_registry.cli.policies import find_policy
+
+    def inside(name):
+        return evaluate(find_policy(name, SPEC), SPEC, SMALL).agents
+
+    for name, same, near in (
+        ("optimal", "optimal", 1e-9),
+        ("constant", "constant_half", 0.0),
+        ("linear", "linear_least_squares", 0.05),  # fitted on other states
+        ("random", "uniform_random", 0.3),
+    ):
+        for agent in inside(name).values():
+            found, expected = agent.regions[0], agent.references[same][0]
+            assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
+
+
 def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
     seen = []
 
