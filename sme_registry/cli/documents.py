@@ -28,7 +28,6 @@ from sme_registry.spec import (
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import resolve, with_fingerprint
-from sme_registry.spec.sme_spec import MAX_DIM
 
 Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
 
@@ -467,7 +466,8 @@ def _team_fields(
                 f"--agents {agents} --channels-each {channels_each}: make {agents * channels_each} "
                 f"action channels and --action-dim says {fields['action_dim']}. Leave it out."
             )
-        made["team"] = {"agents": [{"action_dim": channels_each}] * min(agents, MAX_DIM)}
+        # The spec refuses far fewer than these; billions would first fill the memory.
+        made["team"] = {"agents": [{"action_dim": channels_each}] * min(agents, 2**12)}
     elif reward is not None and origin.team is not None:
         made["team"] = origin.team.plain()
     if reward is not None:
