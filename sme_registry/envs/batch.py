@@ -54,7 +54,7 @@ class Batch:
     """
 
     def __init__(self, task: Task, lanes: int) -> None:
-        S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
+        self._dimensions = S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
         refuse_above_limit(
             lanes * 8 * (4 * S + 4 * A + 16 * n + 48),
             f"num_envs={lanes}: a batch this large",
@@ -116,8 +116,7 @@ class Batch:
         Raises:
           ActionError: not finite; nothing has moved then.
         """
-        B, S, A = self.lanes, self.task.spec.state_dim, self.task.spec.action_dim
-        n = len(self.task.policies)
+        B, (S, A, n) = self.lanes, self._dimensions
         moved, observation = np.empty((S, B)), np.empty((B, S + 1 + n), np.float32)
         optimal, values, ends = np.empty((B, A)), np.empty((5, n, B)), np.empty((2, B), bool)
         if not self._step_many(

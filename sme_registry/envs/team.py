@@ -9,6 +9,7 @@ A task without a team is a team of one, `agent_0`. Source: METHOD, section 5.
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, cast
 
@@ -77,21 +78,27 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         self.render_mode = render_mode
         self._task = materialize(resolve(spec).derive(**overrides))
         self._batch = Batch(self._task, 1)
-        self._columns = observed_columns(self._task)
-        self._owned = self._task.owned
+        columns = observed_columns(self._task)
+        self._every_column = np.concatenate(columns)
+        ends = np.cumsum([len(part) for part in columns]).tolist()
+        self._seen = [slice(*part) for part in pairwise([0, *ends])]
         self.possible_agents = list(self._task.names)
+        self._parts = [
+            (agent, name, own)
+            for agent, (name, own) in enumerate(
+                zip(self.possible_agents, self._task.owned, strict=True)
+            )
+        ]
         self.agents: list[str] = []
         self._begun = False
         self._renderer: Any = None
 
         self._action_spaces, self._observation_spaces = {}, {}
-        for name, own, columns in zip(
-            self.possible_agents, self._owned, self._columns, strict=True
-        ):
+        for agent, name, own in self._parts:
             width = own.stop - own.start
             self._action_spaces[name], self._rescaled = action_ranges.space(action_range, width)
             self._observation_spaces[name] = gymnasium.spaces.Box(
-                0.0, 1.0, (len(columns),), np.float32
+                0.0, 1.0, (len(columns[agent]),), np.float32
             )
         self._joint_space, _ = action_ranges.space(action_range, self.sme_spec.action_dim)
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
@@ -198,25 +205,22 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
 
     def _infos(self, done: Advanced) -> dict[str, dict[str, Any]]:
         optimal = action_ranges.to_range(done.optimal[0], self._rescaled)
-        similarity, step_reward, regret, _, accumulated = done.values[:, :, 0].tolist()
+        similarity, step_reward, regret, _, accumulated = done.values.reshape(5, -1).tolist()
         return {
             name: {
-                "optimal_action": optimal[own].copy(),
+                "optimal_action": optimal[own],
                 "similarity": similarity[agent],
                 "step_reward": step_reward[agent],
                 "regret": regret[agent],
                 "accumulated_reward": accumulated[agent],
             }
-            for agent, (name, own) in enumerate(zip(self.possible_agents, self._owned, strict=True))
+            for agent, name, own in self._parts
         }
 
     def _shown(self, observation: Observation) -> dict[str, Observation]:
-        """What each agent sees of the joint observation; fresh arrays."""
-        row = observation[0]
-        return {
-            name: row[columns]
-            for name, columns in zip(self.possible_agents, self._columns, strict=True)
-        }
+        """What each agent sees of the joint observation; fresh arrays, apart from each other."""
+        seen = observation[0].take(self._every_column)
+        return dict(zip(self.possible_agents, map(seen.__getitem__, self._seen), strict=True))
 
     def _joint(self, actions: dict[str, npt.NDArray[Any]]) -> Array:
         """The joint action `[1, A]`, float64 of the unit range."""
@@ -224,20 +228,25 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             what = "has ended" if self._begun else "has not begun"
             raise EpisodeError(f"step: the episode {what}. Call reset() first.")
         joint = np.empty((1, self.sme_spec.action_dim))
-        for name, own in zip(self.possible_agents, self._owned, strict=True):
+        row = joint[0]
+        for _, name, own in self._parts:
             try:
                 action = actions[name]
             except (KeyError, TypeError, IndexError):
                 raise self._bad_keys(actions) from None
-            joint[0, own] = self._checked(name, action)
+            # Most actions are arrays as they should be, and checking costs as much as the step.
+            usual = type(action) is np.ndarray and action.dtype.char in "fd"
+            if not usual or action.shape != (own.stop - own.start,):
+                action = self._checked(name, action)
+            row[own] = action
         if len(actions) != len(self.possible_agents):
             raise self._bad_keys(actions)
-        return joint
+        return (joint + 1.0) / 2.0 if self._rescaled else joint
 
     def _checked(self, name: str, action: Any) -> Array:
-        shape = self._action_spaces[name].shape
+        """One agent's action as float64, in the environment's range."""
         try:
-            return action_ranges.checked(action, shape, self._rescaled)
+            return action_ranges.checked(action, self._action_spaces[name].shape, rescaled=False)
         except ActionError as error:
             raise ActionError(f"{name}: {error}") from None
 
@@ -274,7 +283,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         )
 
     def _not_finite(self, joint: Array) -> ActionError:
-        for name, own in zip(self.possible_agents, self._owned, strict=True):
+        for _, name, own in self._parts:
             if not np.isfinite(joint[0, own]).all():
                 return ActionError(f"{name}: {action_ranges.not_finite()}")
         return action_ranges.not_finite()
