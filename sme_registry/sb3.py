@@ -366,7 +366,7 @@ class SMETeamVecEnv(_LanesVecEnv):
         )
         optimal = action_ranges.to_range(done.optimal, self._rescaled)
         columns: dict[str, list[Any]] = {
-            "optimal_action": [row[own].copy() for row in optimal for own in self._task.owned],
+            "optimal_action": [row[own] for row in optimal for own in self._task.owned],
             "similarity": similarity.tolist(),
             "step_reward": step_reward.tolist(),
             "regret": regret.tolist(),
@@ -411,5 +411,5 @@ def _infos(
     for lane, row in enumerate(zip(*columns.values(), strict=True)):
         info = dict(zip(columns, row, strict=True))
         if dones[lane]:
-            info["terminal_observation"] = last[lane].copy()
+            info["terminal_observation"] = last[lane]
         yield info
