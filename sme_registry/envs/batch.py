@@ -127,4 +127,4 @@ class Batch:
         self._s = moved
         self._t += 1
         self._accumulated = values[4].copy()
-        return Advanced(observation, optimal, values, *ends)
+        return Advanced(observation, optimal, values, ends[0], ends[1])

@@ -100,6 +100,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             self._observation_spaces[name] = gymnasium.spaces.Box(
                 0.0, 1.0, (len(columns[agent]),), np.float32
             )
+        self._joint_shape = (1, self.sme_spec.action_dim)
         self._joint_space, _ = action_ranges.space(action_range, self.sme_spec.action_dim)
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
@@ -189,23 +190,24 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         except ActionError:
             raise self._not_finite(joint) from None
         names = self.possible_agents
-        terminated, truncated = bool(done.terminated[0]), bool(done.truncated[0])
-        infos = self._infos(done)
+        terminated, truncated = done.terminated.item(), done.truncated.item()
+        values = done.values.reshape(5, -1).tolist()
+        infos = self._infos(done.optimal[0], values)
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
             self._frame((joint, done))
         return (
             self._shown(done.observation),
-            dict(zip(names, done.values[3, :, 0].tolist(), strict=True)),
+            dict(zip(names, values[3], strict=True)),
             dict.fromkeys(names, terminated),
             dict.fromkeys(names, truncated),
             infos,
         )
 
-    def _infos(self, done: Advanced) -> dict[str, dict[str, Any]]:
-        optimal = action_ranges.to_range(done.optimal[0], self._rescaled)
-        similarity, step_reward, regret, _, accumulated = done.values.reshape(5, -1).tolist()
+    def _infos(self, optimal: Array, values: list[list[float]]) -> dict[str, dict[str, Any]]:
+        optimal = action_ranges.to_range(optimal, self._rescaled)
+        similarity, step_reward, regret, _, accumulated = values
         return {
             name: {
                 "optimal_action": optimal[own],
@@ -227,7 +229,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         if not self.agents:
             what = "has ended" if self._begun else "has not begun"
             raise EpisodeError(f"step: the episode {what}. Call reset() first.")
-        joint = np.empty((1, self.sme_spec.action_dim))
+        joint = np.empty(self._joint_shape)
         row = joint[0]
         for _, name, own in self._parts:
             try:
