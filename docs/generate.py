@@ -22,13 +22,14 @@ def catalogue() -> str:
         "",
         "## Environments",
         "",
-        f"| Id | {' | '.join(_SYMBOLS)} | digest | |",
-        "|---" * (len(_SYMBOLS) + 3) + "|",
+        f"| Id | {' | '.join(_SYMBOLS)} | agents | digest | |",
+        "|---" * (len(_SYMBOLS) + 4) + "|",
     ]
     for env in entries(EnvFile):
         values = " | ".join(f"{getattr(env.spec, field):g}" for field in _FIELDS)
         env_id, digest = f"SME/{env.versioned_name}", _short(env.digest)
-        lines.append(f"| `{env_id}` | {values} | `{digest}` | {env.description} |")
+        agents = len(env.spec.team.agents) if env.spec.team else 1
+        lines.append(f"| `{env_id}` | {values} | {agents} | `{digest}` | {env.description} |")
     lines += ["", "## Suites", "", "| Name | classes | instances | digest | |", "|---" * 5 + "|"]
     for suite in entries(SuiteFile):
         counts = f"{len(suite.suite.classes)} | {len(suite.suite.instances)}"

@@ -16,6 +16,8 @@ from sme_registry.registration import (
     env_spec,
     load,
     make,
+    make_aec,
+    make_parallel,
     make_vec,
     register,
     register_catalogue,
@@ -23,6 +25,7 @@ from sme_registry.registration import (
 )
 
 if TYPE_CHECKING:
+    from sme_registry.envs.team import env, parallel_env
     from sme_registry.evaluation.evaluate import evaluate
     from sme_registry.evaluation.report import EvaluationReport
     from sme_registry.spec import EvaluationProtocol, SMESpec
@@ -36,12 +39,16 @@ __all__ = [
     "SMEError",
     "SMESpec",
     "Task",
+    "env",
     "env_spec",
     "evaluate",
     "load",
     "make",
+    "make_aec",
+    "make_parallel",
     "make_vec",
     "materialize",
+    "parallel_env",
     "register",
     "save",
 ]
@@ -51,8 +58,10 @@ _LAZY = {
     "EvaluationReport": "sme_registry.evaluation",
     "SMESpec": "sme_registry.spec",
     "Task": "sme_registry.task",
+    "env": "sme_registry.envs.team",
     "evaluate": "sme_registry.evaluation",
     "materialize": "sme_registry.task",
+    "parallel_env": "sme_registry.envs.team",
 }
 
 

@@ -76,6 +76,8 @@ def decay_curve(
 ) -> Path:
     """Draw reports over the expansion level ε, one panel a measure, one line a report.
 
+    One report of a team, drawn alone, has a thinner line for each agent, too.
+
     Args:
       reports: one or more; named by their policies.
       path: the file to write, .png, .pdf or .svg.
@@ -121,6 +123,20 @@ def _decay_panel(
             markersize=4.5,
             linewidth=2,
             label=_literal(report.policy),
+        )
+    agents = reports[0].agents if len(reports) == 1 else {}
+    for index, (name, agent) in enumerate(agents.items()):
+        several = len(agents) >= len(COLOURS)  # more than can be told apart
+        label = name if not several else "" if index else f"each of {len(agents)} agents"
+        axes.plot(
+            *line(agent.regions),
+            color=COLOURS[5 if several else index + 1],
+            marker="" if several else _MARKERS[index + 1],
+            markersize=3.5,
+            linewidth=1.2,
+            alpha=0.8,
+            zorder=1.8,
+            label=label,
         )
     tasks: dict[str, int] = {}
     for index, report in enumerate(reports if references else ()):

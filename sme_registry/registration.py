@@ -9,23 +9,40 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
+from pettingzoo.env_registry import registration as pettingzoo
 
 from sme_registry.errors import NameTakenError, OptionError
 
 if TYPE_CHECKING:
+    from pettingzoo import AECEnv
+
+    from sme_registry.envs.team import SMETeamEnv
     from sme_registry.spec import SMESpec
 
 _ENTRY_POINT = "sme_registry.envs:SMEEnv"
 _VECTOR_ENTRY_POINT = "sme_registry.envs:SMEVectorEnv"
+_TEAM_ENTRY_POINTS = {
+    "parallel": "sme_registry.envs.team:parallel_env",
+    "aec": "sme_registry.envs.team:env",
+}
 
 
-def _register(env_id: str, spec: dict[str, Any] | str) -> None:
+def _register(env_id: str, spec: dict[str, Any] | str, team: bool) -> None:
+    """Put an id into the registry where it belongs: Gymnasium's, or for teams PettingZoo's."""
+    if team:
+        for kind, entry_point in _TEAM_ENTRY_POINTS.items():
+            pettingzoo.register(kind, env_id, entry_point, kwargs={"spec": spec})
+        return
     gymnasium.register(
         env_id,
         entry_point=_ENTRY_POINT,
         vector_entry_point=_VECTOR_ENTRY_POINT,
         kwargs={"spec": spec},
     )
+
+
+def _is_registered(env_id: str) -> bool:
+    return env_id in gymnasium.registry or env_id in pettingzoo.parallel_registry
 
 
 def register_catalogue() -> None:
@@ -35,11 +52,11 @@ def register_catalogue() -> None:
     """
     from sme_registry.spec.catalogue import NAMESPACE, released
 
-    for versioned_name, content_name in released():
+    for versioned_name, content_name, team in released():
         version = versioned_name.rsplit("-v", 1)[1]
         for name in (versioned_name, f"{content_name}-v{version}"):
-            if f"{NAMESPACE}/{name}" not in gymnasium.registry:
-                _register(f"{NAMESPACE}/{name}", versioned_name)
+            if not _is_registered(f"{NAMESPACE}/{name}"):
+                _register(f"{NAMESPACE}/{name}", versioned_name, team)
 
 
 def register(spec: SMESpec, name: str) -> str:
@@ -70,14 +87,14 @@ def register(spec: SMESpec, name: str) -> str:
             f"-v{DYNAMICS_VERSION} or none."
         )
     env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
-    if env_id in gymnasium.registry:
+    if _is_registered(env_id):
         if resolve(env_id) == spec:
             return env_id
         raise NameTakenError(
             f"{env_id!r} stands for another spec ({resolve(env_id).digest[:19]}…). Choose another "
             "name: a released id never changes its numbers."
         )
-    _register(env_id, spec.plain())
+    _register(env_id, spec.plain(), spec.team is not None)
     registered[env_id] = spec
     return env_id
 
@@ -219,3 +236,37 @@ def _makeable(spec_or_id: Any) -> str | EnvSpec:
             if env_id in gymnasium.registry and env_id.startswith("SME/"):
                 return env_id
     return env_spec(spec_or_id)
+
+
+def make_parallel(
+    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
+) -> SMETeamEnv:
+    """The team of an id, a digest, a path or a spec as a PettingZoo parallel environment.
+
+    Args:
+      spec_or_id: the task; one without a team is a team of one, `agent_0`.
+      **kwargs: spec fields to override, `action_range`, `render_mode`.
+
+    Raises:
+      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    """
+    from sme_registry.envs.team import parallel_env
+
+    return parallel_env(spec_or_id, **kwargs)
+
+
+def make_aec(
+    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
+) -> AECEnv[str, Any, Any]:
+    """The same as a PettingZoo AEC environment: agents act in turn, the step is joint.
+
+    Args:
+      spec_or_id: the task; one without a team is a team of one, `agent_0`.
+      **kwargs: spec fields to override, `action_range`, `render_mode`.
+
+    Raises:
+      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    """
+    from sme_registry.envs.team import env
+
+    return env(spec_or_id, **kwargs)

@@ -2,6 +2,7 @@
 
     from sme_registry.testing import check_sme
     check_sme("SME/Default-v1")                       # or your own spec, or your own classes
+    check_team("SME/Team4-v1")                        # the same for teams, through PettingZoo
 
 Each check raises `ConformanceError` with what was expected and what came. They play real episodes
 with actions between the optimal and the random, so that some end early where D > 0.
@@ -9,8 +10,10 @@ with actions between the optimal and the random, so that some end early where D 
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
+import io
 import os
 import pickle
 import warnings
@@ -23,12 +26,15 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from pettingzoo.utils.conversions import aec_to_parallel_wrapper, parallel_to_aec
+from scipy.special import ndtr
 
 from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.envs.team import SMETeamEnv
 from sme_registry.registration import env_spec, load
 from sme_registry.spec import SMESpec
 from sme_registry.spec.sme_spec import as_spec
-from sme_registry.task import materialize
+from sme_registry.task import Task, materialize, observe, step
 
 __all__ = [
     "ConformanceError",
@@ -38,18 +44,31 @@ __all__ = [
     "check_gymnasium",
     "check_info",
     "check_optimum",
+    "check_pettingzoo",
     "check_pickling",
     "check_sme",
+    "check_team",
+    "check_team_definition",
+    "check_team_determinism",
+    "check_team_optimum",
+    "check_team_pickling",
+    "check_turns",
     "check_vector",
 ]
 
 TaskLike = SMESpec | dict[str, Any] | str | os.PathLike[str]
 MakeSingle = Callable[..., Any]
 MakeVector = Callable[..., Any]
+MakeParallel = Callable[..., Any]
 
 INFO_KEYS = {"optimal_action", "similarity", "step_reward", "regret", "accumulated_reward"}
 RANGES = ("unit", "symmetric")
 TOLERANCE = 1e-12  # of oracle and reward between back-ends; states are equal bit for bit
+_SAID_OF_UNEQUAL_AGENTS = {
+    "Agents have different observation space sizes",
+    "Agents have different action space sizes",
+    "Observations are different shapes",
+}
 _STEPS = 250  # of an episode, at most: horizons may be long
 
 
@@ -298,6 +317,211 @@ def check_env_spec(task: TaskLike) -> None:
         _expect("the id after EnvSpec.to_json", again.spec.id, env.spec.id)
 
 
+def check_team(task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0) -> None:
+    """Run every check of a team.
+
+    Args:
+      task: an id, a path, a digest, a spec or its fields; without a team it is a team of one.
+      parallel: makes the environment, as `SMETeamEnv` does: `parallel(spec, action_range=…)`.
+      seed: of the episodes and the actions.
+
+    Raises:
+      ConformanceError: the first promise that is not kept.
+    """
+    check_pettingzoo(task, parallel=parallel)
+    check_team_definition(task, parallel=parallel, seed=seed)
+    check_team_optimum(task, parallel=parallel, seed=seed)
+    check_team_determinism(task, parallel=parallel, seed=seed)
+    check_team_pickling(task, parallel=parallel, seed=seed)
+    check_turns(task, parallel=parallel, seed=seed)
+
+
+def check_pettingzoo(task: TaskLike, *, parallel: MakeParallel = SMETeamEnv) -> None:
+    """PettingZoo's own tests of API, seed and state pass, parallel and in turns, without warnings.
+
+    It warns of agents whose spaces differ in size, which is what such a team is; that is let pass.
+    """
+    spec = _spec(task)
+    drawn = materialize(spec)
+    widths = {own.stop - own.start for own in drawn.owned}
+    unequal = len(widths) > 1 or len({len(channels) for channels in drawn.observed}) > 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its import warns of its own module's age
+        from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+        from pettingzoo.test.state_test import state_test
+    for action_range in RANGES:
+        make = functools.partial(parallel, spec, action_range=action_range)
+        in_turns: Callable[[], Any] = functools.partial(_in_turns, make)
+        tests: dict[str, Callable[[], Any]] = {
+            "parallel_api_test": functools.partial(parallel_api_test, make(), num_cycles=_STEPS),
+            "api_test": functools.partial(api_test, in_turns(), num_cycles=_STEPS),
+            "parallel_seed_test": functools.partial(parallel_seed_test, make),
+            "seed_test": functools.partial(seed_test, in_turns),
+            "state_test": functools.partial(state_test, in_turns(), make()),
+        }
+        for name, run in tests.items():
+            silence = contextlib.redirect_stdout(io.StringIO())
+            with warnings.catch_warnings(record=True) as caught, silence:
+                warnings.simplefilter("always")
+                try:
+                    run()
+                except Exception as error:
+                    raise ConformanceError(
+                        f"PettingZoo's {name}, {action_range}: {error}"
+                    ) from error
+            told = [str(warning.message) for warning in caught]
+            told = [said for said in told if not (unequal and said in _SAID_OF_UNEQUAL_AGENTS)]
+            if told:
+                raise ConformanceError(f"PettingZoo's {name}, {action_range}, warns: {told[0]}")
+
+
+def check_team_definition(
+    task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
+) -> None:
+    """Each step is that of `sme_registry.task.step`, agent by agent, and each sees what it may.
+
+    States and ends are compared bit for bit, oracle and rewards to 1e-12.
+    """
+    spec = _spec(task)
+    drawn, rng = materialize(spec), np.random.default_rng(seed)
+    for action_range in RANGES:
+        env = parallel(spec, action_range=action_range)
+        observations, infos = env.reset(seed=seed)
+        _expect("the agents", tuple(env.agents), drawn.names)
+        _expect("infos at reset", infos, {name: {} for name in drawn.names})
+        s, r_cum = env.state()[None], np.zeros((1, len(drawn.names)))
+        _observed(drawn, observations, s, 0, r_cum)
+        for t in range(min(spec.horizon, _STEPS)):
+            actions = _team_actions(env, rng)
+            joint = np.concatenate([actions[name] for name in drawn.names]).astype(np.float64)
+            joint = (joint + 1.0) / 2.0 if action_range == "symmetric" else joint
+            done = step(drawn, s, np.array([t]), r_cum, joint[None])
+            observations, rewards, terminated, truncated, infos = env.step(actions)
+            _expect("the next state", env.state(), done.state[0])
+            optimal = done.optimal_action[0]
+            optimal = 2.0 * optimal - 1.0 if action_range == "symmetric" else optimal
+            for agent, (name, own) in enumerate(zip(drawn.names, drawn.owned, strict=True)):
+                info = infos[name]
+                _expect(f"{name}: info's keys", set(info), INFO_KEYS)
+                _near(f"{name}: optimal_action", info["optimal_action"], optimal[own])
+                for key in ("similarity", "step_reward"):
+                    _near(f"{name}: {key}", info[key], getattr(done, key)[0, agent])
+                _expect(f"{name}: regret", info["regret"], 1.0 - info["step_reward"])
+                for key, got in (
+                    ("reward", rewards[name]), ("accumulated_reward", info["accumulated_reward"])
+                ):  # fmt: skip
+                    _near(f"{name}: {key}", got, getattr(done, key)[0, agent], spec.k * TOLERANCE)
+                _expect(f"{name}: terminated", terminated[name], bool(done.terminated[0]))
+                _expect(f"{name}: truncated", truncated[name], bool(done.truncated[0]))
+            s = done.state
+            r_cum = np.array([[infos[name]["accumulated_reward"] for name in drawn.names]])
+            _observed(drawn, observations, s, t + 1, r_cum)
+            if done.terminated[0] or done.truncated[0]:
+                _expect("the agents, once the episode has ended", list(env.agents), [])
+                break
+
+
+def check_team_optimum(
+    task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
+) -> None:
+    """Every agent that acts by its own layers on what it observes alone is paid the horizon T."""
+    spec = _spec(task)
+    drawn = materialize(spec)
+    if spec.horizon > 10_000:
+        spec = spec.derive(horizon=10_000)
+    for action_range in RANGES:
+        env = parallel(spec, action_range=action_range)
+        env.reset(seed=seed)
+        returned, steps = dict.fromkeys(drawn.names, 0.0), 0
+        while env.agents:
+            actions = {}
+            s = env.state()
+            for name, channels, layers in zip(
+                drawn.names, drawn.observed, drawn.policies, strict=True
+            ):
+                x = s[list(channels)]
+                for W, b in layers:
+                    x = ndtr(W @ x + b)
+                actions[name] = 2.0 * x - 1.0 if action_range == "symmetric" else x
+            _, rewards, _, _, infos = env.step(actions)
+            steps += 1
+            for name, reward in rewards.items():
+                _near(f"{name}: the optimum's regret", infos[name]["regret"], 0.0, 1e-9)
+                returned[name] += reward
+        _expect("the optimum's steps", steps, spec.horizon)
+        for name, total in returned.items():
+            _near(f"{name}: the optimum's return", total, spec.horizon, 1e-9 * spec.horizon)
+
+
+def check_team_determinism(
+    task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
+) -> None:
+    """A seed fixes whole episodes, one after the other; PettingZoo's tests compare one step."""
+    spec = _spec(task)
+    first, second, other = (
+        _team_record(parallel(spec), reset_seed, seed) for reset_seed in (seed, seed, seed + 1)
+    )
+    _same("two runs of one seed", first, second)
+    name = next(iter(first[0]))
+    if np.array_equal(first[0][name], other[0][name]):
+        raise ConformanceError(f"Seeds {seed} and {seed + 1} begin at the same observation.")
+
+
+def check_team_pickling(
+    task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
+) -> None:
+    """Pickled and deep copies, taken in the middle of an episode, go on as the original does."""
+    spec = _spec(task)
+    env = parallel(spec)
+    env.reset(seed=seed)
+    if spec.horizon > 1:
+        best = env.task.optimal_action(env.state())
+        env.step({
+            name: best[own] for name, own in zip(env.task.names, env.task.owned, strict=True)
+        })  # fmt: skip
+    before = env.state()
+    copies = {"a pickled copy": pickle.loads(pickle.dumps(env)), "a deep copy": copy.deepcopy(env)}
+    played = {how: _team_record(twin, None, seed, begun=True) for how, twin in copies.items()}
+    _expect("the state, once a copy is stepped", env.state(), before)
+    original = _team_record(env, None, seed, begun=True)
+    for how, record in played.items():
+        _same(how, record, original)
+
+
+def check_turns(task: TaskLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0) -> None:
+    """PettingZoo's conversions, to turns and back, keep every number of a whole episode."""
+    spec = _spec(task)
+    make = functools.partial(parallel, spec)
+    direct = _team_record(make(), seed, seed)
+    # Not `aec_to_parallel`: it would hand out the environment that is inside.
+    there_and_back: Any = aec_to_parallel_wrapper(parallel_to_aec(make()))
+    there_and_back.task = materialize(spec)
+    _same("parallel, in turns, and back", _team_record(there_and_back, seed, seed), direct)
+
+    env, turns = make(), parallel_to_aec(make())
+    observations, _ = env.reset(seed=seed)
+    turns.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    rewards = dict.fromkeys(env.agents, 0.0)
+    terminated = truncated = dict.fromkeys(env.agents, False)
+    infos: dict[str, Any] = {name: {} for name in env.agents}
+    while env.agents:
+        actions = _team_actions(env, rng)
+        for name in env.agents:
+            _expect("whose turn it is", turns.agent_selection, name)
+            _same(f"{name} in turns", list(turns.last()), [
+                observations[name], rewards[name], terminated[name], truncated[name], infos[name]
+            ])  # fmt: skip
+            turns.step(actions[name])
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+    for _ in env.possible_agents:
+        name = turns.agent_selection  # once they have ended, in the order of their names
+        _same(f"{name} in turns, at the end", list(turns.last()), [
+            observations[name], rewards[name], terminated[name], truncated[name], infos[name]
+        ])  # fmt: skip
+        turns.step(None)
+
+
 def _spec(task: TaskLike) -> SMESpec:
     return as_spec(task) if isinstance(task, SMESpec | dict) else load(task)
 
@@ -328,6 +552,45 @@ def _record(env: Any, reset_seed: int, seed: int) -> list[Any]:
             if returned[2] or returned[3]:
                 break
     return seen
+
+
+def _in_turns(make: MakeParallel) -> Any:
+    return parallel_to_aec(make())
+
+
+def _team_actions(env: Any, rng: np.random.Generator) -> dict[str, npt.NDArray[np.float32]]:
+    """`_mixed` actions, for each agent its own, in the environment's range."""
+    joint = _mixed(env.task.optimal_action(env.state()), rng)
+    if env.action_space(env.task.names[0]).low[0] < 0.0:
+        joint = (2.0 * joint - 1.0).astype(np.float32)
+    return {name: joint[own] for name, own in zip(env.task.names, env.task.owned, strict=True)}
+
+
+def _team_record(env: Any, reset_seed: int | None, seed: int, begun: bool = False) -> list[Any]:
+    """All that two whole episodes return, the second going on with the generator.
+
+    An episode that is `begun` is played to its end, and is the first.
+    """
+    rng = np.random.default_rng(seed)
+    seen: list[Any] = []
+    for given in (reset_seed, None):
+        if not begun:
+            seen += env.reset(seed=given)
+        begun = False
+        for _ in range(_STEPS):
+            if not env.agents:
+                break
+            seen += [*env.step(_team_actions(env, rng)), env.state()]
+    return seen
+
+
+def _observed(drawn: Task, got: dict[str, Any], s: Any, t: int, r_cum: Any) -> None:
+    """Each agent observes its own state channels, t/T and its own r_cum/k, and no more."""
+    spec = drawn.spec
+    joint = observe(spec, s, np.array([t]), r_cum)[0]
+    for agent, (name, channels) in enumerate(zip(drawn.names, drawn.observed, strict=True)):
+        columns = [*channels, spec.state_dim, spec.state_dim + 1 + agent]
+        _expect(f"{name}: the observation", got[name], joint[columns])
 
 
 def _observation(spec: SMESpec, s: Any, t: int, cumulated: float) -> npt.NDArray[np.float32]:

@@ -13,7 +13,8 @@ from sme_registry.spec import SMESpec
 
 CONTRACT = {
     "SMEError", "SMESpec", "Task", "EvaluationProtocol", "EvaluationReport", "env_spec", "evaluate",
-    "load", "make", "make_vec", "materialize", "register", "save",
+    "load", "make", "make_aec", "make_parallel", "make_vec", "materialize", "register", "save",
+    "env", "parallel_env",
 }  # fmt: skip
 
 
@@ -42,7 +43,8 @@ def test_an_unknown_attribute_is_an_attribute_error():
 
 
 MODULES = [
-    "errors", "files", "registration", "spec", "spec.catalogue", "spec.document", "spec.envelope",
+    "envs.batch", "envs.team", "errors", "files", "registration", "spec", "spec.catalogue",
+    "spec.document", "spec.envelope",
     "spec.protocol", "spec.resolve", "spec.sme_spec", "spec.suite", "task", "task.draw",
     "task.fingerprint", "task.memory", "task.step", "task.streams", "task.task",
 ]  # fmt: skip

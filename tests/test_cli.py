@@ -96,6 +96,12 @@ class TestList:
         for kind in KINDS:
             assert all(name in text for name in catalogue.names(kind))
 
+    def test_the_table_counts_the_agents(self) -> None:
+        lines = good("list", "--kind", "env").stdout.splitlines()
+        for name, agents in (("Team8", "8"), ("Default", "1")):
+            (row,) = [line for line in lines if f"SME/{name}-v1" in line]
+            assert row.split("│")[2].strip() == agents
+
     def test_filters_by_kind_and_tag(self) -> None:
         suites = json.loads(good("list", "--kind", "suite", "--json").stdout)
         assert {entry["kind"] for entry in suites} == {"suite"}
@@ -127,6 +133,36 @@ class TestShow:
         assert facts["parameters"] == numbers
         assert facts["parameter_memory_bytes"] == 8 * numbers
         assert (facts["largest_return"], facts["payouts_in_a_full_episode"]) == (100, 4)
+
+    def test_who_owns_and_sees_and_is_paid_for_what_is_a_table(self) -> None:
+        text = good("show", "TeamBlind4").stdout
+        rows = [line for line in text.splitlines() if line.startswith("│ agent_")]
+        cells = [[cell.strip() for cell in row.strip("│").split("│")] for row in rows]
+        assert cells == [
+            ["agent_0", "0–1", "0–3", "[6]", "own channels"],
+            ["agent_1", "2–3", "2–5", "[6]", "own channels"],
+            ["agent_2", "4–5", "4–7", "[6]", "own channels"],
+            ["agent_3", "6–7", "0–1, 6–7", "[6]", "own channels"],
+        ]
+        assert "4 agents, individual reward" in text
+        assert "all channels" in good("show", "TeamShared2").stdout
+        assert "Agents" not in good("show", "Default").stdout
+
+    def test_the_agents_of_the_json_are_those_of_the_environment(self) -> None:
+        derived = json.loads(good("show", "DuoDeep", "--json").stdout)["derived"]
+        env = sme_registry.make_parallel("DuoDeep")
+        assert [agent["name"] for agent in derived["agents"]] == env.possible_agents
+        for agent, own, seen in zip(
+            derived["agents"], env.task.owned, env.task.observed, strict=True
+        ):
+            space = env.observation_space(agent["name"])
+            assert agent["action_channels"] == list(range(own.start, own.stop))
+            assert agent["observed_channels"] == list(seen)
+            assert (agent["observation_dim"],) == space.shape
+        assert "agents" not in json.loads(good("show", "Default", "--json").stdout)["derived"]
+
+    def test_a_suite_of_teams_says_how_many_agents(self) -> None:
+        assert "team=8 agents, individual reward" in good("show", "teams").stdout
 
     def test_people_see_fields_digest_and_facts(self) -> None:
         text = good("show", "Survival25").stdout
@@ -199,6 +235,35 @@ class TestNew:
         assert found is not None
         assert [agent.action_dim for agent in found.agents] == [1, 3]
 
+    def test_a_team_is_given_as_a_file(self, tmp_path: Path) -> None:
+        team = {"agents": [{"action_dim": 1, "observes": [0, 3]}, {"action_dim": 3}]}
+        (tmp_path / "who.json").write_text(json.dumps(team))
+        good("new", "team.json", "--team", "who.json", "--team-reward", "team")
+        found = load(tmp_path / "team.json").team
+        assert found is not None
+        assert [agent.observes for agent in found.agents] == [(0, 3), "all"]
+        assert found.reward == "team"
+
+    @pytest.mark.parametrize(
+        ("options", "channels", "reward"),
+        [
+            (("--agents", "4"), [1] * 4, "individual"),
+            (("--agents", "4", "--channels-each", "2"), [2] * 4, "individual"),
+            (("--agents", "2", "--action-dim", "6", "--team-reward", "team"), [3] * 2, "team"),
+            (("--from", "Team8", "--team-reward", "team"), [2] * 8, "team"),
+            (("--from", "Team8", "--agents", "3", "--channels-each", "1"), [1] * 3, "individual"),
+        ],
+    )
+    def test_a_team_of_equals_is_given_by_numbers(
+        self, options: tuple[str, ...], channels: list[int], reward: str, tmp_path: Path
+    ) -> None:
+        good("new", "team.json", *options)
+        spec = load(tmp_path / "team.json")
+        assert spec.team is not None
+        assert [agent.action_dim for agent in spec.team.agents] == channels
+        assert {agent.observes for agent in spec.team.agents} == {"all"}
+        assert (spec.action_dim, spec.team.reward) == (sum(channels), reward)
+
     def test_a_file_that_is_there_is_replaced_only_by_force(self, tmp_path: Path) -> None:
         good("new", "a.json", "--seed", "1")
         before = (tmp_path / "a.json").read_bytes()
@@ -219,6 +284,16 @@ class TestNew:
             (("--state-dim", "1000000", "--action-dim", "1000000"), "GiB"),
             (("--team", '{"agents": [{"action_dim": 3}]}'), "action_dim=4"),
             (("--team", "two"), "got 'two'"),
+            (("--team", "nowhere.json"), "cannot be read"),
+            (("--team", "two", "--agents", "2"), "one or the other"),
+            (("--agents", "3"), "shared out"),
+            (("--agents", "0"), "at least 1"),
+            (("--agents", "1000000000", "--channels-each", "1"), "1024"),
+            (("--agents", "2", "--channels-each", "0"), "action_dim=0"),
+            (("--agents", "2", "--channels-each", "2", "--action-dim", "5"), "Leave it out"),
+            (("--channels-each", "2"), "--agents"),
+            (("--team-reward", "team"), "of which team"),
+            (("--agents", "2", "--team-reward", "both"), "reward='both'"),
             (("--from", "Defalt"), "Did you mean"),
             (("--name", "a b"), "name='a b'"),
             (("--tag", "a/b"), "tags"),
@@ -303,6 +378,17 @@ class TestCertify:
         assert "refused for constant_policy_similarity" in result.stderr
         assert sme("certify", "Default", "trivial.json").exit_code == 1
 
+    def test_a_trivial_agent_among_others_is_found_and_named(self) -> None:
+        team = '{"agents": [{"action_dim": 4, "observes": [0]}, {"action_dim": 4}]}'
+        good("new", "t.json", "--action-dim", "8", "--seed", "1", "--team", team)
+        (made,) = json.loads(good("certify", "t.json", "--json").stdout)
+        checks = {check["name"]: check for check in made["checks"]}
+        of_agent = checks.pop("agent_constant_policy_similarity")
+        assert of_agent["outcome"] == "warning"
+        assert "agent_0" in of_agent["meaning"]
+        # Nothing else shows it.
+        assert {check["outcome"] for check in checks.values()} == {"passed", "reported"}
+
     def test_a_suite_is_certified_task_by_task(self) -> None:
         text = good("certify", "smoke").stdout
         assert len(text.splitlines()) == len(catalogue.find(SuiteFile, "smoke").suite.instances)
@@ -345,6 +431,38 @@ class TestEvaluate:
         similarity = report["regions"][0]["similarity"]
         expected = report["references"][reference][0]["similarity"]
         assert similarity == pytest.approx(expected, abs=0.01)
+
+    @pytest.mark.parametrize(
+        ("policy", "reference", "close"),
+        [
+            ("optimal", "optimal", 1e-6),
+            ("constant", "constant_half", 1e-12),
+            ("linear", "linear_least_squares", 0.01),
+            ("random", "uniform_random", 0.02),
+        ],
+    )
+    def test_on_a_team_a_reference_acts_for_each_agent_by_what_that_one_sees(
+        self, policy: str, reference: str, close: float
+    ) -> None:
+        report = json.loads(good("evaluate", policy, "TeamBlind4", *QUICK, "--json").stdout)
+        assert list(report["agents"]) == [f"agent_{i}" for i in range(4)]
+        for agent in report["agents"].values():
+            similarity = [region["similarity"] for region in agent["regions"]]
+            expected = [region["similarity"] for region in agent["references"][reference]]
+            assert similarity == pytest.approx(expected, abs=close)
+        assert "agent_3" in good("evaluate", policy, "TeamBlind4", *QUICK).stdout
+
+    def test_a_function_is_the_policy_that_a_team_shares(self, tmp_path: Path) -> None:
+        (tmp_path / "shared_for_the_test.py").write_text(
+            "import numpy as np\n"
+            "def act(observations):\n"
+            "    assert observations.shape[1] == 8 + 2 + 4\n"
+            "    return np.full((len(observations), 2), 0.5)\n"
+        )
+        arguments = ("evaluate", "shared_for_the_test:act", "Team4", *QUICK, "--json")
+        report = json.loads(good(*arguments).stdout)
+        assert report["regions"][0]["normalised_regret"] == pytest.approx(1.0)
+        assert "for each agent in turn" in refused("evaluate", "math:sqrt", "Team4", *QUICK)
 
     def test_the_folder_gets_report_and_figures_and_is_not_overwritten(
         self, tmp_path: Path
@@ -442,6 +560,26 @@ class TestTrain:
         pytest.importorskip("stable_baselines3")
         assert message in refused(*SHORT, *options)
         assert list(tmp_path.iterdir()) == []
+
+    def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(
+        self, tmp_path: Path
+    ) -> None:
+        pytest.importorskip("stable_baselines3")
+        command = ("train", "SME/Team2-v1", "-n", "300", "--set", "horizon=20", *QUICK)
+        result = good(*command, "--out", "run", "--json")
+        printed = json.loads(result.stdout)
+        assert printed["run"]["algorithm"] == "PPO"
+        assert (printed["run"]["agents"], printed["run"]["steps_done"]) == (2, 1024)
+        assert "training PPO: 1,024 of 1,024 steps" in result.stderr
+        assert "team's mean regret" in result.stderr
+        header = (tmp_path / "run/episodes.csv").read_text().splitlines()[0]
+        assert header.endswith(",mean_regret/agent_0,mean_regret/agent_1")
+        again = good(
+            "evaluate", "run/model.zip", "Team2", "--set", "horizon=20", *QUICK, "--json"
+        ).stdout
+        assert json.loads(again)["agents"] == printed["evaluation"]["agents"]
+        assert "shape" in refused("evaluate", "run/model.zip", "Team4", *QUICK)
+        assert "shape" in refused("evaluate", "run/model.zip", "Default", *QUICK)
 
     def test_an_interrupt_says_how_to_go_on_and_going_on_works(self, tmp_path: Path) -> None:
         pytest.importorskip("stable_baselines3")

@@ -137,6 +137,41 @@ def test_decay_curve_draws_references_once_for_each_task(tmp_path, report, figur
     assert len(figures[-1].axes[0].lines) == 1
 
 
+@pytest.mark.parametrize("n", [1, 2, 6, 7])
+def test_decay_curve_of_a_team_has_a_line_for_each_agent(tmp_path, figures, n):
+    agents = [{"action_dim": 1 + i % 2} for i in range(n)]
+    width = sum(agent["action_dim"] for agent in agents)
+    team = SMESpec(state_dim=2, action_dim=width, team={"agents": agents})
+
+    def spread(observations):
+        shares = np.linspace(0.2, 0.8, n)[observations[:, 4:].argmax(axis=1)]
+        return np.repeat(shares[:, None], min(n, 2), axis=1)
+
+    report = evaluate(spread, team, PROTOCOL)
+    plots.decay_curve(report, tmp_path / "figure.png")
+    for axes, measure in zip(figures[0].axes, ("similarity", "normalised_regret"), strict=True):
+        drawn = [tuple(line.get_ydata()) for line in axes.lines]
+        for scope in (report, *report.agents.values()):
+            assert tuple(getattr(region, measure) for region in scope.regions) in drawn
+    named = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    expected = [f"agent_{i}" for i in range(n)] if n < 7 else ["each of 7 agents"]
+    assert named[: 1 + len(expected)] == ["spread", *expected]
+
+    plots.decay_curve([report, report], tmp_path / "figure.png", references=False)
+    assert len(figures[1].axes[0].lines) == 2
+
+
+def test_similarity_map_of_a_team_is_of_its_joint_action(tmp_path, figures):
+    team = PLANE.derive(team={"agents": [{"action_dim": 1, "observes": [1]}, {"action_dim": 1}]})
+    own = {"agent_0": lambda o: o[:, :1], "agent_1": lambda o: o[:, :1]}
+    plots.similarity_map(own, team, tmp_path / "map.png", resolution=8, epsilon=1.0)
+    drawn = figures[0].axes[0].images[0].get_array()
+    side = -0.5 + (np.arange(8) + 0.5) / 4
+    s = np.array([[x, y] for y in side for x in side])
+    expected = materialize(team).similarity(s, s[:, ::-1]).reshape(8, 8)
+    assert np.asarray(drawn) == pytest.approx(expected, abs=1e-6)
+
+
 def test_decay_curve_of_different_state_dims_warns_that_levels_differ(tmp_path, report, figures):
     other = evaluate(half, PLANE.derive(state_dim=3), PROTOCOL)
     plots.decay_curve([report, other], tmp_path / "figure.png")

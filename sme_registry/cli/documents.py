@@ -15,7 +15,16 @@ from rich.table import Table
 from sme_registry.cli import names
 from sme_registry.cli.output import err, mark, out, print_json, print_pairs
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
-from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, Suite, SuiteFile, catalogue
+from sme_registry.files import read_json
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    Suite,
+    SuiteFile,
+    TeamSpec,
+    catalogue,
+)
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import resolve, with_fingerprint
@@ -110,18 +119,20 @@ def _summary(kind: str, file: Envelope) -> dict[str, Any]:
 def _env_table(files: list[EnvFile]) -> Table:
     table = Table(
         title="Environments",
-        caption="S state, A action channels · L layers of π* · k reward interval · T horizon",
+        caption="n agents · S state, A action channels · L layers of π* · k reward interval · "
+        "T horizon",
         title_justify="left",
         caption_justify="left",
     )
     table.add_column("id", no_wrap=True)
-    for column in ("S", "A", "L", "k", "r_min", "D", "T"):
+    for column in ("n", "S", "A", "L", "k", "r_min", "D", "T"):
         table.add_column(column, justify="right")
     table.add_column("tags", overflow="fold")
     for file in files:
         spec = file.spec
+        agents = 1 if spec.team is None else len(spec.team.agents)
         numbers = (
-            spec.state_dim, spec.action_dim, spec.complexity, spec.k, spec.r_min, spec.D,
+            agents, spec.state_dim, spec.action_dim, spec.complexity, spec.k, spec.r_min, spec.D,
             spec.horizon,
         )  # fmt: skip
         table.add_row(
@@ -204,11 +215,20 @@ def show(
 def _show_task(found: SMESpec | EnvFile, json: bool) -> None:
     spec = found if isinstance(found, SMESpec) else found.spec
     facts = _facts(spec)
+    agents = _agents(spec)
     if json:
+        if agents:
+            facts["agents"] = agents
         head = {} if isinstance(found, SMESpec) else _summary("env", found)
         print_json({**head, "spec": spec.plain(), "digest": spec.digest, "derived": facts})
         return
-    print_pairs(spec.content_name if isinstance(found, SMESpec) else _title(found), spec.plain())
+    fields = spec.plain()
+    if spec.team is not None:
+        fields["team"] = _team_in_words(spec.team)
+    print_pairs(spec.content_name if isinstance(found, SMESpec) else _title(found), fields)
+    if agents:
+        out().print()
+        out().print(_agents_table(agents))
     out().print()
     print_pairs("Derived", {"digest": spec.digest, **facts})
 
@@ -220,17 +240,85 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
     payouts = math.ceil(spec.horizon / spec.k)
     facts: dict[str, Any] = {
         "id": f"{catalogue.NAMESPACE}/{spec.content_name}-v1",
-        "observation": f"[{spec.state_dim + 2}] float32 in [0, 1]: state, t/T, r_cum/k",
-        "action": f"[{spec.action_dim}] float32 in [0, 1]",
+        **_spaces(spec),
         "parameters": parameter_bytes(spec) // 8,
         "parameter_memory_bytes": parameter_bytes(spec),
-        "largest_return": spec.horizon,
+        "largest_return": spec.horizon,  # of a team, each agent's
         "payouts_in_a_full_episode": payouts,
         "largest_payout": min(spec.k, spec.horizon),
     }
     if spec.D > 0:
         facts["episode_ends_below_step_reward"] = max(spec.D, spec.r_min)
     return facts
+
+
+def _spaces(spec: SMESpec) -> dict[str, str]:
+    """What is observed and what is done, in words."""
+    if spec.team is None:
+        return {
+            "observation": f"[{spec.state_dim + 2}] float32 in [0, 1]: state, t/T, r_cum/k",
+            "action": f"[{spec.action_dim}] float32 in [0, 1]",
+        }
+    n, widest = len(spec.team.agents), max(agent.action_dim for agent in spec.team.agents)
+    return {
+        "observation": "of each agent, float32 in [0, 1]: what it observes, t/T, its own r_cum/k",
+        "action": "of each agent, float32 in [0, 1]: the channels that it owns",
+        "shared_observation": f"[{spec.state_dim + 2 + n}] of one policy for all agents: state "
+        "with unobserved channels 0, t/T, its own r_cum/k, one-hot of the agent",
+        "shared_action": f"[{widest}], of which the agent's first count",
+    }
+
+
+def _team_in_words(team: TeamSpec) -> str:
+    n = len(team.agents)
+    return f"{n} agent{'s' * (n > 1)}, {team.reward} reward"
+
+
+def _agents(spec: SMESpec) -> list[dict[str, Any]]:
+    """Who owns, sees and is paid for what; nothing where there is no team."""
+    if spec.team is None:
+        return []
+    agents, first = [], 0
+    for agent in spec.team.agents:
+        seen = range(spec.state_dim) if agent.observes == "all" else agent.observes
+        agents.append(
+            {
+                "name": agent.name,
+                "action_channels": list(range(first, first + agent.action_dim)),
+                "observed_channels": list(seen),
+                "observation_dim": len(seen) + 2,
+                "paid_for": "all channels" if spec.team.reward == "team" else "own channels",
+            }
+        )
+        first += agent.action_dim
+    return agents
+
+
+def _agents_table(agents: list[dict[str, Any]]) -> Table:
+    table = Table(title="Agents", title_justify="left")
+    table.add_column("agent", no_wrap=True)
+    for column in ("action channels", "observed state channels", "observation", "paid for"):
+        table.add_column(column, overflow="fold")
+    for agent in agents:
+        table.add_row(
+            escape(agent["name"]),
+            _ranges(agent["action_channels"]),
+            _ranges(agent["observed_channels"]),
+            escape(f"[{agent['observation_dim']}]"),
+            agent["paid_for"],
+        )
+    return table
+
+
+def _ranges(channels: list[int]) -> str:
+    """Increasing channels in short: `0–3, 6`."""
+    runs: list[list[int]] = []
+    for channel in channels:
+        if runs and channel == runs[-1][-1] + 1:
+            runs[-1].append(channel)
+        else:
+            runs.append([channel])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
 def _show_suite(file: SuiteFile) -> None:
@@ -244,6 +332,8 @@ def _show_suite(file: SuiteFile) -> None:
     for member in file.suite.classes:
         changed = {k: v for k, v in member.setting.plain().items() if v != default[k]}
         seeds = ", ".join(map(str, member.seeds))
+        if member.setting.team is not None:
+            changed["team"] = _team_in_words(member.setting.team)
         table.add_row(member.name, escape(", ".join(f"{k}={v}" for k, v in changed.items())), seeds)
     out().print(table)
 
@@ -272,7 +362,21 @@ def new(
     ] = None,
     team: Annotated[
         str | None,
-        typer.Option(help='JSON: \'{"agents": [{"action_dim": 2}, {"action_dim": 2}]}\'.'),
+        typer.Option(
+            metavar="JSON|FILE",
+            help='\'{"agents": [{"action_dim": 2, "observes": \\[0, 1]}, {"action_dim": 2}]}\', '
+            "or a file of it.",
+        ),
+    ] = None,
+    agents: Annotated[
+        int | None, typer.Option(help="A team of so many alike, who observe the whole state.")
+    ] = None,
+    channels_each: Annotated[
+        int | None,
+        typer.Option(help="Action channels of each of --agents; by default A shared out."),
+    ] = None,
+    team_reward: Annotated[
+        str | None, typer.Option(help="individual, or team: all paid for all channels.")
     ] = None,
     base: Annotated[
         str | None, typer.Option("--from", metavar="NAME|PATH", help="The task to derive from.")
@@ -294,6 +398,8 @@ def new(
       sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
 
       sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
+
+      sme new team.json --agents 4 --channels-each 2 --team-reward team
     """
     given = {
         "state_dim": state_dim,
@@ -306,20 +412,71 @@ def new(
         "hidden_width": hidden_width,
         "policy_init": policy_init,
         "seed": None if seed is None else names.json_or_text(seed),
-        "team": None if team is None else names.json_or_text(team),
     }
     fields = {field: value for field, value in given.items() if value is not None}
     if path.suffix != ".json":
         raise OptionError(f"{path}: must end in .json, by which every command knows a path.")
     if path.exists() and not force:
         raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
-    spec = (resolve(base) if base is not None else SMESpec()).derive(**fields)
+    origin = resolve(base) if base is not None else SMESpec()
+    fields |= _team_fields(origin, fields, team, agents, channels_each, team_reward)
+    spec = origin.derive(**fields)
 
     import sme_registry
 
     sme_registry.save(spec, path, name, description=description, tags=tuple(tag or ()))
     out().print(f"{escape(str(path))}  {spec.digest}", soft_wrap=True)
     err().print(f"[dim]sme certify {escape(str(path))}  checks the draw[/]", soft_wrap=True)
+
+
+def _team_fields(
+    origin: SMESpec,
+    fields: dict[str, Any],
+    team: str | None,
+    agents: int | None,
+    channels_each: int | None,
+    reward: str | None,
+) -> dict[str, Any]:
+    """The spec fields that the options of a team amount to.
+
+    Raises:
+      OptionError: two options contradict each other, or channels cannot be shared out.
+      MalformedDocumentError: the team's file cannot be read.
+    """
+    if team is not None and agents is not None:
+        raise OptionError("--agents: --team says who the agents are. Give one or the other.")
+    if channels_each is not None and agents is None:
+        raise OptionError(f"--channels-each {channels_each}: of how many? Give --agents, too.")
+    made: dict[str, Any] = {}
+    if team is not None:
+        made["team"] = read_json(team) if team.endswith(".json") else names.json_or_text(team)
+    elif agents is not None:
+        if agents < 1:
+            raise OptionError(f"--agents {agents}: must be at least 1.")
+        if channels_each is None:
+            A = fields.get("action_dim", origin.action_dim)
+            channels_each, left_over = divmod(A, agents)
+            if left_over or not channels_each:
+                raise OptionError(
+                    f"--agents {agents}: action_dim={A} cannot be shared out evenly. Give "
+                    "--channels-each, or --team for unequal agents."
+                )
+        else:
+            fields.setdefault("action_dim", agents * channels_each)
+        if fields.get("action_dim", origin.action_dim) != agents * channels_each:
+            raise OptionError(
+                f"--agents {agents} --channels-each {channels_each}: make {agents * channels_each} "
+                f"action channels and --action-dim says {fields['action_dim']}. Leave it out."
+            )
+        # The spec refuses far fewer than these; billions would first fill the memory.
+        made["team"] = {"agents": [{"action_dim": channels_each}] * min(agents, 2**12)}
+    elif reward is not None and origin.team is not None:
+        made["team"] = origin.team.plain()
+    if reward is not None:
+        if not isinstance(made.get("team"), dict):
+            raise OptionError(f"--team-reward {reward}: of which team? Give --agents or --team.")
+        made["team"] = {**made["team"], "reward": reward}
+    return made
 
 
 def validate(

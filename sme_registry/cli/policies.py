@@ -19,6 +19,7 @@ from sme_registry.task.draw import Array
 
 Observations = npt.NDArray[np.float32]
 Act = Callable[[Observations], Any]
+Joint = Callable[[Array], Array]  # states [B, S] to joint actions [B, A]
 
 
 def find_policy(name: str, spec: SMESpec) -> Any:
@@ -34,7 +35,7 @@ def find_policy(name: str, spec: SMESpec) -> Any:
       PolicyError: the module or its function is not there, or fails when it is imported.
     """
     if name in REFERENCES:
-        return REFERENCES[name](spec)
+        return _reference(name, spec)
     if name.endswith(".zip") or (os.sep in name and os.path.exists(name)):
         return name
     if ":" in name:
@@ -67,40 +68,52 @@ def _imported(name: str) -> Any:
     return found
 
 
-def _optimal(spec: SMESpec) -> Act:
-    oracle, S = engine(materialize(spec)).optimal_action, spec.state_dim
-    return lambda observations: oracle(_states(observations, S))
+def _optimal(spec: SMESpec) -> Joint:
+    return engine(materialize(spec)).optimal_action
 
 
-def _constant(spec: SMESpec) -> Act:
-    return lambda observations: np.full((len(observations), spec.action_dim), 0.5)
+def _constant(spec: SMESpec) -> Joint:
+    return lambda s: np.full((len(s), spec.action_dim), 0.5)
 
 
-def _random(spec: SMESpec) -> Act:
+def _random(spec: SMESpec) -> Joint:
     generator = np.random.default_rng(0)
-    return lambda observations: generator.random((len(observations), spec.action_dim))
+    return lambda s: generator.random((len(s), spec.action_dim))
 
 
-def _linear(spec: SMESpec) -> Act:
+def _linear(spec: SMESpec) -> Joint:
     from sme_registry.evaluation import references
 
-    S = spec.state_dim
-    s = np.random.default_rng(0).random((references.fit_states(spec), S))
-    fitted = references.fit(s, engine(materialize(spec)).optimal_action(s))
-
-    def act(observations: Observations) -> Array:
-        return (_states(observations, S) - 0.5) @ fitted.slope + fitted.intercept
-
-    return act
+    task = materialize(spec)
+    s = np.random.default_rng(0).random((references.fit_states(spec), spec.state_dim))
+    agents = zip(task.observed, task.owned, strict=True)
+    fitted = references.fit(s, engine(task).optimal_action(s), agents)
+    return lambda s: (s - 0.5) @ fitted.slope + fitted.intercept
 
 
-def _states(observations: Observations, state_dim: int) -> Array:
-    return observations[:, :state_dim].astype(np.float64)
-
-
-REFERENCES: dict[str, Callable[[SMESpec], Act]] = {
+REFERENCES: dict[str, Callable[[SMESpec], Joint]] = {
     "optimal": _optimal,
     "constant": _constant,
     "random": _random,
     "linear": _linear,
 }
+
+
+def _reference(name: str, spec: SMESpec) -> Act | dict[str, Act]:
+    """A reference policy of a single agent, or one for each agent of a team."""
+    joint, S = REFERENCES[name](spec), spec.state_dim
+    if spec.team is None:
+        return lambda observations: joint(observations[:, :S].astype(np.float64))
+    task = materialize(spec)
+
+    def of(observed: tuple[int, ...], own: slice) -> Act:
+        def act(observations: Observations) -> Array:
+            # What the agent does not observe has no part in its own channels of the joint action.
+            s = np.zeros((len(observations), S))
+            s[:, observed] = observations[:, : len(observed)]
+            return joint(s)[:, own]
+
+        return act
+
+    agents = zip(task.names, task.observed, task.owned, strict=True)
+    return {agent: of(observed, own) for agent, observed, own in agents}

@@ -54,6 +54,11 @@ def evaluate(
     A function takes observations `[B, S + 2]` and returns actions `[B, A]`. A .zip of
     Stable-Baselines3 is code: open only those whose author you trust.
 
+    A team's function or .zip is the policy that all agents share: it is asked for each agent in
+    turn, with its shared observation `[B, S + 2 + n]` (the state with what the agent does not
+    observe set to 0, t/T, its r_cum/k, the one-hot of the agent), and returns `[B, max a_i]`.
+    The report has each agent, too.
+
     Examples:
 
       sme evaluate linear Complexity10
@@ -61,6 +66,8 @@ def evaluate(
       sme evaluate runs/demo/model.zip Default --out runs/demo-again
 
       sme evaluate mypolicy:act Default --protocol quick-v1 --json
+
+      sme evaluate runs/Team4-PPO-seed0/model.zip Team4
     """
     from sme_registry import evaluation
     from sme_registry.training.progress import Meter
@@ -97,7 +104,7 @@ def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
     from sme_registry import plots
 
     figures = [plots.decay_curve(report, target.with_name("decay_curve.png"))]
-    if report.spec.state_dim == 2:
+    if report.spec.state_dim == 2 and report.spec.team is None:
         path = target.with_name("similarity_map.png")
         figures.append(
             plots.similarity_map(
@@ -119,9 +126,14 @@ def _say_where(written: list[Path]) -> None:
 def train(
     task: TaskName,
     algorithm: Annotated[
-        str, typer.Option("--algorithm", "-a", help="TD3, SAC, DDPG, PPO or A2C.")
-    ] = "TD3",
-    steps: Annotated[int, typer.Option("--steps", "-n", help="Steps of the environment.")] = 20_000,
+        str | None,
+        typer.Option(
+            "--algorithm", "-a", help="TD3, SAC, DDPG, PPO or A2C; by default TD3, of a team PPO."
+        ),
+    ] = None,
+    steps: Annotated[
+        int, typer.Option("--steps", "-n", help="Steps of the environment; of a team, the team's.")
+    ] = 20_000,
     seed: Annotated[int, typer.Option(help="Of the algorithm and of the starts.")] = 0,
     out_folder: Annotated[
         Path | None,
@@ -131,8 +143,12 @@ def train(
         str, typer.Option(help="symmetric, [-1, 1], or unit, [0, 1].")
     ] = "symmetric",
     num_envs: Annotated[
-        int, typer.Option(help="Environments at once; off-policy, more mean fewer updates.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            help="Environments (teams) at once; off-policy, more mean fewer updates. By default 1, "
+            "of a team on-policy 8."
+        ),
+    ] = None,
     protocol: Protocol = "paper-v1",
     set_: Overrides = None,
     checkpoint_every: Annotated[
@@ -150,6 +166,12 @@ def train(
     PPO and A2C finish their last rollout. The folder holds episodes.csv, checkpoint.zip,
     model.zip, run.json, evaluation.json, figures, and what TensorBoard reads.
 
+    The agents of a team share one policy (its shared observation: `sme evaluate --help`).
+    episodes.csv then has the team's mean and a column mean_regret/<agent> for each. A step is one
+    of the whole team, so the algorithm sees as many transitions as there are agents; SB3's own
+    count, on TensorBoard's axis, is of those. PPO collects its 2,048 transitions over all agents
+    of all teams together, not 2,048 from each: run.json says n_steps.
+
     --resume goes on from the last checkpoint, with the same networks, optimisers, replay buffer
     and step count. It is not the uninterrupted run to the bit: random streams are seeded anew, and
     episodes that were under way begin again.
@@ -161,12 +183,14 @@ def train(
       sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10
 
       sme train mine.json --out runs/mine --resume
+
+      sme train Team4 --steps 40000
     """
     from sme_registry import training
 
     changed = names.overrides(set_ or [])
     spec = resolve(task).derive(**changed)
-    algorithm = training.known_algorithm(algorithm)
+    algorithm = training.known_algorithm(algorithm or training.default_algorithm(spec))
     if out_folder is None:
         out_folder = Path("runs") / f"{_label(task, spec, bool(changed))}-{algorithm}-seed{seed}"
     try:

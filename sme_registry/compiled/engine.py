@@ -142,19 +142,19 @@ def _numpy_engine(task: Task) -> Engine:
         optimal: Array,
         observation: npt.NDArray[np.float32],
     ) -> tuple[float, ...]:
-        rewards, ends = np.empty((5, 1)), np.empty((2, 1), dtype=bool)
+        rewards, ends = np.empty((5, 1, 1)), np.empty((2, 1), dtype=bool)
         s, moved = lane[2:, None], np.empty((S, 1))
         t = lane[:1].astype(np.int64)
         if action.size != task.spec.action_dim or not step_many(
-            None, s, t, lane[1:2], action.astype(np.float64)[None], moved,
+            None, s, t, lane[1:2, None], action.astype(np.float64)[None], moved,
             observation[None], optimal[None], rewards, ends,
         ):  # fmt: skip
             return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
         lane[0] += 1.0
-        lane[1] = rewards[4, 0]
+        lane[1] = rewards[4, 0, 0]
         lane[2:] = moved[:, 0]
         end = float(ends[0, 0] + 2 * ends[1, 0])
-        return (*rewards[:, 0].tolist(), end)
+        return (*rewards[:, 0, 0].tolist(), end)
 
     def step_many(
         params: None,
@@ -170,17 +170,19 @@ def _numpy_engine(task: Task) -> Engine:
     ) -> bool:
         if not np.isfinite(action).all():
             return False
-        done = step(task, np.ascontiguousarray(s.T), t, accumulated, action)
+        done = step(task, np.ascontiguousarray(s.T), t, accumulated.T, action)
         moved[:] = done.state.T
         observation[:] = observe(task.spec, done.state, t + 1, done.accumulated_reward)
         optimal[:] = done.optimal_action
-        rewards[:] = (
+        values = (
             done.similarity,
             done.step_reward,
             1.0 - done.step_reward,
             done.reward,
             done.accumulated_reward,
         )
+        for row, value in zip(rewards, values, strict=True):
+            row[:] = value.T
         ends[:] = done.terminated, done.truncated
         return True
 

@@ -7,7 +7,8 @@ What differs is only where the loops are: a single lane runs over channels, a ba
 lanes, channel by channel, so that the inner loop is long enough to fill vector registers.
 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
-    S, A, k, T, r_min, D, agents, widest layer, size of all this, W [A, S], b [S], for each agent
+    S, A, k, T, r_min, D, agents, widest layer, size of all this, pays the team (0 or 1),
+    W [A, S], b [S], for each agent
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
 A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
 stand alone where it is not, so that lanes can share it:
@@ -26,7 +27,7 @@ from sme_registry.compiled.normal_cdf import normal_cdf
 from sme_registry.task import Task
 
 BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
-_HEADER = 9
+_HEADER = 10
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
 
 
@@ -36,7 +37,7 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
     widest = max(spec.state_dim, *(max(W.shape) for layers in task.policies for W, _ in layers))
     parts = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
-        [spec.r_min, spec.D, len(task.policies), widest, 0.0],
+        [spec.r_min, spec.D, len(task.policies), widest, 0.0, task.pays_the_team],
         task.W.ravel(),
         task.b,
     ]
@@ -93,7 +94,7 @@ def _wide_layer(W, b, x, y):  # type: ignore[no-untyped-def]
 def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
     """One step of the lane whose own numbers begin at `lane[start]`; see `step_lane`."""
     S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
-    r_min, D, agents, widest = p[4], p[5], np.uint64(p[6]), np.uint64(p[7])
+    r_min, D, widest = p[4], p[5], np.uint64(p[7])
     if np.uint64(action.size) != A:
         return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
     for i in range(A):
@@ -102,33 +103,29 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
 
     s = start + _U2
     at = np.uint64(_HEADER) + A * S + S
-    done = _U0
-    for _ in range(agents):
-        channels, layers = np.uint64(p[at]), np.uint64(p[at + _U1])
+    channels, layers = np.uint64(p[at]), np.uint64(p[at + _U1])
+    at += _U2
+    x, y = s + S, s + S + widest
+    for j in range(channels):
+        lane[x + j] = lane[s + np.uint64(p[at + j])]
+    at += channels
+    for _ in range(layers):
+        inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
         at += _U2
-        x, y = s + S, s + S + widest
-        for j in range(channels):
-            lane[x + j] = lane[s + np.uint64(p[at + j])]
-        at += channels
-        outputs = _U0
-        for _ in range(layers):
-            inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
-            at += _U2
-            b = at + inputs * outputs
-            if outputs < np.uint64(_NARROW):
-                for o in range(outputs):
-                    total = p[b + o]
-                    for i in range(inputs):
-                        total = total + p[at + i * outputs + o] * lane[x + i]
-                    lane[y + o] = normal_cdf(total)
-            else:
-                W = p[at:b].reshape(inputs, outputs)
-                _wide_layer(W, p[b : b + outputs], lane[x : x + inputs], lane[y : y + outputs])
-            at = b + outputs
-            x, y = y, x
-        for o in range(outputs):
-            optimal[done] = lane[x + o]
-            done += _U1
+        b = at + inputs * outputs
+        if outputs < np.uint64(_NARROW):
+            for o in range(outputs):
+                total = p[b + o]
+                for i in range(inputs):
+                    total = total + p[at + i * outputs + o] * lane[x + i]
+                lane[y + o] = normal_cdf(total)
+        else:
+            W = p[at:b].reshape(inputs, outputs)
+            _wide_layer(W, p[b : b + outputs], lane[x : x + inputs], lane[y : y + outputs])
+        at = b + outputs
+        x, y = y, x
+    for o in range(A):
+        optimal[o] = lane[x + o]
 
     missed = 0.0
     for i in range(A):
@@ -176,7 +173,7 @@ PACKED_LANE_FLOAT64 = _RESULT(float64[::1], float64[:], *_REST)
 
 @njit([LANE_FLOAT32, LANE_FLOAT64], error_model="numpy", cache=True)
 def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
-    """One step of one lane.
+    """One step of one lane of a single agent.
 
     Args:
       p: the packed task.
@@ -239,30 +236,31 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
         _PACKED,
         float64[:, ::1],
         int64[::1],
-        float64[::1],
+        float64[:, ::1],
         float64[:, ::1],
         float64[:, ::1],
         float32[:, ::1],
         float64[:, ::1],
-        float64[:, ::1],
+        float64[:, :, ::1],
         boolean[:, ::1],
     ),
     error_model="numpy",
     cache=True,
 )
 def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards, ends):  # type: ignore[no-untyped-def]
-    """One step of `B` lanes.
+    """One step of `B` lanes of a team of n agents; a single agent is a team of one.
 
     Args:
       p: the packed task.
       s: `[S, B]` states, channel by channel.
       t: `[B]` steps done before this one.
-      accumulated: `[B]` r_cum before this step.
+      accumulated: `[n, B]` each agent's r_cum before this step.
       action: `[B, A]`, clipped here.
       moved: `[S, B]`, written: the next states.
-      observation: `[B, S + 2]`, written.
+      observation: `[B, S + 1 + n]`, written: s, t/T, and each agent's r_cum/k.
       optimal: `[B, A]`, written: π* of the states acted in.
-      rewards: `[5, B]`, written: similarity, step reward, regret, reward, r_cum after a payout.
+      rewards: `[5, n, B]`, written: similarity, step reward, regret, reward, r_cum after a
+        payout.
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:
@@ -270,20 +268,22 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
     """
     S, A, k, T = int(p[0]), int(p[1]), p[2], p[3]
     r_min, D, agents, widest = p[4], p[5], int(p[6]), int(p[7])
+    pays_the_team = p[9] == 1.0
     W = p[_HEADER : _HEADER + A * S].reshape(A, S)
     b = p[_HEADER + A * S : _HEADER + A * S + S]
     lanes = max(32, min(128, BLOCK_NUMBERS // widest))
     x, y = np.empty((widest, lanes)), np.empty((widest, lanes))
     best, state = np.empty((A, lanes)), np.empty((S, lanes))
     acted = np.empty((A, lanes))
-    missed = np.empty(lanes)
+    missed, total_missed = np.empty((agents, lanes)), np.empty(lanes)
+    owner, owned = np.empty(A, np.int64), np.zeros(agents)
     batch = t.size
     finite = True
     for first in range(0, batch, lanes):
         count = min(lanes, batch - first)
         at = _HEADER + A * S + S
         done = 0
-        for _ in range(agents):
+        for agent in range(agents):
             channels, layers = int(p[at]), int(p[at + 1])
             at += 2
             for j in range(channels):
@@ -304,17 +304,19 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
             for o in range(outputs):
                 for lane in range(count):
                     best[done, lane] = x[o, lane]
+                owner[done] = agent
                 done += 1
+            owned[agent] = outputs
 
-        for lane in range(count):
-            missed[lane] = 0.0
+        missed[:] = 0.0
         for i in range(A):
+            agent = owner[i]
             for lane in range(count):
                 given = action[first + lane, i]
                 a = given if given > 0.0 else 0.0
                 a = a if a < 1.0 else 1.0
                 # The last term is 0, but NaN for NaN and for infinities, which clipping hides.
-                missed[lane] += abs(a - best[i, lane]) + (given - given)
+                missed[agent, lane] += abs(a - best[i, lane]) + (given - given)
                 acted[i, lane] = float64(float32(a))
                 optimal[first + lane, i] = best[i, lane]
 
@@ -343,34 +345,43 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
                 moved[j, first + lane] = z
                 observation[first + lane, j] = z
 
-        # Three short loops rather than one long one: the first two fill vector registers.
+        # Short loops rather than one long one: all but the last fill vector registers.
         for lane in range(count):
-            i = first + lane
-            similarity = 1.0 - missed[lane] / float64(A)
-            finite &= similarity == similarity
-            graded = 4.0 * (similarity - 0.75)
-            graded = graded if graded > 0.0 else 0.0
-            step_reward = graded if graded > r_min else 0.0
-            rewards[0, i] = similarity
-            rewards[1, i] = step_reward
-            rewards[2, i] = 1.0 - step_reward
-            ends[0, i] = step_reward < D
-        for lane in range(count):
-            i = first + lane
-            steps = float64(t[i] + 1)
-            total = accumulated[i] + rewards[1, i]
-            truncated = steps >= T
-            # Exact: no quotient of integers below 2³¹ rounds to a whole number that it is not.
-            paid = truncated | (np.floor(steps / k) * k == steps)
-            rewards[3, i] = total if paid else 0.0
-            kept = 0.0 if paid else total
-            rewards[4, i] = kept
-            ends[1, i] = truncated
-            best[0, lane] = steps / T
-            missed[lane] = kept / k
+            total_missed[lane] = 0.0
+            ends[0, first + lane] = False
+        for agent in range(agents):
+            for lane in range(count):
+                total_missed[lane] += missed[agent, lane]
+        for agent in range(agents):
+            for lane in range(count):
+                i = first + lane
+                similarity = 1.0 - missed[agent, lane] / owned[agent]
+                finite &= similarity == similarity
+                paid_for = 1.0 - total_missed[lane] / float64(A) if pays_the_team else similarity
+                graded = 4.0 * (paid_for - 0.75)
+                graded = graded if graded > 0.0 else 0.0
+                step_reward = graded if graded > r_min else 0.0
+                rewards[0, agent, i] = similarity
+                rewards[1, agent, i] = step_reward
+                rewards[2, agent, i] = 1.0 - step_reward
+                ends[0, i] |= step_reward < D
+            for lane in range(count):
+                i = first + lane
+                steps = float64(t[i] + 1)
+                total = accumulated[agent, i] + rewards[1, agent, i]
+                truncated = steps >= T
+                # Exact: no quotient of integers below 2³¹ rounds to a whole number it is not.
+                paid = truncated | (np.floor(steps / k) * k == steps)
+                rewards[3, agent, i] = total if paid else 0.0
+                kept = 0.0 if paid else total
+                rewards[4, agent, i] = kept
+                ends[1, i] = truncated
+                best[0, lane] = steps / T
+                missed[agent, lane] = kept / k
+            for lane in range(count):
+                observation[first + lane, S + 1 + agent] = missed[agent, lane]
         for lane in range(count):
             observation[first + lane, S] = best[0, lane]
-            observation[first + lane, S + 1] = missed[lane]
     return finite
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.errors import OptionError, StateError, did_you_mean
+from sme_registry.errors import OptionError, SpecError, StateError, did_you_mean
+from sme_registry.task import Task
 
 
 def refuse_unknown(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
@@ -56,3 +57,17 @@ def checked_seed(seed: Any) -> int | None:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise OptionError(f"seed={seed!r:.60}: must be an integer of at least 0, or None.")
     return int(seed)
+
+
+def single_agent(task: Task) -> Task:
+    """The task, which must be one agent's.
+
+    Raises:
+      SpecError: it is a team's; says how to make that.
+    """
+    if len(task.policies) > 1:
+        raise SpecError(
+            f"team: this task is for {len(task.policies)} agents and Gymnasium's environments are "
+            "for one. Use sme_registry.make_parallel or sme_registry.make_aec."
+        )
+    return task

@@ -1,7 +1,8 @@
 """`Renderer`: what an SME looks like, one frame per step.
 
 The state and the action beside the optimal one, channel by channel; below them the episode so far:
-similarity of each step and the regret that has added up.
+similarity of each step and the regret that has added up. Of a team all channels, each agent's own
+underlined, and the mean of the agents' numbers.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ class Renderer:
         self._pygame = _import_pygame()
         self._spec, self._mode, self._fps = spec, mode, metadata["render_fps"]
         self._title = _title(spec)
+        self._owned = _owned(spec)
         self._window: pygame.Surface | None = None
         self._begun = False
 
@@ -192,8 +194,13 @@ class Renderer:
         self._heading(surface, "last action", A, left, top)
         height = bottom - top - 22
         tracks = [0.0] * min(A, _CHANNELS_SHOWN)
-        for x, width, _ in _columns(tracks, left, right):
+        columns = _columns(tracks, left, right)
+        for x, width, _ in columns:
             rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
+        for own in self._owned:
+            if mine := columns[own]:
+                end = mine[-1][0] + mine[-1][1]
+                rect(surface, _FAINT, (mine[0][0], bottom + 4, end - mine[0][0], 3))
         if self._action is None or self._optimal is None:
             return
         x = right
@@ -289,7 +296,15 @@ def _title(spec: SMESpec) -> str:
     shown = [f"SME   S = {spec.state_dim}", f"A = {spec.action_dim}", f"L = {spec.complexity}"]
     rest = {"k": spec.k, "r_min": spec.r_min, "D": spec.D}
     shown += [f"{name} = {value:g}" for name, value in rest.items()]
+    if spec.team is not None:
+        shown.append(f"mean of {len(spec.team.agents)} agents")
     return "   ".join([*shown, spec.content_name])
+
+
+def _owned(spec: SMESpec) -> list[slice]:
+    """The action channels of each agent of a team; none to tell apart without one."""
+    ends = itertools.accumulate(agent.action_dim for agent in spec.team.agents) if spec.team else ()
+    return [slice(*ends) for ends in itertools.pairwise([0, *ends])]
 
 
 def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, int, float]]:

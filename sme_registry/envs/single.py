@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from sme_registry.compiled import engine
 from sme_registry.envs import actions
 from sme_registry.envs.naming import renamed_by_content
-from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown
+from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown, single_agent
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.resolve import resolve
@@ -62,7 +62,7 @@ class SMEEnv(gymnasium.Env[Observation, Action]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
         self.render_mode = render_mode
-        self._task = materialize(resolve(spec).derive(**overrides))
+        self._task = single_agent(materialize(resolve(spec).derive(**overrides)))
         S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
         space, self._rescaled = actions.space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)

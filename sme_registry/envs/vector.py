@@ -13,20 +13,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.compiled import engine
 from sme_registry.envs import actions as action_ranges
-from sme_registry.envs.initial_states import InitialStates
+from sme_registry.envs.batch import Array, Batch, Mask
 from sme_registry.envs.naming import renamed_by_content
-from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown
+from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown, single_agent
 from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize, observe
-from sme_registry.task.memory import refuse_above_limit
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from sme_registry.task import Task, materialize
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
@@ -83,18 +78,14 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self.mode = _autoreset_mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
         self.render_mode = None
-        self._task = materialize(resolve(spec).derive(**overrides))
+        self._task = single_agent(materialize(resolve(spec).derive(**overrides)))
         sme = self._task.spec
         if max_episode_steps is not None and max_episode_steps < sme.horizon:
             raise WrapperError(
                 f"max_episode_steps={max_episode_steps}: must be at least the horizon, "
                 f"{sme.horizon}. Make the task itself shorter: horizon={max_episode_steps}."
             )
-        refuse_above_limit(
-            num_envs * 8 * (4 * sme.state_dim + 4 * sme.action_dim + 64),
-            f"num_envs={num_envs}: a batch this large",
-            "Use fewer lanes.",
-        )
+        self._batch = Batch(self._task, num_envs)
         self.num_envs = num_envs
         S, A = sme.state_dim, sme.action_dim
         self.single_action_space, self._rescaled = action_ranges.space(action_range, A)
@@ -102,27 +93,9 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
-        # Channel by channel, [S, B], as the compiled step reads it.
-        self._s = np.zeros((S, num_envs))
-        self._t = np.zeros(num_envs, np.int64)
-        self._accumulated = np.zeros(num_envs)
-        self._initial_states = InitialStates(num_envs, S)
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
         self._all_begun, self._any_ended = False, False
-        self._load_engine()
-
-    def _load_engine(self) -> None:
-        made = engine(self._task)
-        self._params, self._step_many = made.params, made.step_many
-
-    def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_params", "_step_many")
-        return {name: value for name, value in self.__dict__.items() if name not in dropped}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._load_engine()
 
     @property
     def task(self) -> Task:
@@ -137,7 +110,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
     @property
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
-        return np.ascontiguousarray(self._s.T)
+        return self._batch.state
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -182,8 +155,8 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         # All is checked: only now anything moves.
         for lane, lane_seed in zip(lanes, seeds, strict=True):
             if lane_seed is not None:
-                self._initial_states.seed(int(lane), lane_seed)
-        observation = observe(self.sme_spec, self.state, self._t, self._accumulated)
+                self._batch.initial_states.seed(int(lane), lane_seed)
+        observation = self._batch.observe()
         self._begin(lanes, observation, states)
         self._begun[lanes] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
@@ -204,7 +177,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
           ActionError: wrong shape, not numbers, or not finite; nothing has moved then.
           EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
         """
-        B, S, A = self.num_envs, self.sme_spec.state_dim, self.sme_spec.action_dim
+        B, A = self.num_envs, self.sme_spec.action_dim
         if not self._all_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         resting, any_resting = self._ended, self._any_ended
@@ -219,15 +192,8 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             actions, (B, A), self._rescaled, ignored=resting if any_resting else None
         )
 
-        moved, observation = np.empty((S, B)), np.empty((B, S + 2), np.float32)
-        optimal, values, ends = np.empty((B, A)), np.empty((5, B)), np.empty((2, B), bool)
-        if not self._step_many(
-            self._params, self._s, self._t, self._accumulated, acted,
-            moved, observation, optimal, values, ends,
-        ):  # fmt: skip
-            raise action_ranges.not_finite()
-        similarity, step_reward, regret, reward, accumulated = values
-        terminated, truncated = ends
+        observation, optimal, values, terminated, truncated = self._batch.advance(acted)
+        similarity, step_reward, regret, reward, accumulated = values[:, 0]
         info = {
             "optimal_action": action_ranges.to_range(optimal, self._rescaled),
             "similarity": similarity,
@@ -235,10 +201,6 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             "regret": regret,
             "accumulated_reward": accumulated,
         }
-        self._s = moved
-        self._t += 1
-        self._accumulated = accumulated.copy()
-
         live = None
         if any_resting:
             live = ~resting
@@ -265,15 +227,8 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self, lanes: npt.NDArray[np.int64], observation: Observation, states: Array | None = None
     ) -> None:
         """Put lanes at the start of an episode, and write what they observe."""
-        S = self.sme_spec.state_dim
-        if states is None:
-            states = self._initial_states.draw(lanes)
-        self._s[:, lanes] = states.T
-        self._t[lanes] = 0
-        self._accumulated[lanes] = 0.0
+        self._batch.begin(lanes, observation, states)
         self._ended[lanes] = False
-        observation[lanes, :S] = states
-        observation[lanes, S:] = 0.0
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""

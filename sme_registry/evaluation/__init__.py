@@ -1,14 +1,21 @@
 """Evaluation within and out of distribution: a policy and a task to a report."""
 
 from sme_registry.evaluation.evaluate import evaluate, resolve_protocol
-from sme_registry.evaluation.policies import Policy, as_policy, load_sb3
-from sme_registry.evaluation.report import ChannelReport, EvaluationReport, RegionReport
+from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, load_sb3
+from sme_registry.evaluation.report import (
+    AgentReport,
+    ChannelReport,
+    EvaluationReport,
+    RegionReport,
+)
 
 __all__ = [
+    "AgentReport",
     "ChannelReport",
     "EvaluationReport",
     "Policy",
     "RegionReport",
+    "TeamPolicy",
     "as_policy",
     "evaluate",
     "load_sb3",

@@ -15,13 +15,14 @@ from importlib import metadata
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sme_registry.compiled import Engine, engine
 from sme_registry.errors import SpecError
 from sme_registry.evaluation import references
 from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.regions import Observations, Uniform, observations
-from sme_registry.evaluation.report import EvaluationReport
+from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
 from sme_registry.evaluation.score import Score
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
@@ -46,6 +47,10 @@ def evaluate(
       policy: a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, a
         Stable-Baselines3 model, or the path of such a model's .zip (which can run code of whoever
         made it). Models act deterministically. Actions are clipped as the environment clips them.
+        For a team, a dict from each agent's name to such a policy of the agent's own, from its
+        observations `[B, |O_i| + 2]` to its actions `[B, a_i]`; or one such policy that all agents
+        share, asked for each in turn, from its shared observation `[B, S + 2 + n]` (see
+        `envs.shared`) to `[B, max a_i]`, of which the agent's first a_i are used.
       spec_or_id: the task: a spec, its fields, an id, a digest or a path.
       protocol: a protocol, its fields, its name in the catalogue, or the path of its file.
       action_range: what the policy's actions are in, "unit" for [0, 1] or "symmetric" for
@@ -54,11 +59,11 @@ def evaluate(
       progress: called after each batch with the states done and the states in all.
 
     Returns:
-      The report, with the reference policies on the same states.
+      The report, with the reference policies on the same states; of a team also for each agent.
 
     Raises:
       UnknownNameError, SpecError: no such task or protocol, or a field out of range.
-      PolicyError: the policy cannot be loaded, or its actions cannot be used.
+      PolicyError: the policy cannot be loaded, or its actions cannot be used; of a team, whose.
       OptionError: `action_range` is none, or a shell is too thin for float32 observations.
       ResourceLimitError: the task would not fit in memory.
     """
@@ -68,19 +73,22 @@ def evaluate(
     task = materialize(spec)
     fast = engine(task)
 
+    agents = list(zip(task.names, task.owned, strict=True)) if spec.team is not None else []
+    scopes = {_WHOLE: slice(0, spec.action_dim), **dict(agents)}
+
     regions = []
     fitted: references.References | None = None
     total, done = protocol.states_per_region * len(protocol.edges), 0
     for region in range(len(protocol.edges)):
         batches = _solved(task, fast, protocol, region)
         if fitted is None:
-            fitted, batches = _fitted_on(batches, spec)
-        scores = {who: Score(spec.action_dim) for who in (_POLICY, *references.NAMES)}
+            fitted, batches = _fitted_on(batches, task)
+        scores = {who: _Scores(scopes) for who in (_POLICY, *references.NAMES)}
         random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
         for batch in batches:
             acted = asked(batch.observations)
             a = np.clip(acted, 0.0, 1.0)
-            scores[_POLICY].add(a, batch.optimal, int(np.count_nonzero(a != acted)))
+            scores[_POLICY].add(a, batch.optimal, a != acted)
             others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
             for who, a in others.items():
                 scores[who].add(a, batch.optimal)
@@ -89,13 +97,19 @@ def evaluate(
                 progress(done, total)
         regions.append(scores)
 
-    reports = {
-        who: tuple(
-            scores[who].report(region, edges, scores["constant_half"], regions[0][who])
-            for region, (edges, scores) in enumerate(zip(protocol.edges, regions, strict=True))
-        )
-        for who in regions[0]
-    }
+    def reports(scope: str) -> dict[str, tuple[RegionReport, ...]]:
+        """Of the policy and each reference, over these channels."""
+        return {
+            who: tuple(
+                scores[who][scope].report(
+                    region, edges, scores["constant_half"][scope], regions[0][who][scope]
+                )
+                for region, (edges, scores) in enumerate(zip(protocol.edges, regions, strict=True))
+            )
+            for who in regions[0]
+        }
+
+    whole, of_agents = reports(_WHOLE), {name: reports(name) for name, _ in agents}
     return EvaluationReport(
         policy=asked.name,
         action_range=asked.action_range,
@@ -103,8 +117,12 @@ def evaluate(
         spec_digest=spec.digest,
         protocol=protocol,
         protocol_digest=protocol.digest,
-        regions=reports.pop(_POLICY),
-        references=reports,
+        regions=whole.pop(_POLICY),
+        references=whole,
+        agents={
+            name: AgentReport(regions=own.pop(_POLICY), references=own)
+            for name, own in of_agents.items()
+        },
         versions=_versions(fast),
     )
 
@@ -131,6 +149,23 @@ def resolve_protocol(
 
 
 _POLICY = ""  # the key of the policy in question among the references' names
+_WHOLE = ""  # the key of all action channels among the agents' names
+
+
+class _Scores(dict[str, Score]):
+    """One policy's scores in one region: over all action channels, and over each agent's own."""
+
+    def __init__(self, scopes: dict[str, slice]) -> None:
+        super().__init__({name: Score(own.stop - own.start) for name, own in scopes.items()})
+        self._scopes = scopes
+
+    def add(self, a: Array, optimal: Array, clipped: npt.NDArray[np.bool_] | None = None) -> None:
+        """Count a batch in: `a` `[B, A]` or `[A]`, `optimal` and `clipped` `[B, A]`."""
+        missed = np.abs(a - optimal)
+        sums = missed.sum(axis=0)
+        for name, own in self._scopes.items():
+            outside = 0 if clipped is None else int(np.count_nonzero(clipped[:, own]))
+            self[name].add(missed[:, own], sums[own], outside)
 
 
 class _Batch(NamedTuple):
@@ -151,16 +186,17 @@ def _solved(
 
 
 def _fitted_on(
-    batches: Iterator[_Batch], spec: SMESpec
+    batches: Iterator[_Batch], task: Task
 ) -> tuple[references.References, Iterator[_Batch]]:
     """The references fitted on the first states, and all batches again from the first one."""
-    wanted = references.fit_states(spec)
+    wanted = references.fit_states(task.spec)
     kept: list[_Batch] = []
     while sum(len(batch.s) for batch in kept) < wanted and (batch := next(batches, None)):
         kept.append(batch)
     s = np.concatenate([batch.s for batch in kept])[:wanted]
     optimal = np.concatenate([batch.optimal for batch in kept])[:wanted]
-    return references.fit(s, optimal), itertools.chain(kept, batches)
+    agents = zip(task.observed, task.owned, strict=True)
+    return references.fit(s, optimal, agents), itertools.chain(kept, batches)
 
 
 def _versions(fast: Engine) -> dict[str, str]:

@@ -2,6 +2,11 @@
 
 A policy is a callable `[B, S + 2] → [B, A]`, a Stable-Baselines3 model or policy, or the path of an
 SB3 model's .zip. An SB3 .zip is code: open only those whose author you trust.
+
+A team's is a dict from each agent's name to a policy of what that agent observes and owns,
+`[B, |O_i| + 2] → [B, a_i]`; or one policy for all agents, asked for each in turn with its shared
+observation (`envs.shared`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state is no
+team's policy: under partial observation no agent could follow it.
 """
 
 from __future__ import annotations
@@ -11,17 +16,25 @@ import json
 import os
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from sme_registry.envs import actions
-from sme_registry.errors import ActionError, MissingDependencyError, OptionError, PolicyError
+from sme_registry.envs.shared import Observation as Observations
+from sme_registry.envs.shared import shared_observation_of
+from sme_registry.errors import (
+    ActionError,
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    did_you_mean,
+)
 from sme_registry.spec import SMESpec
+from sme_registry.task import draw
 from sme_registry.task.draw import Array
 
 ActionRange = Literal["unit", "symmetric"]
@@ -43,16 +56,18 @@ class Policy:
     Attributes:
       name: what reports call it.
       action_range: the range of what `act` returns, "unit" or "symmetric".
-      act: observations `[B, S + 2]` float32 to actions; unchecked.
-      action_dim: A.
+      act: observations float32 to actions; unchecked.
+      action_dim: A, entries of an action.
+      asked: how it is asked, for who wonders what it was given.
     """
 
     name: str
     action_range: ActionRange
-    act: Callable[[npt.NDArray[np.float32]], Any]
+    act: Callable[[Observations], Any]
     action_dim: int
+    asked: str = ""
 
-    def __call__(self, observations: npt.NDArray[np.float32]) -> Array:
+    def __call__(self, observations: Observations) -> Array:
         """Actions `[B, A]` in units of the unit range, not yet clipped to it.
 
         Raises:
@@ -69,19 +84,67 @@ class Policy:
             raise PolicyError(
                 f"policy {self.name!r}: {error} It is given observations "
                 f"[{len(observations)}, {observations.shape[1]}] and must return one action a row."
+                f"{self.asked}"
             ) from None
         except PolicyError:
             raise
         except Exception as error:
             raise PolicyError(
                 f"policy {self.name!r} failed on observations of shape {observations.shape}: "
-                f"{type(error).__name__}: {error}"
+                f"{type(error).__name__}: {error}{'.' * bool(self.asked)}{self.asked}"
             ) from error
+
+
+@dataclass(frozen=True)
+class TeamPolicy:
+    """A team's policies ready to be asked, as one policy of the joint action.
+
+    Attributes:
+      name: what reports call it.
+      action_range: "unit" or "symmetric"; "mixed" where the agents' policies differ.
+      members: the agents, in the order of the channels that they own.
+    """
+
+    name: str
+    action_range: ActionRange | Literal["mixed"]
+    members: tuple[Member, ...]
+
+    def __call__(self, observations: Observations) -> Array:
+        """Joint actions `[B, A]` in units of the unit range, not yet clipped to it.
+
+        Args:
+          observations: `[B, S + 2]`: s, t/T and r_cum/k, the same for each agent.
+
+        Raises:
+          PolicyError: an agent's policy fails, or its actions cannot be used; says whose.
+        """
+        joint = []
+        for member in self.members:
+            with _said_of(member.agent):
+                a = member.policy(member.seen(observations))
+            joint.append(a[:, : member.action_dim])
+        return np.concatenate(joint, axis=1)
+
+
+class Member(NamedTuple):
+    """One agent of a team policy.
+
+    Attributes:
+      agent: its name.
+      policy: its own policy, or the one that all agents share.
+      seen: what the policy is shown of observations `[B, S + 2]`; a fresh array.
+      action_dim: a_i, how many entries of the policy's action are this agent's.
+    """
+
+    agent: str
+    policy: Policy
+    seen: Callable[[Observations], Observations]
+    action_dim: int
 
 
 def as_policy(
     policy: Any, spec: SMESpec, *, action_range: str | None = None, name: str | None = None
-) -> Policy:
+) -> Policy | TeamPolicy:
     """A policy given in any of the forms that this module's head lists.
 
     Args:
@@ -92,29 +155,132 @@ def as_policy(
       name: what reports call it; None takes the file's, algorithm's or function's name.
 
     Raises:
-      PolicyError: it is none of these, cannot be loaded, or is made for other spaces.
+      PolicyError: it is none of these, cannot be loaded, or is made for other spaces; or an agent
+        of a team is missing or unknown.
       OptionError: `action_range` is neither "unit" nor "symmetric".
       MissingDependencyError: a .zip is given and Stable-Baselines3 is not installed.
     """
     if action_range not in (None, *_LOW):
         raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
+    S, A = spec.state_dim, spec.action_dim
+    if spec.team is None:
+        return _prepared(policy, (S + 2, A), f"state_dim={S}, action_dim={A}", action_range, name)
+    if isinstance(policy, Mapping):
+        return _separate(policy, spec, action_range, name)
+    return _shared(policy, spec, action_range, name)
+
+
+def _prepared(
+    policy: Any,
+    dims: tuple[int, int],
+    of: str,
+    action_range: str | None,
+    name: str | None,
+    form: str = "",
+    asked: str = "",
+) -> Policy:
+    """A policy from observations of `dims[0]` entries to actions of `dims[1]`.
+
+    Args:
+      policy: a callable, a model or a path.
+      dims: entries of an observation, and of an action.
+      of: what these widths are of, for a model made for others.
+      action_range: as in `as_policy`.
+      name: as in `as_policy`.
+      form: what else a policy may be, for what is none.
+      asked: as in `Policy`.
+    """
     if isinstance(policy, str | os.PathLike):
         name = Path(policy).stem if name is None else name
         policy = load_sb3(policy)
     if hasattr(policy, "predict"):
-        _refuse_other_spaces(policy, spec)
+        _refuse_other_spaces(policy, dims, of)
         act = _predictor(policy)
         range_ = action_range or _range_of(policy)
     elif callable(policy):
         act, range_ = policy, action_range or "unit"
     else:
         raise PolicyError(
-            f"policy={policy!r:.80}: must be a callable from observations [B, {spec.state_dim + 2}]"
-            f" to actions [B, {spec.action_dim}], a Stable-Baselines3 model, or a model's .zip."
+            f"policy={policy!r:.80}: must be {form}a callable from observations [B, {dims[0]}]"
+            f" to actions [B, {dims[1]}], a Stable-Baselines3 model, or a model's .zip."
         )
-    return Policy(
-        name or _name_of(policy), cast(ActionRange, range_), act, action_dim=spec.action_dim
+    return Policy(name or _name_of(policy), cast(ActionRange, range_), act, dims[1], asked)
+
+
+def _separate(
+    policies: Mapping[str, Any], spec: SMESpec, action_range: str | None, name: str | None
+) -> TeamPolicy:
+    """A team in which each agent has a policy of its own."""
+    agents = draw.agents(spec)
+    _refuse_other_names(policies, [agent.name for agent in agents])
+    members = []
+    for agent, observed in zip(agents, draw.observed_channels(spec), strict=True):
+        dims = len(observed) + 2, agent.action_dim
+        of = f"{len(observed)} observed and {agent.action_dim} owned channels"
+        with _said_of(agent.name):
+            own = _prepared(policies[agent.name], dims, of, action_range, None)
+        columns = [*observed, spec.state_dim, spec.state_dim + 1]
+        members.append(Member(agent.name, own, _columns(columns), agent.action_dim))
+    names = {member.policy.name for member in members}
+    ranges = {member.policy.action_range for member in members}
+    return TeamPolicy(
+        name or (names.pop() if len(names) == 1 else f"{len(members)} policies"),
+        ranges.pop() if len(ranges) == 1 else "mixed",
+        tuple(members),
     )
+
+
+def _shared(policy: Any, spec: SMESpec, action_range: str | None, name: str | None) -> TeamPolicy:
+    """A team in which all agents share one policy."""
+    agents = draw.agents(spec)
+    dims = spec.state_dim + 2 + len(agents), max(agent.action_dim for agent in agents)
+    one = _prepared(
+        policy,
+        dims,
+        f"a policy that all {len(agents)} agents share",
+        action_range,
+        name,
+        form="a dict from each agent's name to its policy; or for all agents ",
+        asked=f" A team's one policy is asked for each agent in turn, from its shared observation "
+        f"[B, {dims[0]}] to [B, {dims[1]}]; for separate policies give a dict by agent.",
+    )
+    members = tuple(
+        Member(agent.name, one, _shown(index, len(agents), observed), agent.action_dim)
+        for index, (agent, observed) in enumerate(
+            zip(agents, draw.observed_channels(spec), strict=True)
+        )
+    )
+    return TeamPolicy(one.name, one.action_range, members)
+
+
+def _columns(columns: list[int]) -> Callable[[Observations], Observations]:
+    return lambda observations: observations[:, columns]
+
+
+def _shown(
+    agent: int, agents: int, observed: tuple[int, ...]
+) -> Callable[[Observations], Observations]:
+    return lambda observations: shared_observation_of(agent, agents, observed, observations)
+
+
+def _refuse_other_names(policies: Mapping[str, Any], names: list[str]) -> None:
+    missing = [name for name in names if name not in policies]
+    unknown = [name for name in policies if name not in names]
+    said = [f"{', '.join(missing)}: policy missing."] if missing else []
+    if unknown:
+        hint = did_you_mean(str(unknown[0]), missing or names)
+        said.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
+    if said:
+        raise PolicyError(f"policy: {' '.join(said)} Give one for each of {', '.join(names)}.")
+
+
+@contextlib.contextmanager
+def _said_of(agent: str) -> Iterator[None]:
+    """Errors of an agent's policy begin with its name."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"{agent}: {error}") from error.__cause__
 
 
 def load_sb3(path: str | os.PathLike[str]) -> Any:
@@ -173,13 +339,13 @@ def _saved_fields(path: Path) -> set[str]:
     return set(fields)
 
 
-def _predictor(model: Any) -> Callable[[npt.NDArray[np.float32]], Any]:
+def _predictor(model: Any) -> Callable[[Observations], Any]:
     """The deterministic actions of an object with `predict`, before clipping where it is SB3's."""
     sb3 = sys.modules.get("stable_baselines3.common.policies")
     network = getattr(model, "policy", model)
     if sb3 is None or not isinstance(network, sb3.BasePolicy):
 
-        def predict(observations: npt.NDArray[np.float32]) -> Any:
+        def predict(observations: Observations) -> Any:
             predicted = model.predict(observations, deterministic=True)
             return predicted[0] if isinstance(predicted, tuple) else predicted
 
@@ -187,7 +353,7 @@ def _predictor(model: Any) -> Callable[[npt.NDArray[np.float32]], Any]:
 
     import torch
 
-    def act(observations: npt.NDArray[np.float32]) -> Any:
+    def act(observations: Observations) -> Any:
         was_training = network.training
         network.set_training_mode(False)
         try:
@@ -202,14 +368,12 @@ def _predictor(model: Any) -> Callable[[npt.NDArray[np.float32]], Any]:
     return act
 
 
-def _refuse_other_spaces(model: Any, spec: SMESpec) -> None:
-    expected = {"observation": (spec.state_dim + 2,), "action": (spec.action_dim,)}
-    for what, shape in expected.items():
-        found = getattr(getattr(model, f"{what}_space", None), "shape", shape)
-        if found != shape:
+def _refuse_other_spaces(model: Any, dims: tuple[int, int], of: str) -> None:
+    for what, width in zip(("observation", "action"), dims, strict=True):
+        found = getattr(getattr(model, f"{what}_space", None), "shape", (width,))
+        if found != (width,):
             raise PolicyError(
-                f"policy: its {what}s have shape {found}: must be {shape} for "
-                f"state_dim={spec.state_dim}, action_dim={spec.action_dim}. "
+                f"policy: its {what}s have shape {found}: must be {(width,)} for {of}. "
                 "Evaluate it on the task it was trained for."
             )
     normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()

@@ -1,7 +1,8 @@
 """The policies that every report shows beside the one in question, on the same states.
 
 optimal                π*: similarity 1, normalised regret 0
-linear_least_squares   the affine map of the state fitted to π*, clipped to [0, 1]
+linear_least_squares   the affine map of the state fitted to π*, clipped to [0, 1]; of a team, each
+                       agent's own map of the channels that it observes
 best_constant          the constant action of least mean |a − a*|: each channel's median of a*
 constant_half          a = ½: normalised regret 1
 uniform_random         a ~ U([0, 1]^A), drawn anew in each state
@@ -10,10 +11,14 @@ The two fitted ones know the training cube only: they are fitted on the states o
 `FIT_STATES` of them (all, under paper-v1), and used unchanged in every other region. So they lose
 outside what an agent that learnt no more than they did would lose. Judged in WD on the states they
 were fitted on, they look too good there where those are not many times state_dim.
+
+An agent's reference knows no more than the agent: a linear map of the whole state, fitted to all
+channels at once, would be another policy, which no agent that observes a part of it could follow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +48,8 @@ class References:
 
     Attributes:
       constant: `[A]` the best constant action.
-      slope: `[S, A]` of the linear policy, about the cube's centre.
+      slope: `[S, A]` of the linear policy, about the cube's centre; 0 where the agent that owns
+        the action channel does not observe the state channel.
       intercept: `[A]` its action there.
     """
 
@@ -73,8 +79,25 @@ class References:
         }
 
 
-def fit(s: Array, optimal: Array) -> References:
-    """Fit the references on states `[N, S]` of WD and their optimal actions `[N, A]`."""
-    design = np.concatenate([s - 0.5, np.ones((len(s), 1))], axis=1)
-    solution = np.linalg.lstsq(design, optimal)[0]
-    return References(np.median(optimal, axis=0), solution[:-1], solution[-1])
+def fit(
+    s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
+) -> References:
+    """Fit the references on states of WD and their optimal actions.
+
+    Args:
+      s: `[N, S]` states.
+      optimal: `[N, A]` π*(s).
+      agents: the state channels that each agent observes and the action channels that it owns;
+        None is one agent with all of them.
+    """
+    S, A = s.shape[1], optimal.shape[1]
+    slope, intercept = np.zeros((S, A)), np.empty(A)
+    owned_by_observed: dict[tuple[int, ...], list[int]] = {}
+    for observed, own in [(range(S), slice(0, A))] if agents is None else agents:
+        owned_by_observed.setdefault(tuple(observed), []).extend(range(own.start, own.stop))
+    for channels, owned in owned_by_observed.items():
+        design = np.concatenate([s[:, channels] - 0.5, np.ones((len(s), 1))], axis=1)
+        solution = np.linalg.lstsq(design, optimal[:, owned])[0]
+        slope[np.ix_(channels, owned)] = solution[:-1]
+        intercept[owned] = solution[-1]
+    return References(np.median(optimal, axis=0), slope, intercept)

@@ -40,7 +40,8 @@ def region_name(region: int) -> str:
 
 def batch_rows(spec: SMESpec) -> int:
     """How many states are held at once; few where a state is large."""
-    width = spec.state_dim + spec.action_dim + spec.hidden_width
+    others = len(spec.team.agents) - 1 if spec.team is not None else 0
+    width = spec.state_dim + spec.action_dim + spec.hidden_width + others
     return max(1, min(BATCH_ROWS, BATCH_NUMBERS // width))
 
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.files import read_json, to_json, write_atomically
@@ -84,12 +84,28 @@ class RegionReport(StrictModel):
 _Regions = Annotated[tuple[RegionReport, ...], Field(strict=False, min_length=1)]
 
 
+class AgentReport(StrictModel):
+    """One agent of a team: every region over the action channels that it owns.
+
+    Attributes:
+      regions: WD, then OOD 1, 2, …; `channels` are the agent's own, in order.
+      references: the same regions for each reference policy, over the same channels.
+    """
+
+    regions: _Regions
+    references: dict[str, _Regions]
+
+
 class EvaluationReport(StrictModel):
     """A policy in every region of a protocol, and the references on the same states.
 
+    Of a team `regions` and `references` are over all action channels, and `agents` has each agent
+    over its own. A report of a single agent has none, and its JSON no such field.
+
     Attributes:
       policy: the policy's name.
-      action_range: of the policy's actions, "unit" or "symmetric".
+      action_range: of the policy's actions, "unit" or "symmetric"; "mixed" where the agents of a
+        team differ.
       spec: the task, whole.
       spec_digest: its digest.
       protocol: the protocol, whole.
@@ -97,19 +113,28 @@ class EvaluationReport(StrictModel):
       regions: WD, then OOD 1, 2, …
       references: the same regions for each reference policy; what each is, says
         `sme_registry.evaluation.references`.
+      agents: each agent of a team by its name, in the order of the channels that they own.
       versions: of Python and the packages that the numbers depend on.
     """
 
     schema_version: Literal[1] = 1
     policy: str
-    action_range: Literal["unit", "symmetric"]
+    action_range: Literal["unit", "symmetric", "mixed"]
     spec: SMESpec
     spec_digest: str
     protocol: EvaluationProtocol
     protocol_digest: str
     regions: _Regions
     references: dict[str, _Regions]
+    agents: dict[str, AgentReport] = Field(default_factory=dict)
     versions: dict[str, str]
+
+    @model_serializer(mode="wrap")
+    def _without_agents_of_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        if not self.agents:
+            del plain["agents"]
+        return plain
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
@@ -139,14 +164,18 @@ class EvaluationReport(StrictModel):
         return write_atomically(path, to_json(self.plain()))
 
     def table(self) -> Table:
-        """The report for a terminal of 80 columns: regions across, policy and references down."""
+        """The report for a terminal of 80 columns: regions across, policy and references down.
+
+        Of a team it is the whole team's, and three lines for each agent below.
+        """
         from rich.markup import escape
         from rich.table import Table
 
         spec, own_name = self.spec, escape(self.policy)
+        team = f", {len(self.agents)} agents" if self.agents else ""
         table = Table(
             title=f"{own_name} on {catalogue.title(spec)} (S={spec.state_dim}, "
-            f"A={spec.action_dim}, L={spec.complexity})\n"
+            f"A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{spec.digest}\n{self.regions[0].states:,} states a region",
             caption=NOT_COMPARABLE,
             title_justify="left",
@@ -174,4 +203,11 @@ class EvaluationReport(StrictModel):
         row("decay from WD", self.regions, "decay", ".1%")
         row("points of r̃ lost", self.regions, "decay_points", ".1f")
         row("actions clipped", self.regions, "clipped_share", ".1%")
+        for agent, found in self.agents.items():
+            table.add_section()
+            row(f"{agent}  r̃", found.regions, "similarity", ".3f")
+            row("  normalised regret", found.regions, "normalised_regret", ".3f")
+            linear = found.references.get("linear_least_squares")
+            if linear is not None:
+                row(f"  of {LABELS['linear_least_squares']}", linear, "normalised_regret", ".3f")
         return table

@@ -27,15 +27,15 @@ class Score:
         self._missed = np.zeros(action_dim)
         self._clipped = 0
 
-    def add(self, a: Array, optimal: Array, clipped: int = 0) -> None:
+    def add(self, missed: Array, sums: Array, clipped: int = 0) -> None:
         """Count a batch in.
 
         Args:
-          a: `[B, A]` actions in [0, 1], or one `[A]` for all states.
-          optimal: `[B, A]` π* of the same states.
+          missed: `[B, A]` |a − a*| of these channels.
+          sums: `[A]` its sums over states: taken over all channels of a task at once, so that an
+            agent's channels have the same bits in its own score and in its team's.
           clipped: how many of the actions' entries lay outside [0, 1] before they were clipped.
         """
-        missed = np.abs(a - optimal)
         errors = missed.mean(axis=1)
         count, mean = len(errors), float(errors.mean())
         errors -= mean
@@ -44,7 +44,7 @@ class Score:
         self._squares += float(errors @ errors) + ahead**2 * self._states * count / states
         self._mean += ahead * count / states
         self._states = states
-        self._missed += missed.sum(axis=0)
+        self._missed += sums
         self._clipped += clipped
 
     @property

@@ -88,12 +88,13 @@ def title(spec: SMESpec) -> str:
     return f"{NAMESPACE}/{named.get(spec.digest, spec.content_name)}"
 
 
-def released() -> Iterator[tuple[str, str]]:
-    """`(versioned name, name by content)` of every environment, read without validation.
+def released() -> Iterator[tuple[str, str, bool]]:
+    """`(versioned name, name by content, is a team)` of every environment, without validation.
 
     For registering the catalogue at import, which must stay cheap; what is made of a name is
     validated in full.
     """
     for path in paths(EnvFile):
-        digest = read_json(path)["digest"]
-        yield path.stem, digest.replace(":", "-")[: len("sha256-") + 12]
+        file = read_json(path)
+        content_name = file["digest"].replace(":", "-")[: len("sha256-") + 12]
+        yield path.stem, content_name, file["spec"]["team"] is not None

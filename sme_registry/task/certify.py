@@ -51,6 +51,7 @@ _CELLS = 16
 _FALSE_ALARM = 1e-6  # chance that a uniform ensemble is refused by one of the uniformity checks
 _LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
 _ROUNDING = 1e-9
+_CONSTANT_PASSES, _CONSTANT_WARNS = (0.65, 0.80), (0.60, 0.90)  # mean r̃ of the action ½
 
 
 @dataclass(frozen=True)
@@ -318,8 +319,8 @@ def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
             float(similarity.mean()),
             "Mean r̃ of the constant action ½ over uniform states; near 0.75 where π* spreads over "
             "its range. Higher: the target is near-trivial. Lower: it sits in corners.",
-            passes=(0.65, 0.80),
-            warns=(0.60, 0.90),
+            passes=_CONSTANT_PASSES,
+            warns=_CONSTANT_WARNS,
         ),
         _judged(
             "constant_policy_reward",
@@ -336,7 +337,29 @@ def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
             passes=(0.15, None),
             warns=(0.05, None),
         ),
+        *_least_typical_agent(task, optimal),
         _linear_policy(task, seed, s, optimal),
+    )
+
+
+def _least_typical_agent(task: Task, optimal: Array) -> tuple[Check, ...]:
+    """The constant action's r̃ of the agent where it is farthest from 0.75; none without a team.
+
+    The mean over all channels would hide an agent that has nothing to learn among others that do.
+    """
+    if task.spec.team is None:
+        return ()
+    means = task.similarities_of(np.full_like(optimal, 0.5), optimal).mean(axis=0)
+    agent = int(np.abs(means - 0.75).argmax())
+    return (
+        _judged(
+            "agent_constant_policy_similarity",
+            float(means[agent]),
+            f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
+            "farthest from 0.75.",
+            passes=_CONSTANT_PASSES,
+            warns=_CONSTANT_WARNS,
+        ),
     )
 
 

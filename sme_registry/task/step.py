@@ -1,11 +1,13 @@
 """One step of a batch of episodes, in NumPy: the definition that every back-end must equal.
 
-Source: METHOD, section 1. `B` batch, `S` state_dim, `A` action_dim, T horizon, t completed steps.
+Source: METHOD, sections 1 and 5. `B` batch, `n` agents (a single agent is a team of one), `S`
+state_dim, `A` action_dim, T horizon, t completed steps. Each agent i has its own r_i and r_cum:
+r_i is of the similarity over its own channels, or of all channels where the team is paid.
 
     r_cum ← r_cum + r(s, a);  s ← T(s, a);  t ← t + 1
-    terminated = r < D        truncated = t ≥ T
+    terminated = any r_i < D   truncated = t ≥ T
     R = r_cum where k divides t or truncated, else 0;  r_cum ← 0 after a payout
-    observation = (s, t/T, r_cum/k), after the step
+    observation = (s, t/T, r_cum/k of each agent), after the step
 
 On termination alone nothing extra is paid; what is lost stays visible as r_cum.
 """
@@ -28,10 +30,10 @@ class Step(NamedTuple):
     Attributes:
       state: `[B, S]` next states.
       optimal_action: `[B, A]` π* of the states acted in.
-      similarity: `[B]` r̃.
-      step_reward: `[B]` r.
-      reward: `[B]` R, what is paid.
-      accumulated_reward: `[B]` r_cum, after a payout's reset.
+      similarity: `[B, n]` r̃ over the agent's own channels.
+      step_reward: `[B, n]` r.
+      reward: `[B, n]` R, what is paid.
+      accumulated_reward: `[B, n]` r_cum, after a payout's reset.
       terminated: `[B]`.
       truncated: `[B]`.
     """
@@ -58,19 +60,22 @@ def step(
       task: the task.
       s: `[B, S]` states.
       t: `[B]` steps completed before this one.
-      accumulated_reward: `[B]` r_cum before this step.
+      accumulated_reward: `[B, n]` r_cum before this step.
       a: `[B, A]` actions, finite; clipped to [0, 1].
     """
     spec = task.spec
     a = np.clip(a, 0.0, 1.0)
     optimal = task.policy(s[:, None, :])[:, 0, :]
-    similarity = task.similarity_of(a, optimal)
-    step_reward = task.reward_of(similarity)
+    similarity = task.similarities_of(a, optimal)
+    paid_for = similarity
+    if task.pays_the_team:
+        paid_for = np.broadcast_to(task.similarity_of(a, optimal)[:, None], similarity.shape)
+    step_reward = task.reward_of(paid_for)
 
     total = accumulated_reward + step_reward
     t = t + 1
     truncated = t >= spec.horizon
-    paid = truncated | (t % spec.k == 0)
+    paid = (truncated | (t % spec.k == 0))[:, None]
     return Step(
         state=task.transition(s, a),
         optimal_action=optimal,
@@ -78,7 +83,7 @@ def step(
         step_reward=step_reward,
         reward=np.where(paid, total, 0.0),
         accumulated_reward=np.where(paid, 0.0, total),
-        terminated=step_reward < spec.D,
+        terminated=np.asarray((step_reward < spec.D).any(axis=-1)),
         truncated=truncated,
     )
 
@@ -86,6 +91,9 @@ def step(
 def observe(
     spec: SMESpec, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array
 ) -> npt.NDArray[np.float32]:
-    """The observations (s, t/T, r_cum/k), `[B, S + 2]` float32 in [0, 1]."""
-    auxiliary = np.stack([t / spec.horizon, accumulated_reward / spec.k], axis=-1)
-    return np.concatenate([s, auxiliary], axis=-1).astype(np.float32)
+    """What there is to observe, (s, t/T, r_cum/k of each agent), `[B, S + 1 + n]` float32.
+
+    A single agent observes all of it; an agent of a team its own part, see `envs.team`.
+    """
+    columns = [s, (t / spec.horizon)[:, None], accumulated_reward / spec.k]
+    return np.concatenate(columns, axis=-1).astype(np.float32)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import cast
 
 import numpy as np
@@ -55,6 +56,23 @@ class Task:
         if self.spec.team is None:
             return list(self.policies[0])
         return [list(policy) for policy in self.policies]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The agents, in the order of the channels that they own; one where there is no team."""
+        return tuple(agent.name for agent in draw.agents(self.spec))
+
+    @property
+    def owned(self) -> tuple[slice, ...]:
+        """The action channels that each agent owns."""
+        widths = [agent.action_dim for agent in draw.agents(self.spec)]
+        ends = accumulate(widths)
+        return tuple(slice(end - width, end) for width, end in zip(widths, ends, strict=True))
+
+    @property
+    def pays_the_team(self) -> bool:
+        """Whether every agent is paid for the mean similarity over all channels."""
+        return self.spec.team is not None and self.spec.team.reward == "team"
 
     def transition(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """The next state, ψ(s + a W + b).
@@ -125,6 +143,50 @@ class Task:
     def similarity_of(self, a: Array, optimal: Array) -> Array:
         """r̃ of actions in [0, 1] beside the optimal ones, `[..., A]` each."""
         return cast(Array, 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim)
+
+    def similarities_of(self, a: Array, optimal: Array) -> Array:
+        """Each agent's r̃ over its own channels, `[..., n]` of actions `[..., A]`."""
+        missed = np.abs(a - optimal)
+        means = [missed[..., own].sum(axis=-1) / (own.stop - own.start) for own in self.owned]
+        return 1.0 - np.stack(means, axis=-1)
+
+    def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """Each agent's share of the team's regret, `[B, n]` or `[n]`; they add up to it.
+
+        regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one.
+        The team's 1 − r̃ is the sum of all d_i / A, so each is charged in proportion to what it
+        contributed. All are 0 at the optimum.
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        s, a = self._pairs(s, a)
+        optimal = self.policy(s)
+        missed = np.abs(a - optimal)
+        distances = np.stack([missed[..., own].sum(axis=-1) for own in self.owned], axis=-1)
+        total = distances.sum(axis=-1, keepdims=True)
+        shares = np.divide(distances, total, out=np.zeros_like(distances), where=total > 0)
+        regret = 1.0 - self.reward_of(self.similarity_of(a, optimal))
+        return cast(Array, shares * np.asarray(regret)[..., None])
+
+    def difference_rewards(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """What the team would gain were one agent at its optimum, `[B, n]` or `[n]`, in [0, 1].
+
+        The team's step reward with agent i's action replaced by its optimal one and all others as
+        they are, minus the team's step reward as it is.
+
+        Raises:
+          StateError, ActionError: wrong shape or not finite.
+        """
+        s, a = self._pairs(s, a)
+        optimal = self.policy(s)
+        as_is = self.reward_of(self.similarity_of(a, optimal))
+        gains = []
+        for own in self.owned:
+            mended = a.copy()
+            mended[..., own] = optimal[..., own]
+            gains.append(self.reward_of(self.similarity_of(mended, optimal)) - as_is)
+        return np.stack(gains, axis=-1)
 
     def policy(self, s: Array) -> Array:
         """π* of states `[..., S]`, unchecked: each agent's layers over what it observes."""

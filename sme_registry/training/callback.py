@@ -6,7 +6,7 @@ Imports Stable-Baselines3; import it inside functions only.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -20,12 +20,16 @@ _RECENT = 20  # episodes in the running mean that the progress shows
 class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
     """Sums what the environment says of each step, and writes it down when an episode ends.
 
+    SB3 counts a step for each agent of a team; here, as in all that is written, a step is one of
+    the whole team.
+
     Args:
       log: where episodes go.
       meter: what shows the progress.
       checkpoint: called with the steps done, every `checkpoint_every` steps.
       checkpoint_every: steps.
       wall_before: seconds of training in earlier sessions.
+      agents: the agents of the team, whose lanes lie side by side; none where there is no team.
     """
 
     def __init__(
@@ -35,10 +39,13 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
         checkpoint: Callable[[int], None],
         checkpoint_every: int,
         wall_before: float,
+        agents: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self._log, self._meter, self._checkpoint = log, meter, checkpoint
         self._every, self._wall_before = checkpoint_every, wall_before
+        self._agents = tuple(agents)
+        self._lanes_each = max(1, len(self._agents))
         self._start = time.monotonic()
         self._last_checkpoint = 0
 
@@ -47,20 +54,25 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
         """Seconds of training, over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
+    @property
+    def steps_done(self) -> int:
+        """Environment steps of the whole run, over all environments."""
+        return int(self.num_timesteps) // self._lanes_each
+
     def _on_training_start(self) -> None:
         lanes = self.training_env.num_envs
         # return, length, sum of regret, sum of similarity; the episode under way in each lane
         self._sums = np.zeros((4, lanes))
-        self._last_checkpoint = self.num_timesteps
+        self._last_checkpoint = self.steps_done
         self._start = time.monotonic()
         self._note = self._running_mean()
 
     def _on_rollout_start(self) -> None:
         # Between rollouts the model is consistent: all it has seen is learnt from and in its
         # replay buffer. For off-policy algorithms that is after each step of the environment.
-        if self.num_timesteps - self._last_checkpoint >= self._every:
-            self._checkpoint(self.num_timesteps)
-            self._last_checkpoint = self.num_timesteps
+        if self.steps_done - self._last_checkpoint >= self._every:
+            self._checkpoint(self.steps_done)
+            self._last_checkpoint = self.steps_done
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], self.locals["dones"]
@@ -68,31 +80,42 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
         self._sums[1] += 1.0
         self._sums[2] += [info["regret"] for info in infos]
         self._sums[3] += [info["similarity"] for info in infos]
-        for lane in np.flatnonzero(dones):
-            returned, length, regret, similarity = self._sums[:, lane].tolist()
-            self._sums[:, lane] = 0.0
-            self._log.add(
-                Episode(
-                    episode=len(self._log.episodes) + 1,
-                    step=self.num_timesteps,
-                    episode_return=returned,
-                    length=int(length),
-                    mean_regret=regret / length,
-                    mean_similarity=similarity / length,
-                    terminated=int(not infos[lane]["TimeLimit.truncated"]),
-                    wall_seconds=round(self.wall_seconds, 3),
-                )
-            )
-            self.logger.record_mean("sme/mean_regret", regret / length)
-            self.logger.record_mean("sme/mean_similarity", similarity / length)
+        # A team's lanes end together: the first of them stands for all.
+        for lane in np.flatnonzero(dones[:: self._lanes_each]) * self._lanes_each:
+            self._log_episode(int(lane), int(not infos[lane]["TimeLimit.truncated"]))
         if dones.any():
             self._note = self._running_mean()
-        self._meter.update(self.num_timesteps, self._note)
+        self._meter.update(self.steps_done, self._note)
         return True
+
+    def _log_episode(self, lane: int, terminated: int) -> None:
+        """Write down the episode that ended in this lane, or in those of a team from it on."""
+        lanes = slice(lane, lane + self._lanes_each)
+        returned, length, regret, similarity = self._sums[:, lanes].mean(axis=1).tolist()
+        regrets = (self._sums[2, lanes] / length).tolist() if self._agents else []
+        self._sums[:, lanes] = 0.0
+        self._log.add(
+            Episode(
+                episode=len(self._log.episodes) + 1,
+                step=self.steps_done,
+                episode_return=returned,
+                length=int(length),
+                mean_regret=regret / length,
+                mean_similarity=similarity / length,
+                terminated=terminated,
+                wall_seconds=round(self.wall_seconds, 3),
+                agents_mean_regret=tuple(regrets),
+            )
+        )
+        self.logger.record_mean("sme/mean_regret", regret / length)
+        self.logger.record_mean("sme/mean_similarity", similarity / length)
+        for agent, value in zip(self._agents, regrets, strict=True):
+            self.logger.record_mean(f"sme/mean_regret/{agent}", value)
 
     def _running_mean(self) -> str:
         recent = self._log.episodes[-_RECENT:]
         if not recent:
             return ""
         regret = np.mean([episode.mean_regret for episode in recent])
-        return f"mean regret {regret:.3f} (last {len(recent)} episodes)"
+        whose = "team's mean regret" if self._agents else "mean regret"
+        return f"{whose} {regret:.3f} (last {len(recent)} episodes)"

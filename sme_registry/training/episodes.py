@@ -1,9 +1,13 @@
-"""`episodes.csv`: one row for each finished episode, on disk as soon as it has ended."""
+"""`episodes.csv`: one row for each finished episode, on disk as soon as it has ended.
+
+A team's has a column more for each agent, `mean_regret/<agent>`.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,20 +15,25 @@ from sme_registry.errors import OptionError
 from sme_registry.files import write_atomically
 
 FILE = "episodes.csv"
+_OF_AGENT = "mean_regret/"
 
 
 class Episode(NamedTuple):
-    """A finished episode.
+    """A finished episode; of a team, one episode of the whole team.
 
     Attributes:
       episode: its number, from 1.
-      step: environment steps of the whole run when it ended, over all lanes.
+      step: environment steps of the whole run when it ended, over all environments; a step of a
+        team is one step of all its agents.
       episode_return: the sum of its rewards, in [0, T]; the column is called `return`.
       length: its steps.
       mean_regret: mean regret 1 − r over its steps, in [0, 1]; exact.
       mean_similarity: mean r̃ over its steps, in [0, 1]; exact.
       terminated: 1 where it ended by D, 0 where its time was up.
       wall_seconds: of training, over all sessions, when it ended.
+      agents_mean_regret: each agent's mean regret, in the team's order; empty where there is no
+        team. Of a team the numbers above (return, mean_regret, mean_similarity) are the mean over
+        its agents.
     """
 
     episode: int
@@ -35,9 +44,10 @@ class Episode(NamedTuple):
     mean_similarity: float
     terminated: int
     wall_seconds: float
+    agents_mean_regret: tuple[float, ...] = ()
 
 
-COLUMNS = tuple("return" if field == "episode_return" else field for field in Episode._fields)
+COLUMNS = tuple("return" if f == "episode_return" else f for f in Episode._fields[:-1])
 _TYPES = (int, int, float, int, float, float, int, float)
 
 
@@ -51,15 +61,22 @@ def read_episodes(path: Path) -> list[Episode]:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
     except (OSError, UnicodeDecodeError) as error:
         raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise OptionError(f"{path}: its columns must be {','.join(COLUMNS)}.")
+    head = rows[0] if rows else []
+    own, agents = tuple(head[: len(COLUMNS)]), head[len(COLUMNS) :]
+    if own != COLUMNS or not all(column.startswith(_OF_AGENT) for column in agents):
+        raise OptionError(
+            f"{path}: its columns must be {','.join(COLUMNS)}, and of a team {_OF_AGENT}<agent>."
+        )
     episodes = []
     for row in rows[1:]:
         try:
-            values = [kind(text) for kind, text in zip(_TYPES, row, strict=True)]
+            if len(row) != len(head):
+                break
+            values = [kind(text) for kind, text in zip(_TYPES, row, strict=False)]
+            regrets = tuple(map(float, row[len(COLUMNS) :]))
         except ValueError:
             break
-        episodes.append(Episode(*values))
+        episodes.append(Episode._make((*values, regrets)))
     return episodes
 
 
@@ -70,13 +87,15 @@ class EpisodeLog:
       path: the file. Rows after `up_to_step`, which a resumed run will live through again, are
         dropped; so is a row that a kill cut short.
       up_to_step: the step of the checkpoint that the run goes on from; 0 begins anew.
+      agents: the agents of the team, each with a column; none where there is no team.
     """
 
-    def __init__(self, path: Path, up_to_step: int = 0) -> None:
+    def __init__(self, path: Path, up_to_step: int = 0, agents: Sequence[str] = ()) -> None:
         kept = read_episodes(path) if up_to_step and path.exists() else []
         self.episodes = [episode for episode in kept if episode.step <= up_to_step]
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([COLUMNS, *map(_row, self.episodes)])
+        head = [*COLUMNS, *(f"{_OF_AGENT}{agent}" for agent in agents)]
+        csv.writer(text, lineterminator="\n").writerows([head, *map(_row, self.episodes)])
         write_atomically(path, text.getvalue())
         self._stream = path.open("a", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream, lineterminator="\n")
@@ -93,4 +112,5 @@ class EpisodeLog:
 
 
 def _row(episode: Episode) -> list[int | str]:
-    return [format(v, ".9g") if isinstance(v, float) else v for v in episode]
+    *own, agents = episode
+    return [format(v, ".9g") if isinstance(v, float) else v for v in (*own, *agents)]

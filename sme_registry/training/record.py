@@ -15,6 +15,7 @@ from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel
 
 FILE = "run.json"
+DEFAULTS = "stable-baselines3 defaults"
 _PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
 
@@ -25,8 +26,10 @@ class RunRecord(StrictModel):
       status: "running" (or killed), then "finished".
       spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which a resumption
         must agree with.
-      hyperparameters: whose.
-      steps: environment steps asked for, over all lanes.
+      hyperparameters: whose, and what is changed.
+      agents: of the task; more than 1 in a team. They share the one policy that is trained.
+      steps: environment steps asked for, over all environments. A step of a team is one step of
+        all its agents, so the algorithm learns from `agents` times as many transitions.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their
         last rollout, so it can be above `steps`.
       checkpoint_every: steps between checkpoints.
@@ -42,10 +45,11 @@ class RunRecord(StrictModel):
     spec: SMESpec
     spec_digest: str
     algorithm: str
-    hyperparameters: Literal["stable-baselines3 defaults"] = "stable-baselines3 defaults"
+    hyperparameters: str = DEFAULTS
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
+    agents: Integer = 1
     steps: Integer
     steps_done: Integer = 0
     checkpoint_every: Integer

@@ -1,5 +1,7 @@
 """`train`: one algorithm on one task, its exact regret logged, evaluated at the end.
 
+The agents of a team share one policy, which is told whom it acts for (`envs.shared`).
+
 The folder of a run:
     run.json          what was run, and how far it got
     episodes.csv      one row for each finished episode
@@ -34,14 +36,17 @@ from sme_registry.task import materialize
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
+    default_algorithm,
+    default_num_envs,
     known_algorithm,
     load_algorithm,
     refuse_without_dependencies,
+    rollout_steps,
 )
 from sme_registry.training.episodes import Episode, EpisodeLog
 from sme_registry.training.progress import Meter
+from sme_registry.training.record import DEFAULTS, RunRecord, installed_versions
 from sme_registry.training.record import FILE as RECORD
-from sme_registry.training.record import RunRecord, installed_versions
 
 if TYPE_CHECKING:
     from sme_registry.training.callback import RunCallback
@@ -91,12 +96,12 @@ class TrainingResult:
 def train(
     spec: SMESpec | dict[str, Any] | str | os.PathLike[str],
     *,
-    algorithm: str = "TD3",
+    algorithm: str | None = None,
     steps: int = 20_000,
     seed: int = 0,
     folder: str | os.PathLike[str],
     action_range: Literal["unit", "symmetric"] = "symmetric",
-    num_envs: int = 1,
+    num_envs: int | None = None,
     checkpoint_every: int | None = None,
     protocol: EvaluationProtocol | dict[str, Any] | str | os.PathLike[str] = "paper-v1",
     progress: bool = True,
@@ -106,6 +111,9 @@ def train(
 ) -> TrainingResult:
     """Train one SB3 algorithm, with SB3's default hyperparameters, on the CPU.
 
+    One exception: on a team PPO's rollout of 2,048 transitions is shared out over the agents of
+    all teams, at least 16 steps each, instead of 2,048 for each of them.
+
     A resumed run goes on from its last checkpoint: the same networks, optimisers, replay buffer
     and step count. It is not the run that would have been without the kill, to the bit: random
     streams are seeded anew, and the episodes under way (and for PPO and A2C the rollout) begin
@@ -113,13 +121,16 @@ def train(
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
-      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case.
-      steps: environment steps over all lanes, at least 1. PPO and A2C finish their last rollout.
+      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; None takes TD3, and for a team
+        PPO.
+      steps: environment steps over all environments, at least 1. A step of a team is one step of
+        all its n agents, n transitions to learn from. PPO and A2C finish their last rollout.
       seed: of the algorithm and of the environment's starts, in [0, 2**32 - num_envs].
       folder: where to write; made if missing.
       action_range: of the policy's actions, "symmetric" [−1, 1] or "unit" [0, 1].
-      num_envs: lanes stepped at once, in [1, 4096]. Off-policy algorithms still learn once for
-        each step of all lanes, so more lanes mean fewer updates.
+      num_envs: environments (of a team: teams) stepped at once, in [1, 4096]; None takes 1, and
+        for a team with PPO or A2C 8. Off-policy algorithms still learn once for each step of all
+        of them, so more mean fewer updates.
       checkpoint_every: steps between checkpoints; None takes a twentieth of `steps`, at least
         1,000.
       protocol: of the evaluation at the end.
@@ -140,6 +151,9 @@ def train(
       MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
     """
     resolved = resolve(spec)
+    algorithm = known_algorithm(default_algorithm(resolved) if algorithm is None else algorithm)
+    if num_envs is None:
+        num_envs = default_num_envs(resolved, algorithm)
     _in_range("steps", steps, 1, MAX_STEPS)
     _in_range("num_envs", num_envs, 1, 4096)
     _in_range("seed", seed, 0, 2**32 - num_envs)
@@ -149,14 +163,17 @@ def train(
     if action_range not in ("unit", "symmetric"):
         raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
     judged_by = resolve_protocol(protocol)
+    n_steps = rollout_steps(resolved, algorithm, num_envs)
     asked = RunRecord(
         status="running",
+        hyperparameters=DEFAULTS if n_steps is None else f"{DEFAULTS}, but n_steps={n_steps}",
         spec=resolved,
         spec_digest=resolved.digest,
-        algorithm=known_algorithm(algorithm),
+        algorithm=algorithm,
         seed=seed,
         action_range=action_range,
         num_envs=num_envs,
+        agents=1 if resolved.team is None else len(resolved.team.agents),
         steps=steps,
         checkpoint_every=checkpoint_every,
         protocol=judged_by,
@@ -229,20 +246,26 @@ def _learn(
     """Train, from the start or the checkpoint; write the model, and the record of it."""
     from stable_baselines3.common.vec_env import VecMonitor
 
-    from sme_registry.sb3 import SMEVecEnv
+    from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
     from sme_registry.training.callback import RunCallback
 
     algorithm = load_algorithm(record.algorithm)
-    env = VecMonitor(
-        SMEVecEnv(record.spec, record.num_envs, action_range=record.action_range)  # type: ignore[arg-type, unused-ignore]
-    )
+    team = record.spec.team
+    names = () if team is None else tuple(agent.name for agent in team.agents)
+    kind = SMEVecEnv if team is None else SMETeamVecEnv
+    env = VecMonitor(kind(record.spec, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
     has_tensorboard = importlib.util.find_spec("tensorboard") is not None
     settings: dict[str, Any] = {
         "tensorboard_log": str(folder / TENSORBOARD) if has_tensorboard else None
     }
     if _is_off_policy(algorithm):
         # Never smaller than what is stored, so nothing that SB3's default would do changes.
-        settings["buffer_size"] = min(_MAX_REPLAY, record.steps + record.num_envs)
+        transitions = (record.steps + record.num_envs) * record.agents
+        settings["buffer_size"] = min(_MAX_REPLAY, transitions)
+
+    n_steps = rollout_steps(record.spec, record.algorithm, record.num_envs)
+    if n_steps is not None:
+        settings["n_steps"] = n_steps
 
     path = folder / checkpoint.FILE
     if record.sessions > 1 and path.exists():
@@ -252,9 +275,9 @@ def _learn(
         model.set_random_seed(int(sequence.generate_state(1)[0] >> 1))
     else:
         model = algorithm("MlpPolicy", env, seed=record.seed, device="cpu", **settings)
-    begun_at = int(model.num_timesteps)
+    begun_at = int(model.num_timesteps) // record.agents  # SB3 counts each agent's steps
 
-    log = EpisodeLog(folder / episode_files.FILE, begun_at)
+    log = EpisodeLog(folder / episode_files.FILE, begun_at, names)
     wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
 
     def save_checkpoint(steps_done: int) -> None:
@@ -269,20 +292,23 @@ def _learn(
     with Meter(
         f"training {record.algorithm}", total, done=begun_at, console=console, shown=progress
     ) as meter:
-        callback = RunCallback(log, meter, save_checkpoint, record.checkpoint_every, wall_before)
+        callback = RunCallback(
+            log, meter, save_checkpoint, record.checkpoint_every, wall_before, names
+        )
         try:
             if begun_at < record.steps:
                 model.learn(
-                    record.steps - begun_at,
+                    (record.steps - begun_at) * record.agents,
                     callback=callback,
                     reset_num_timesteps=begun_at == 0,
                     tb_log_name="run",
                 )
-                save_checkpoint(int(model.num_timesteps))
+                save_checkpoint(callback.steps_done)
         finally:
             log.close()
             env.close()
-    record = record.updated(**_so_far(int(model.num_timesteps), log, callback))
+    steps_done = int(model.num_timesteps) // record.agents
+    record = record.updated(**_so_far(steps_done, log, callback))
     saved = io.BytesIO()
     with checkpoint.uninterrupted():
         model.save(saved)
@@ -336,7 +362,7 @@ def _draw(report: EvaluationReport, folder: Path, model: Any) -> tuple[Path, ...
         title = f"{report.policy} on {catalogue.title(report.spec)}"
         figures.append(plots.training_curve(log, folder / TRAINING_CURVE, title=title))
     figures.append(plots.decay_curve(report, folder / DECAY_CURVE))
-    if report.spec.state_dim == 2:
+    if report.spec.state_dim == 2 and report.spec.team is None:
         path = folder / SIMILARITY_MAP
         figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
     return tuple(figures)

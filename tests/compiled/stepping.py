@@ -13,7 +13,7 @@ from sme_registry.task import Task
 
 @dataclass
 class Result:
-    """What a step gave, as arrays with or without the axis of lanes."""
+    """What a step gave; of a batch the agents' numbers are `[B, n]`, of a lane they are scalars."""
 
     state: Any
     observation: Any
@@ -28,7 +28,7 @@ class Result:
 
 
 class Lane:
-    """One lane of an engine: an episode that is stepped by its single-lane entry points."""
+    """One lane of a single agent: an episode stepped by an engine's single-lane entry points."""
 
     def __init__(
         self, task: Task, engine: Engine, state: Any, t: int = 0, r_cum: float = 0.0
@@ -52,17 +52,17 @@ class Lane:
 def step_batch(
     task: Task, engine: Engine, states: Any, t: Any, r_cum: Any, actions: Any
 ) -> Result | None:
-    """One step of a batch of lanes; `states` `[B, S]`. None where it was refused."""
-    B, S, A = len(states), task.spec.state_dim, task.spec.action_dim
+    """One step of a batch: `states` `[B, S]`, `r_cum` `[B, n]`. None where it was refused."""
+    B, S, A, n = len(states), task.spec.state_dim, task.spec.action_dim, len(task.names)
     moved, observation, optimal = (
         np.empty((S, B)),
-        np.empty((B, S + 2), np.float32),
+        np.empty((B, S + 1 + n), np.float32),
         np.empty((B, A)),
     )
-    values, ends = np.empty((5, B)), np.empty((2, B), bool)
+    values, ends = np.empty((5, n, B)), np.empty((2, B), bool)
     if not engine.step_many(
-        engine.params, np.ascontiguousarray(states.T), t, r_cum, actions,
+        engine.params, np.ascontiguousarray(states.T), t, np.ascontiguousarray(r_cum.T), actions,
         moved, observation, optimal, values, ends,
     ):  # fmt: skip
         return None
-    return Result(moved.T, observation, optimal, *values, *ends)
+    return Result(moved.T, observation, optimal, *values.transpose(0, 2, 1), *ends)

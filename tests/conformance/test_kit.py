@@ -127,8 +127,8 @@ class CopiesLate(SMEVectorEnv):
     """A copy has lost the time of its lanes."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._t = self._t + 1
+        self.__dict__.update(state)
+        self._batch._t = self._batch._t + 1
 
 
 @pytest.mark.parametrize(

@@ -144,13 +144,6 @@ def test_back_ends_agree(monkeypatch, report):
     assert list(numbers(plain)) == pytest.approx(list(numbers(report)), abs=1e-11)
 
 
-def test_teams_are_judged_by_their_joint_action():
-    agents = [{"action_dim": 1, "observes": [0, 1]}, {"action_dim": 2}]
-    spec = SMESpec(state_dim=4, action_dim=3, team={"agents": agents})
-    for region in evaluate(optimal_of(spec), spec, PROTOCOL).regions:
-        assert region.similarity == pytest.approx(1.0, abs=1e-9)
-
-
 def test_progress_runs_from_the_first_batch_to_all_states(monkeypatch):
     monkeypatch.setattr(regions, "BATCH_ROWS", 1_000)
     seen = []

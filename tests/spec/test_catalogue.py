@@ -8,10 +8,10 @@ import json
 import re
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 
+import sme_registry
 from sme_registry.spec import (
     EnvFile,
     EvaluationProtocol,
@@ -88,11 +88,12 @@ def test_the_catalogue_has_the_tasks_that_the_design_names():
     families = {
         "Default": [""], "StateDim": [2, 4, 16, 32, 64], "ActionDim": [1, 2, 8, 16],
         "Interval": [5, 10, 25, 100], "MinReward": [25, 50, 75], "Survival": [10, 25, 50],
-        "Complexity": [2, 3, 5, 10, 20, 50], "Plane": [1, 10, 50],
+        "Complexity": [2, 3, 5, 10, 20, 50], "Plane": [1, 10, 50], "Team": [2, 4, 8],
+        "TeamShared": [2, 4, 8],
     }  # fmt: skip
     expected = {f"{family}{value}" for family, values in families.items() for value in values}
     assert expected <= {file.name for file in ENVS}
-    assert {"smoke", "paper-ablations", "core"} <= {file.name for file in SUITES}
+    assert {"smoke", "paper-ablations", "core", "teams"} <= {file.name for file in SUITES}
     assert "paper" in {file.name for file in PROTOCOLS}
 
 
@@ -146,17 +147,20 @@ def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
     assert spec._fingerprint == file.fingerprint
     task = materialize(spec)  # compares with the fingerprint
     assert task.W.shape == (spec.action_dim, spec.state_dim)
-    env = gymnasium.make(f"SME/{file.versioned_name}", disable_env_checker=True)
-    assert env.unwrapped.sme_spec == spec
-    _, info = env.reset(seed=1)
-    assert info == {}
-    s = env.unwrapped.state
+    env = sme_registry.make_parallel(file.versioned_name)
+    assert env.sme_spec == spec
+    _, infos = env.reset(seed=1)
+    assert infos == {name: {} for name in task.names}
+    s = env.state()
     a = task.optimal_action(s)
-    observation, _, terminated, _, info = env.step(a)
-    assert info["regret"] < 1e-12
-    assert not terminated
-    np.testing.assert_array_equal(env.unwrapped.state, task.transition(s, a))
-    np.testing.assert_array_equal(observation[:-2], env.unwrapped.state.astype(np.float32))
+    actions = {name: a[own] for name, own in zip(task.names, task.owned, strict=True)}
+    observations, _, terminated, _, infos = env.step(actions)
+    np.testing.assert_array_equal(env.state(), task.transition(s, a))
+    for name, channels in zip(task.names, task.observed, strict=True):
+        assert infos[name]["regret"] < 1e-12
+        assert not terminated[name]
+        seen = env.state()[list(channels)].astype(np.float32)
+        np.testing.assert_array_equal(observations[name][:-2], seen)
     env.close()
 
 
@@ -206,4 +210,6 @@ def test_names_come_in_natural_order_and_can_be_used_by_every_registry():
 
 
 def test_names_by_content_are_read_without_validation_but_are_right():
-    assert dict(catalogue.released()) == {f.versioned_name: f.spec.content_name for f in ENVS}
+    assert list(catalogue.released()) == [
+        (file.versioned_name, file.spec.content_name, file.spec.team is not None) for file in ENVS
+    ]

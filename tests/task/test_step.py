@@ -15,7 +15,8 @@ from tests.strategies import specs
 def rollout(task, B, act, seed=0):
     """Steps of `B` episodes side by side until the horizon; ends are recorded, not obeyed."""
     random = np.random.default_rng(seed)
-    s, t, r_cum = random.random((B, task.spec.state_dim)), np.zeros(B, np.int64), np.zeros(B)
+    s, t = random.random((B, task.spec.state_dim)), np.zeros(B, np.int64)
+    r_cum = np.zeros((B, len(task.names)))
     steps = []
     for _ in range(task.spec.horizon):
         steps.append(step(task, s, t, r_cum, act(s, random)))
@@ -63,7 +64,7 @@ def test_the_optimum_earns_exactly_the_horizon_in_the_environment(k, r_min, hori
 def test_what_is_earned_is_paid_or_pending_at_every_step(spec):
     task = materialize(spec)
     steps = rollout(task, 5, mixed(task))
-    earned = paid = np.zeros(5)
+    earned = paid = np.zeros((5, len(task.names)))
     for done in steps:
         earned, paid = earned + done.step_reward, paid + done.reward
         np.testing.assert_allclose(paid + done.accumulated_reward, earned, rtol=0, atol=1e-12)
@@ -79,7 +80,7 @@ def test_payouts_come_every_k_steps_and_at_the_horizon(spec):
         else:
             np.testing.assert_array_equal(done.reward, 0.0)
         assert (done.truncated == (t >= spec.horizon)).all()
-        np.testing.assert_array_equal(done.terminated, done.step_reward < spec.D)
+        np.testing.assert_array_equal(done.terminated, (done.step_reward < spec.D).any(axis=1))
 
 
 def one_step(spec, t, r_cum, off):
@@ -88,7 +89,7 @@ def one_step(spec, t, r_cum, off):
     s = np.full((1, spec.state_dim), 0.3)
     best = task.policy(s[:, None, :])[:, 0, :]
     a = np.where(best > 0.5, best - off, best + off)
-    return step(task, s, np.array([t]), np.array([r_cum]), a)
+    return step(task, s, np.array([t]), np.array([[r_cum]]), a)
 
 
 def test_termination_alone_pays_nothing_and_shows_what_is_lost():
@@ -117,7 +118,7 @@ def test_survival_is_tested_on_the_gated_step_reward_and_strictly():
     # r̂ is 0.2 where every channel is 0.2 off.
     assert not one_step(SMESpec(D=0.1), 0, 0.0, 0.2).terminated[0]
     assert one_step(SMESpec(D=0.1, r_min=0.3), 0, 0.0, 0.2).terminated[0]
-    exact = float(one_step(SMESpec(), 0, 0.0, 0.2).step_reward[0])
+    exact = float(one_step(SMESpec(), 0, 0.0, 0.2).step_reward[0, 0])
     assert not one_step(SMESpec(D=exact), 0, 0.0, 0.2).terminated[0]
     assert one_step(SMESpec(D=float(np.nextafter(exact, 1.0))), 0, 0.0, 0.2).terminated[0]
 
@@ -129,17 +130,18 @@ def test_without_a_survival_threshold_nothing_terminates():
 @given(specs())
 def test_observations_are_state_time_and_pending_reward_in_the_unit_interval(spec):
     task = materialize(spec)
+    n = len(task.names)
     for t, done in enumerate(rollout(task, 5, mixed(task)), start=1):
         seen = observe(spec, done.state, np.full(5, t), done.accumulated_reward)
         assert seen.dtype == np.float32
-        assert seen.shape == (5, spec.state_dim + 2)
+        assert seen.shape == (5, spec.state_dim + 1 + n)
         assert ((seen >= 0.0) & (seen <= 1.0)).all()
-        np.testing.assert_array_equal(seen[:, :-2], done.state.astype(np.float32))
-        np.testing.assert_array_equal(seen[:, -2], np.float32(t / spec.horizon))
+        np.testing.assert_array_equal(seen[:, : -1 - n], done.state.astype(np.float32))
+        np.testing.assert_array_equal(seen[:, -1 - n], np.float32(t / spec.horizon))
         np.testing.assert_array_equal(
-            seen[:, -1], (done.accumulated_reward / spec.k).astype(np.float32)
+            seen[:, -n:], (done.accumulated_reward / spec.k).astype(np.float32)
         )
-    assert seen[0, -2] == 1.0
+    assert seen[0, -1 - n] == 1.0
 
 
 @given(specs(), st.integers(1, 9))
@@ -147,7 +149,7 @@ def test_a_batch_is_its_single_lanes_bit_for_bit(spec, B):
     task = materialize(spec)
     random = np.random.default_rng(B)
     s, a = random.random((B, spec.state_dim)), random.random((B, spec.action_dim))
-    t, r_cum = random.integers(0, spec.horizon, B), random.random(B)
+    t, r_cum = random.integers(0, spec.horizon, B), random.random((B, len(task.names)))
     whole = step(task, s, t, r_cum, a)
     for i in range(B):
         lane = slice(i, i + 1)
@@ -161,7 +163,7 @@ def test_the_environment_follows_the_definition():
     task, env = materialize(spec), gymnasium.make(sme_registry.env_spec(spec))
     random = np.random.default_rng(3)
     env.reset(seed=5)
-    s, r_cum = env.unwrapped.state[None], np.zeros(1)
+    s, r_cum = env.unwrapped.state[None], np.zeros((1, 1))
     for t in range(20):
         a = np.clip(mixed(task)(s, random), 0.0, 1.0).astype(np.float32)
         done = step(task, s, np.array([t]), r_cum, a.astype(np.float64))
@@ -169,7 +171,7 @@ def test_the_environment_follows_the_definition():
         np.testing.assert_array_equal(env.unwrapped.state, done.state[0])
         np.testing.assert_array_equal(seen[:5], done.state[0].astype(np.float32))
         np.testing.assert_allclose(info["optimal_action"], done.optimal_action[0], atol=1e-12)
-        assert reward == pytest.approx(done.reward[0], abs=1e-12)
-        assert info["accumulated_reward"] == pytest.approx(done.accumulated_reward[0], abs=1e-12)
+        assert reward == pytest.approx(done.reward[0, 0], abs=1e-12)
+        assert info["accumulated_reward"] == pytest.approx(done.accumulated_reward[0, 0], abs=1e-12)
         assert (terminated, truncated) == (bool(done.terminated[0]), bool(done.truncated[0]))
         s, r_cum = done.state, done.accumulated_reward

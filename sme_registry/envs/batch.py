@@ -1,0 +1,130 @@
+"""`Batch`: episodes side by side, of a single agent or a team; what all batched environments share.
+
+It holds the numbers of `B` lanes (state, steps done, each agent's r_cum) and steps them by the
+engine. What a lane is shown, and what happens at its end, is the business of its environment.
+A team of n agents is stepped as one: its joint observation is s, t/T and every agent's r_cum/k.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.compiled import engine
+from sme_registry.envs.actions import not_finite
+from sme_registry.envs.initial_states import InitialStates
+from sme_registry.task import Task, observe
+from sme_registry.task.memory import refuse_above_limit
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Lanes = npt.NDArray[np.int64]
+Observation = npt.NDArray[np.float32]
+
+
+class Advanced(NamedTuple):
+    """What one step of all lanes gives; every array is fresh.
+
+    Attributes:
+      observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
+      optimal: `[B, A]` π* of the states acted in, in the unit range.
+      values: `[5, n, B]` similarity, step reward, regret, reward, and r_cum after a payout.
+      terminated: `[B]`.
+      truncated: `[B]`.
+    """
+
+    observation: Observation
+    optimal: Array
+    values: Array
+    terminated: Mask
+    truncated: Mask
+
+
+class Batch:
+    """`lanes` episodes of one task, side by side.
+
+    Args:
+      task: the task.
+      lanes: B, at least 1.
+
+    Raises:
+      ResourceLimitError: a batch this large would not fit in memory.
+    """
+
+    def __init__(self, task: Task, lanes: int) -> None:
+        self._dimensions = S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
+        refuse_above_limit(
+            lanes * 8 * (4 * S + 4 * A + 16 * n + 48),
+            f"num_envs={lanes}: a batch this large",
+            "Use fewer lanes.",
+        )
+        self.task, self.lanes = task, lanes
+        self.initial_states = InitialStates(lanes, S)
+        # Channel by channel, [S, B] and [n, B], as the compiled step reads them.
+        self._s = np.zeros((S, lanes))
+        self._t = np.zeros(lanes, np.int64)
+        self._accumulated = np.zeros((n, lanes))
+        self._load_engine()
+
+    def _load_engine(self) -> None:
+        made = engine(self.task)
+        self._params, self._step_many = made.params, made.step_many
+
+    # Machine code cannot be pickled or copied: it is looked up again where the copy lives.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = ("_params", "_step_many")
+        return {name: value for name, value in self.__dict__.items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._load_engine()
+
+    @property
+    def state(self) -> Array:
+        """The states, `[B, S]` float64 in [0, 1] (a copy)."""
+        return self._s.T.copy()  # also where the transpose is contiguous as it stands
+
+    def observe(self) -> Observation:
+        """The joint observations of all lanes as they stand, `[B, S + 1 + n]`."""
+        return observe(self.task.spec, self.state, self._t, self._accumulated.T)
+
+    def begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
+        """Put lanes at the start of an episode, and write what is observed there.
+
+        Args:
+          lanes: which.
+          observation: `[B, S + 1 + n]`, written in the rows of these lanes.
+          states: `[len(lanes), S]` where to begin; None draws from each lane's generator.
+        """
+        S = self.task.spec.state_dim
+        if states is None:
+            states = self.initial_states.draw(lanes)
+        self._s[:, lanes] = states.T
+        self._t[lanes] = 0
+        self._accumulated[:, lanes] = 0.0
+        observation[lanes, :S] = states
+        observation[lanes, S:] = 0.0
+
+    def advance(self, actions: Array) -> Advanced:
+        """One step of every lane.
+
+        Args:
+          actions: `[B, A]` float64 of the unit range; clipped.
+
+        Raises:
+          ActionError: not finite; nothing has moved then.
+        """
+        B, (S, A, n) = self.lanes, self._dimensions
+        moved, observation = np.empty((S, B)), np.empty((B, S + 1 + n), np.float32)
+        optimal, values, ends = np.empty((B, A)), np.empty((5, n, B)), np.empty((2, B), bool)
+        if not self._step_many(
+            self._params, self._s, self._t, self._accumulated, actions,
+            moved, observation, optimal, values, ends,
+        ):  # fmt: skip
+            raise not_finite()
+        self._s = moved
+        self._t += 1
+        self._accumulated = values[4].copy()
+        return Advanced(observation, optimal, values, ends[0], ends[1])

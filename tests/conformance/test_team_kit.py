@@ -1,0 +1,147 @@
+"""The conformance kit of teams sees faults: each check turns red at a team that earns it."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, testing
+from sme_registry.envs.team import SMETeamEnv
+from sme_registry.testing import ConformanceError
+
+TASK = SMESpec(
+    horizon=12,
+    k=5,
+    team={"agents": [{"action_dim": 1, "observes": [0, 1, 2]}, {"action_dim": 3}]},
+)
+
+
+class RandomFromStepTwo(SMETeamEnv):
+    """Is as it should be for one step, and random from the second on."""
+
+    def step(self, actions: Any) -> Any:
+        returned = super().step(actions)
+        if self._batch._t[0] >= 2:
+            self._batch._s[:] = np.random.default_rng().random(self._batch._s.shape)
+        return returned
+
+
+class PaysTheOther(SMETeamEnv):
+    """Pays each agent what the other has earned."""
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, *rest = super().step(actions)
+        return observations, dict(zip(rewards, reversed(rewards.values()), strict=True)), *rest
+
+
+class SeesTooMuch(SMETeamEnv):
+    """Shows the first agent a channel that is not its own."""
+
+    def step(self, actions: Any) -> Any:
+        observations, *rest = super().step(actions)
+        first = self.possible_agents[0]
+        observations[first][2] = np.float32(self.state()[7])
+        return observations, *rest
+
+
+class EndsOneByOne(SMETeamEnv):
+    """Tells only the first agent that time is up."""
+
+    def step(self, actions: Any) -> Any:
+        *rest, truncated, infos = super().step(actions)
+        return *rest, {**truncated, self.possible_agents[1]: False}, infos
+
+
+class NeedsToSeeMore(SMETeamEnv):
+    """Wants of the first agent what it can only know from another's channels."""
+
+    def step(self, actions: Any) -> Any:
+        first = self.possible_agents[0]
+        moved = np.asarray(actions[first]) * (0.9 + 0.1 * self.state()[7])
+        return super().step({**actions, first: moved})
+
+
+class Unseeded(SMETeamEnv):
+    """Ignores its seed."""
+
+    def reset(self, seed: Any = None, options: Any = None) -> Any:
+        return super().reset(None, options)
+
+
+class Forgets(SMETeamEnv):
+    """A pickled copy has lost what was accumulated."""
+
+    def __getstate__(self) -> Any:
+        return {**self.__dict__, "_forgets": True}
+
+    def __setstate__(self, state: Any) -> None:
+        self.__dict__.update(state)
+        self._batch._accumulated = np.zeros_like(self._batch._accumulated)
+
+
+class Shares(SMETeamEnv):
+    """Its deep copies share their state with it."""
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        return self
+
+
+class NewSpaces(SMETeamEnv):
+    """Makes a new space each time, so that seeding one has no effect."""
+
+    def action_space(self, agent: str) -> Any:
+        space = super().action_space(agent)
+        return type(space)(space.low, space.high, dtype=space.dtype)
+
+
+class RewardsInTurn(SMETeamEnv):
+    """In turns, a second environment would be seen: each is paid by the number of its instance."""
+
+    made = 0
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        RewardsInTurn.made += 1
+        self.number = RewardsInTurn.made
+
+    def step(self, actions: Any) -> Any:
+        observations, rewards, *rest = super().step(actions)
+        return observations, {name: r + self.number for name, r in rewards.items()}, *rest
+
+
+@pytest.mark.parametrize(
+    ("check", "faulty", "words"),
+    [
+        (testing.check_team_determinism, RandomFromStepTwo, "two runs of one seed"),
+        (testing.check_team_determinism, Unseeded, "two runs of one seed"),
+        (testing.check_team_definition, RandomFromStepTwo, "the next state"),
+        (testing.check_team_definition, PaysTheOther, "agent_0: reward"),
+        (testing.check_team_definition, SeesTooMuch, "agent_0: the observation"),
+        (testing.check_team_definition, EndsOneByOne, "agent_1: truncated"),
+        (testing.check_team_optimum, NeedsToSeeMore, "agent_0: the optimum's regret"),
+        (testing.check_team_pickling, Forgets, "a pickled copy"),
+        (testing.check_team_pickling, Shares, "once a copy is stepped"),
+        (testing.check_pettingzoo, NewSpaces, "PettingZoo's .*api_test"),
+        (testing.check_turns, RewardsInTurn, "in turns"),
+    ],
+)
+def test_a_faulty_team_is_seen(check: Any, faulty: type[SMETeamEnv], words: str) -> None:
+    check(TASK)
+    with pytest.raises(ConformanceError, match=words):
+        check(TASK, parallel=faulty)
+
+
+def test_pettingzoos_parallel_seed_test_passes_a_team_that_is_random_from_step_two_on() -> None:
+    # Why there is a check of whole episodes beside it.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from pettingzoo.test import parallel_seed_test
+    parallel_seed_test(lambda: RandomFromStepTwo(TASK))
+
+
+def test_the_whole_kit_stops_at_the_first_fault() -> None:
+    with pytest.raises(ConformanceError, match="agent_0: reward"):
+        testing.check_team(TASK, parallel=PaysTheOther)

@@ -1,0 +1,147 @@
+"""A batch of teams is the loop of its single teams, bit for bit, over whole episodes."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.team import SMETeamEnv, observed_columns
+from sme_registry.errors import ActionError, ResourceLimitError
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
+
+UNEQUAL = {
+    "agents": [
+        {"name": "scout_0", "action_dim": 1, "observes": [0, 2]},
+        {"name": "driver_0", "action_dim": 2},
+        {"name": "scout_1", "action_dim": 1, "observes": [1]},
+    ]
+}
+SPECS = {
+    "individual": SMESpec(k=3, complexity=2, horizon=25, team=UNEQUAL),
+    "shared": SMESpec(k=7, r_min=0.1, horizon=25, team={**UNEQUAL, "reward": "team"}),
+    "fragile": SMESpec(D=0.2, k=4, horizon=25, team={**UNEQUAL, "reward": "team"}),
+    "one": SMESpec(k=3, horizon=25),
+}
+
+
+def mixed(task: Any, s: Any, rng: Any) -> Any:
+    """Actions between the optimum and noise, some a little outside the range."""
+    share = rng.uniform(0.0, 0.6, (len(s), 1))
+    best = task.optimal_action(s)
+    return (1.0 - share) * best + share * rng.uniform(-0.1, 1.1, best.shape)
+
+
+@pytest.fixture(params=["numba", "numpy"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", request.param)
+    return str(request.param)
+
+
+@pytest.mark.parametrize("lanes", [1, 7, 65, 131])
+@pytest.mark.parametrize("name", SPECS)
+def test_a_batch_is_the_loop_of_its_teams_over_whole_episodes(
+    name: str, lanes: int, backend: str
+) -> None:
+    task, rng = materialize(SPECS[name]), np.random.default_rng(lanes)
+    batch, teams = Batch(task, lanes), [SMETeamEnv(SPECS[name]) for _ in range(min(lanes, 20))]
+    # Of large batches some lanes are looked at: the first, the last, and those about a block's end.
+    watched = dict(zip([*range(lanes)][-10:] + [*range(lanes)][:10], teams, strict=False))
+    observation = batch.observe()
+    for lane in range(lanes):
+        batch.initial_states.seed(lane, 100 + lane)
+    batch.begin(np.arange(lanes), observation)
+    columns = observed_columns(task)
+    for lane, team in watched.items():
+        shown, _ = team.reset(seed=100 + lane)
+        for agent, seen in zip(task.names, columns, strict=True):
+            np.testing.assert_array_equal(observation[lane, seen], shown[agent])
+    episodes = 0
+    for _ in range(60):
+        actions = mixed(task, batch.state, rng)
+        done = batch.advance(actions)
+        ended = done.terminated | done.truncated
+        for lane, team in watched.items():
+            joint = {a: actions[lane, o] for a, o in zip(task.names, task.owned, strict=True)}
+            shown, rewards, terminated, truncated, infos = team.step(joint)
+            np.testing.assert_array_equal(team.state(), batch.state[lane])
+            for agent, (who, own) in enumerate(zip(task.names, task.owned, strict=True)):
+                np.testing.assert_array_equal(done.observation[lane, columns[agent]], shown[who])
+                info = infos[who]
+                np.testing.assert_array_equal(done.optimal[lane, own], info["optimal_action"])
+                expected = [
+                    info["similarity"], info["step_reward"], info["regret"], rewards[who],
+                    info["accumulated_reward"],
+                ]  # fmt: skip
+                assert done.values[:, agent, lane].tolist() == expected
+                assert terminated[who] == done.terminated[lane]
+                assert truncated[who] == done.truncated[lane]
+            if ended[lane]:
+                team.reset()
+                episodes += 1
+        if ended.any():
+            batch.begin(np.flatnonzero(ended), done.observation)
+    assert episodes >= 2 * len(watched)
+
+
+def test_a_refused_step_moves_nothing(backend: str) -> None:
+    task = materialize(SPECS["individual"])
+    batch = Batch(task, 70)
+    batch.begin(np.arange(70), batch.observe())
+    good = np.full((70, 4), 0.4)
+    batch.advance(good)
+    before = batch.observe()
+    for bad in (np.nan, np.inf, -np.inf):
+        actions = good.copy()
+        actions[68, 1] = bad
+        with pytest.raises(ActionError, match="NaN or infinite"):
+            batch.advance(actions)
+        np.testing.assert_array_equal(batch.observe(), before)
+    twin = Batch(task, 70)
+    twin.__setstate__(copy.deepcopy(batch.__getstate__()))
+    np.testing.assert_array_equal(batch.advance(good).observation, twin.advance(good).observation)
+
+
+def test_copies_go_on_as_the_original_does() -> None:
+    task = materialize(SPECS["individual"])
+    batch = Batch(task, 5)
+    batch.begin(np.arange(5), batch.observe())
+    batch.advance(np.full((5, 4), 0.4))
+    copies = pickle.loads(pickle.dumps(batch)), copy.deepcopy(batch)
+    actions = np.full((5, 4), 0.6)
+    expected = batch.advance(actions)
+    for twin in copies:
+        got = twin.advance(actions)
+        for one, other in zip(got, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_what_a_step_gives_is_not_written_into_by_the_next() -> None:
+    batch = Batch(materialize(SPECS["individual"]), 3)
+    batch.begin(np.arange(3), batch.observe())
+    first = batch.advance(np.full((3, 4), 0.4))
+    kept = copy.deepcopy(first)
+    batch.advance(np.full((3, 4), 0.7))
+    for one, other in zip(first, kept, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("lanes", "state_dim"), [(1, 8), (5, 1), (1, 1), (5, 8)])
+def test_the_state_that_is_handed_out_is_a_copy(lanes: int, state_dim: int) -> None:
+    batch = Batch(materialize(SMESpec(state_dim=state_dim)), lanes)
+    batch.begin(np.arange(lanes), batch.observe())
+    before = batch.state
+    batch.state[:] = -7.0
+    np.testing.assert_array_equal(batch.state, before)
+
+
+def test_a_batch_too_large_for_memory_is_refused() -> None:
+    with pytest.raises(ResourceLimitError, match="num_envs=1000000000"):
+        Batch(materialize(SPECS["individual"]), 10**9)

@@ -1,0 +1,386 @@
+"""`SMETeamEnv`: a team of one is `SMEEnv`; what is refused, by whose name; pictures; beginnings."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.envs.team import SMETeamEnv
+from sme_registry.errors import (
+    ActionError,
+    EpisodeError,
+    OptionError,
+    SpecError,
+    StateError,
+    UnknownNameError,
+)
+from sme_registry.spec import SMESpec
+
+START = np.linspace(0.1, 0.9, 8)
+
+
+def begun(spec: Any = "Team4", **kwargs: Any) -> SMETeamEnv:
+    env = sme_registry.make_parallel(spec, **kwargs)
+    env.reset(seed=0, options={"state": START})
+    return env
+
+
+def middle(env: SMETeamEnv) -> dict[str, Any]:
+    return {name: np.full(env.action_space(name).shape, 0.5) for name in env.possible_agents}
+
+
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize(
+    "fields",
+    [{}, {"k": 7, "r_min": 0.3}, {"k": 3, "D": 0.3, "complexity": 3}, {"k": 200}],
+    ids=["default", "gated", "fragile", "late"],
+)
+def test_a_team_of_one_is_the_single_environment_number_for_number(
+    fields: dict[str, Any], action_range: Any, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if backend == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", backend)
+    spec = SMESpec(**fields)
+    lone = spec.derive(team={"agents": [{"name": "lone_0", "action_dim": 4}]})
+    single = SMEEnv(spec, action_range=action_range)
+    teams = [SMETeamEnv(task, action_range=action_range) for task in (lone, spec)]
+    rng = np.random.default_rng(1)
+    for seed in (3, None, None):
+        observation, _ = single.reset(seed=seed)
+        for team in teams:
+            (shown,) = team.reset(seed=seed)[0].values()
+            np.testing.assert_array_equal(shown, observation)
+        ended = False
+        while not ended:
+            best = single.task.optimal_action(single.state)
+            action = best + rng.uniform(0.0, 0.6) * (rng.random(4) - best)
+            action = (2.0 * action - 1.0 if action_range == "symmetric" else action).astype("f4")
+            observation, reward, terminated, truncated, info = single.step(action)
+            ended = terminated or truncated
+            for team in teams:
+                (name,) = team.agents
+                shown, *rest = team.step({name: action})
+                np.testing.assert_array_equal(shown[name], observation)
+                np.testing.assert_array_equal(team.state(), single.state)
+                got = [part[name] for part in rest]
+                assert got[:3] == [reward, terminated, truncated]
+                assert got[3].keys() == info.keys()
+                for key in info:
+                    np.testing.assert_array_equal(got[3][key], info[key])
+
+
+def test_spaces_are_each_agents_own_and_the_same_object_each_time() -> None:
+    env = sme_registry.make_parallel("DuoDeep", action_range="symmetric")
+    assert env.possible_agents == ["scout_0", "driver_0"]
+    assert [env.action_space(name).shape for name in env.possible_agents] == [(1,), (3,)]
+    assert [env.observation_space(name).shape for name in env.possible_agents] == [(5,), (7,)]
+    for name in env.possible_agents:
+        assert env.action_space(name) is env.action_space(name)
+        assert env.observation_space(name) is env.observation_space(name)
+        assert env.action_space(name).low.tolist() == [-1.0] * env.action_space(name).shape[0]
+    assert env.state_space.shape == (8,)
+
+
+def test_symmetric_actions_are_the_unit_ones_rescaled() -> None:
+    unit, symmetric = begun("DuoDeep"), begun("DuoDeep", action_range="symmetric")
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        joint = {n: rng.integers(0, 257, unit.action_space(n).shape) / 256 for n in unit.agents}
+        ours = unit.step(joint)
+        theirs = symmetric.step({name: 2.0 * a - 1.0 for name, a in joint.items()})
+        np.testing.assert_array_equal(unit.state(), symmetric.state())
+        assert ours[1:4] == theirs[1:4]
+        for name, info in ours[4].items():
+            rescaled = 2.0 * info["optimal_action"] - 1.0
+            np.testing.assert_array_equal(theirs[4][name]["optimal_action"], rescaled)
+
+
+def test_actions_beyond_the_range_are_clipped() -> None:
+    one, other = begun(), begun()
+    far = {name: np.array([-3.0, 7.0]) for name in one.agents}
+    edge = {name: np.array([0.0, 1.0]) for name in one.agents}
+    assert one.step(far)[1] == other.step(edge)[1]
+    np.testing.assert_array_equal(one.state(), other.state())
+
+
+def test_an_agent_that_acts_on_its_float32_observation_loses_next_to_nothing() -> None:
+    from scipy.special import ndtr
+
+    env = begun("TeamBlind4")
+    observations, _ = env.reset(seed=1)
+    returns = dict.fromkeys(env.agents, 0.0)
+    while env.agents:
+        actions = {}
+        for name, layers in zip(env.possible_agents, env.task.policies, strict=True):
+            x = observations[name][:-2].astype(np.float64)
+            for W, b in layers:
+                x = ndtr(W @ x + b)
+            actions[name] = x
+        observations, rewards, *_ = env.step(actions)
+        returns = {name: returns[name] + rewards[name] for name in returns}
+    assert min(returns.values()) > 100 - 1e-3
+
+
+def test_state_is_a_copy_of_all_of_s_whatever_is_observed() -> None:
+    env = begun("TeamBlind4")
+    np.testing.assert_array_equal(env.state(), START)
+    env.state()[:] = 0.5
+    np.testing.assert_array_equal(env.state(), START)
+    assert env.state_space.contains(env.state())
+
+
+def test_the_end_of_one_is_the_end_of_all_and_both_flags_are_told_to_everyone() -> None:
+    env = begun("Team4", D=0.5, horizon=1)
+    actions = dict(zip(env.agents, np.split(env.task.optimal_action(START), 4), strict=True))
+    actions["agent_2"] = np.abs(actions["agent_2"] - 0.3)
+    _, rewards, terminated, truncated, infos = env.step(actions)
+    assert terminated == dict.fromkeys(env.possible_agents, True) == truncated
+    assert [rewards[name] for name in env.possible_agents] == pytest.approx([1, 1, 0, 1])
+    assert infos["agent_2"]["regret"] == 1.0
+    assert infos["agent_0"]["regret"] < 1e-12
+    assert env.agents == []
+
+
+def test_similarity_is_ones_own_even_where_the_team_is_paid_as_one() -> None:
+    env = begun("TeamShared2")
+    best = env.task.optimal_action(START)
+    off = best[:2] + np.where(best[:2] > 0.5, -0.2, 0.2)
+    _, rewards, _, _, infos = env.step({"agent_0": off, "agent_1": best[2:]})
+    assert infos["agent_0"]["similarity"] == pytest.approx(0.8)
+    assert infos["agent_1"]["similarity"] == pytest.approx(1.0, abs=1e-12)
+    assert rewards["agent_0"] == rewards["agent_1"] == pytest.approx(0.6)
+    assert infos["agent_0"]["regret"] == infos["agent_1"]["regret"] == pytest.approx(0.4)
+
+
+BAD_ACTIONS = [
+    ({"agent_1": None}, "agent_1: action=None: must be numbers"),
+    ({"agent_1": "up"}, "agent_1: action='up': must be numbers"),
+    ({"agent_1": [[0.1], 0.2]}, r"agent_1: action=.*: must be an array of shape \(2,\)"),
+    ({"agent_1": np.zeros(3)}, r"agent_1: action of shape \(3,\): must be of shape \(2,\)"),
+    ({"agent_1": np.zeros((1, 2))}, r"agent_1: action of shape \(1, 2\)"),
+    ({"agent_1": 0.5}, r"agent_1: action of shape \(\)"),
+    ({"agent_3": np.array([0.1, np.nan])}, "agent_3: action: has NaN or infinite"),
+    ({"agent_0": np.array([np.inf, 0.1])}, "agent_0: action: has NaN or infinite"),
+    ({"agent_2": np.array([0.1j, 0.1])}, "agent_2: action=.*dtype complex128"),
+    ({"agnt_2": np.zeros(2)}, r"'agnt_2': no such agent\. Did you mean 'agent_"),
+    ({7: np.zeros(2)}, "7: no such agent"),
+]
+
+
+@pytest.mark.parametrize(("bad", "words"), BAD_ACTIONS, ids=lambda value: str(value)[:30])
+def test_a_bad_action_is_refused_by_its_agents_name_and_nothing_moves(
+    bad: dict[Any, Any], words: str
+) -> None:
+    env, twin = begun(k=3), begun(k=3)
+    good = middle(env)
+    env.step(good)
+    twin.step(good)
+    with pytest.raises(ActionError, match=words):
+        env.step({**good, **bad})
+    for _ in range(5):
+        ours, theirs = env.step(good), twin.step(good)
+        assert ours[1:4] == theirs[1:4]
+        for name in env.possible_agents:
+            np.testing.assert_array_equal(ours[0][name], theirs[0][name])
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        ({}, "actions: agent_0, agent_1, agent_2, agent_3: action missing"),
+        (None, "actions=None: must be a dict from each agent's name to its action"),
+        ([np.zeros(2)] * 4, "must be a dict"),
+        ("agent_0", "actions='agent_0': must be a dict"),
+        (np.zeros(8), "must be a dict"),
+    ],
+    ids=["empty", "None", "list", "text", "array"],
+)
+def test_actions_that_are_no_dict_of_all_agents_are_refused(actions: Any, words: str) -> None:
+    with pytest.raises(ActionError, match=words):
+        begun().step(actions)
+
+
+def test_a_missing_agent_is_named_and_a_mistyped_one_is_recognised() -> None:
+    env = begun()
+    actions = middle(env)
+    actions["agent_22"] = actions.pop("agent_2")
+    with pytest.raises(ActionError, match=r"agent_2: action missing.*'agent_22'.*mean 'agent_2'"):
+        env.step(actions)
+
+
+def test_stepping_before_the_first_reset_and_after_the_end_is_refused() -> None:
+    env = sme_registry.make_parallel("Team2", horizon=1)
+    with pytest.raises(EpisodeError, match=r"has not begun. Call reset\(\) first"):
+        env.step(middle(env))
+    env.reset(seed=0)
+    env.step(middle(env))
+    for actions in (middle(env), {}):
+        with pytest.raises(EpisodeError, match=r"has ended. Call reset\(\) first"):
+            env.step(actions)
+    env.reset()
+    env.step(middle(env))
+
+
+def test_in_turns_a_bad_action_is_refused_in_its_own_turn_and_can_be_mended() -> None:
+    env = sme_registry.make_aec("Team2", horizon=2)
+    with pytest.raises(EpisodeError, match="has not begun"):
+        env.step(np.zeros(2))
+    env.reset(seed=0)
+    for bad in (np.array([np.nan, 0.0]), np.zeros(3), None, "up"):
+        with pytest.raises(ActionError, match="agent_0: action"):
+            env.step(bad)
+        assert env.agent_selection == "agent_0"
+    for _ in range(4):
+        env.step(np.zeros(2))
+    assert env.truncations == {"agent_0": True, "agent_1": True}
+    with pytest.raises(EpisodeError, match=r"agent_0: the episode has ended\. Give None"):
+        env.step(np.zeros(2))
+    env.step(None)
+    env.step(None)
+    for action in (None, np.zeros(2)):
+        with pytest.raises(EpisodeError, match="has ended"):
+            env.step(action)
+
+
+def test_a_mistyped_agent_is_recognised_by_the_spaces() -> None:
+    env = sme_registry.make_parallel("DuoDeep")
+    for ask in (env.action_space, env.observation_space):
+        with pytest.raises(OptionError, match=r"agent='scot_0': no such agent\. .*'scout_0'"):
+            ask("scot_0")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"seed": -1}, OptionError, "seed=-1: must be an integer of at least 0"),
+        ({"seed": 1.5}, OptionError, "seed=1.5"),
+        ({"options": {"sate": START}}, OptionError, "Did you mean 'state'"),
+        ({"options": {"state": START[:3]}}, StateError, r"state of shape \(3,\)"),
+        ({"options": {"state": START + 1.0}}, StateError, r"outside \[0, 1\]"),
+        ({"options": {"state": START * np.nan}}, StateError, r"outside \[0, 1\]"),
+        ({"options": {"state": "here"}}, StateError, "must be an array"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_a_bad_reset_is_refused_and_the_episode_goes_on(
+    arguments: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    env = begun()
+    env.step(middle(env))
+    before = env.state()
+    with pytest.raises(error, match=words):
+        env.reset(**arguments)
+    np.testing.assert_array_equal(env.state(), before)
+    assert env.agents == env.possible_agents
+    assert env.step(middle(env))[0]["agent_0"][-2] == np.float32(2 / 100)
+
+
+def test_reset_begins_where_it_is_told_and_ignores_options_that_are_not_for_it() -> None:
+    env = sme_registry.make_parallel("TeamBlind4")
+    observations, _ = env.reset(seed=1, options={"state": START, "render": 5})
+    for name, channels in zip(env.possible_agents, env.task.observed, strict=True):
+        expected = np.array([*START[list(channels)], 0.0, 0.0], np.float32)
+        np.testing.assert_array_equal(observations[name], expected)
+
+
+def test_a_reset_in_the_middle_begins_anew_with_empty_accounts() -> None:
+    env = begun(k=50)
+    best = np.split(env.task.optimal_action(START), 4)
+    env.step(dict(zip(env.agents, best, strict=True)))
+    observations, _ = env.reset()
+    assert all(seen[-2:].tolist() == [0.0, 0.0] for seen in observations.values())
+    infos = env.step(middle(env))[4]
+    assert all(info["accumulated_reward"] == info["step_reward"] for info in infos.values())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"spec": "Tem4"}, UnknownNameError, "Did you mean 'Team4-v1'"),
+        ({"spec": "Team4", "render_mode": "ansi"}, OptionError, "render_mode='ansi'"),
+        ({"spec": "Team4", "action_range": "half"}, OptionError, "action_range='half'"),
+        ({"spec": "Team4", "horizn": 3}, SpecError, "Did you mean 'horizon'"),
+        ({"spec": "Team4", "action_dim": 9}, SpecError, "add up to 8: must be action_dim=9"),
+        ({"spec": "TeamBlind4", "state_dim": 5}, SpecError, r"agent_1.observes=\[2, 3, 4, 5\]"),
+    ],
+    ids=lambda value: str(value)[-30:],
+)
+def test_making_with_a_bad_argument_is_a_typed_error(
+    arguments: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    for make in (sme_registry.make_parallel, sme_registry.make_aec):
+        kwargs = dict(arguments)
+        with pytest.raises(error, match=words):
+            make(kwargs.pop("spec"), **kwargs)
+
+
+def test_gymnasiums_environments_refuse_a_team_and_say_what_to_use() -> None:
+    for make in (
+        lambda: SMEEnv("Team4"),
+        lambda: SMEVectorEnv("Team4", 3),
+        lambda: sme_registry.make("Team4"),
+        lambda: sme_registry.make_vec("SME/Team4-v1", 3),
+    ):
+        with pytest.raises(SpecError, match=r"team: .* for 4 agents .*make_parallel"):
+            make()
+
+
+def test_overrides_give_another_task() -> None:
+    env = sme_registry.make_parallel("Team4", complexity=3, seed=8)
+    assert env.sme_spec == sme_registry.load("Team4").derive(complexity=3, seed=8)
+    shared = sme_registry.make_parallel("Team4", team=sme_registry.load("TeamShared4").team)
+    assert shared.sme_spec == sme_registry.load("TeamShared4")
+
+
+def test_what_is_handed_out_can_be_written_into() -> None:
+    env, twin = begun(), begun()
+    for _ in range(3):
+        observations, _, _, _, infos = env.step(middle(env))
+        twin.step(middle(twin))
+        for name in env.possible_agents:
+            observations[name][:] = -7.0
+            infos[name]["optimal_action"][:] = -7.0
+            infos[name].clear()
+        env.agents.clear()
+        env.agents.extend(env.possible_agents)
+    np.testing.assert_array_equal(env.state(), twin.state())
+
+
+def test_a_rendered_team_is_a_picture_of_all_its_channels() -> None:
+    pytest.importorskip("pygame")
+    env = begun("DuoDeep", render_mode="rgb_array")
+    first = env.render()
+    assert first.shape == (520, 800, 3)
+    assert first.dtype == np.uint8
+    env.step(middle(env))
+    assert not np.array_equal(env.render(), first)
+    twins = pickle.loads(pickle.dumps(env)), copy.deepcopy(env)
+    for team in (env, *twins):
+        team.step(middle(team))
+    for twin in twins:
+        np.testing.assert_array_equal(twin.render(), env.render())
+    env.close()
+
+
+def test_rendering_before_a_reset_is_refused() -> None:
+    pytest.importorskip("pygame")
+    env = sme_registry.make_parallel("Team2", render_mode="rgb_array")
+    with pytest.raises(EpisodeError, match="has not begun"):
+        env.render()
+
+
+def test_a_saved_team_is_the_same_team_at_the_other_end(tmp_path: Path) -> None:
+    spec = sme_registry.load("DuoDeep").derive(seed="0xfeed")
+    path = sme_registry.save(spec, tmp_path / "duo.json")
+    ours, theirs = begun(spec), begun(path)
+    assert repr(ours) == repr(theirs) == f"SMETeamEnv({spec.content_name}, 2 agents)"
+    assert ours.step(middle(ours))[1] == theirs.step(middle(theirs))[1]

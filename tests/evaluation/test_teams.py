@@ -1,0 +1,425 @@
+"""Teams: each agent is judged over its own channels, by what it alone observes."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
+from sme_registry.compiled import engine
+from sme_registry.envs.shared import (
+    shared_action_dim,
+    shared_observation,
+    shared_observation_dim,
+)
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import as_policy, references, regions
+from sme_registry.spec import EvaluationProtocol
+
+AGENTS = [
+    {"name": "left_0", "action_dim": 1, "observes": [0, 2]},
+    {"name": "right_0", "action_dim": 3, "observes": [1, 2, 3]},
+    {"name": "right_1", "action_dim": 2},
+]
+SPEC = SMESpec(state_dim=4, action_dim=6, complexity=3, team={"agents": AGENTS})
+TASK = materialize(SPEC)
+NAMES = ("left_0", "right_0", "right_1")
+PROTOCOL = EvaluationProtocol(states_per_region=2_000, epsilons=(0.5, 1.0))
+SMALL = EvaluationProtocol(states_per_region=200, epsilons=(1.0,))
+
+
+def half(width):
+    return lambda observations: np.full((len(observations), width), 0.5)
+
+
+def optimal(agent):
+    """An agent's optimal policy, from its own observations alone."""
+    channels, own = list(TASK.observed[agent]), TASK.owned[agent]
+
+    def act(observations):
+        s = np.full((len(observations), 4), 0.123)
+        s[:, channels] = observations[:, : len(channels)]
+        return TASK.optimal_action(s)[:, own]
+
+    return act
+
+
+def slanted(agent):
+    width = AGENTS[agent]["action_dim"]
+    return lambda observations: 0.3 + (0.3 + 0.3 * agent) * observations[:, -3:-2] * np.ones(width)
+
+
+SLANTED = {name: slanted(agent) for agent, name in enumerate(NAMES)}
+
+
+@pytest.fixture(scope="module")
+def report():
+    return evaluate(SLANTED, SPEC, PROTOCOL)
+
+
+def numbers(scope):
+    for rows in (scope.regions, *scope.references.values()):
+        for row in rows:
+            plain = row.plain()
+            yield from (plain[key] for key in plain if key not in ("name", "channels"))
+            for channel in plain["channels"]:
+                yield from channel.values()
+
+
+def all_numbers(report):
+    return [number for scope in (report, *report.agents.values()) for number in numbers(scope)]
+
+
+@pytest.mark.parametrize("complexity", [1, 3])
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+def test_every_agent_attains_its_optimum_from_what_it_observes(monkeypatch, backend, complexity):
+    if backend == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", backend)
+    spec = SPEC.derive(complexity=complexity)
+    monkeypatch.setitem(globals(), "TASK", materialize(spec))
+    found = evaluate({name: optimal(i) for i, name in enumerate(NAMES)}, spec, PROTOCOL)
+    for scope in (found, *found.agents.values()):
+        for region in scope.regions:
+            assert region.normalised_regret == pytest.approx(0.0, abs=1e-9)
+            assert region.similarity == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("policy", [{n: half(a) for n, a in zip(NAMES, (1, 3, 2), strict=True)},
+                                    half(3)], ids=["separate", "shared"])  # fmt: skip
+def test_constant_half_has_normalised_regret_of_exactly_1_for_every_agent(policy):
+    found = evaluate(policy, SPEC, PROTOCOL)
+    for scope in (found, *found.agents.values()):
+        for region in scope.regions:
+            assert region.normalised_regret == 1.0
+            assert {channel.normalised_regret for channel in region.channels} == {1.0}
+
+
+def test_an_agents_numbers_are_those_of_the_definition(report):
+    assert tuple(report.agents) == NAMES
+    for index in range(3):
+        o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
+        best = TASK.optimal_action(o[:, :4].astype(np.float64))
+        parts, clipped = [], []
+        for agent, (name, own) in enumerate(zip(NAMES, TASK.owned, strict=True)):
+            seen = o[:, [*TASK.observed[agent], 4, 5]]
+            raw = SLANTED[name](seen).astype(np.float64)
+            a = np.clip(raw, 0.0, 1.0)
+            missed = np.abs(a - best[:, own])
+            region = report.agents[name].regions[index]
+            assert region.similarity == pytest.approx(1.0 - missed.mean(), abs=1e-12)
+            spread = missed.mean(axis=1).std(ddof=1)
+            assert region.similarity_sd == pytest.approx(spread, abs=1e-12)
+            floor = np.abs(0.5 - best[:, own]).mean()
+            assert region.normalised_regret == pytest.approx(missed.mean() / floor, abs=1e-12)
+            assert region.clipped_share == np.mean(raw != a)
+            clipped.append(raw != a)
+            assert len(region.channels) == a.shape[1]
+            parts.append(a)
+        whole = TASK.similarity(o[:, :4].astype(np.float64), np.concatenate(parts, axis=1))
+        assert report.regions[index].similarity == pytest.approx(whole.mean(), abs=1e-12)
+        share = np.mean(np.concatenate(clipped, axis=1))
+        assert report.regions[index].clipped_share == pytest.approx(share, abs=1e-12)
+        assert index == 0 or share > 0.0
+
+
+def test_only_the_agent_whose_policy_changes_has_other_numbers(report):
+    other = evaluate({**SLANTED, "right_0": half(3)}, SPEC, PROTOCOL)
+    assert other.agents["left_0"] == report.agents["left_0"]
+    assert other.agents["right_1"] == report.agents["right_1"]
+    assert other.agents["right_0"].regions != report.agents["right_0"].regions
+    assert other.regions != report.regions
+
+
+def test_the_teams_channels_are_the_agents_own_in_order(report):
+    for name, rows in {"": report.regions, **report.references}.items():
+        for index, region in enumerate(rows):
+            agents = report.agents.values()
+            own = [agent.references[name] if name else agent.regions for agent in agents]
+            assert region.channels == sum((rows[index].channels for rows in own), ())
+
+
+def test_every_agent_has_every_reference_in_every_region(report):
+    for agent in report.agents.values():
+        assert tuple(agent.references) == references.NAMES
+        assert all(row.normalised_regret == 0.0 for row in agent.references["optimal"])
+        assert all(row.normalised_regret == 1.0 for row in agent.references["constant_half"])
+        inside = {name: rows[0].normalised_regret for name, rows in agent.references.items()}
+        assert 0.0 < inside["linear_least_squares"] < inside["best_constant"] <= 1.0
+
+
+def test_the_linear_reference_of_an_agent_is_fitted_on_what_it_observes():
+    rng = np.random.default_rng(0)
+    s = rng.random((3_000, 4))
+    best = TASK.optimal_action(s)
+    fitted = references.fit(s, best, zip(TASK.observed, TASK.owned, strict=True))
+    for channels, own in zip(TASK.observed, TASK.owned, strict=True):
+        alone = references.fit(s[:, channels], best[:, own])
+        assert fitted.slope[list(channels), own] == pytest.approx(alone.slope, abs=1e-12)
+        assert fitted.intercept[own] == pytest.approx(alone.intercept, abs=1e-12)
+        unseen = [channel for channel in range(4) if channel not in channels]
+        assert not fitted.slope[unseen, own].any()
+    together = references.fit(s, best)
+    assert together.slope[1, 0] != 0.0  # one map of the whole state would not be the agents'
+
+
+@pytest.mark.parametrize("complexity", [1, 3])
+def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
+    single = SMESpec(state_dim=4, action_dim=3, complexity=complexity)
+    team = single.derive(team={"agents": [{"action_dim": 3}]})
+
+    def policy(observations):
+        return observations[:, :3] ** 2 * 1.1
+
+    alone = evaluate(policy, single, PROTOCOL)
+    for given in ({"agent_0": policy}, policy):
+        found = evaluate(given, team, PROTOCOL)
+        assert list(numbers(found)) == list(numbers(alone))
+        assert list(numbers(found.agents["agent_0"])) == list(numbers(alone))
+
+
+def test_the_references_of_the_command_line_act_for_teams_as_the_reports_own():
+    from sme_registry.cli.policies import find_policy
+
+    def inside(name):
+        return evaluate(find_policy(name, SPEC), SPEC, SMALL).agents
+
+    for name, same, near in (
+        ("optimal", "optimal", 1e-9),
+        ("constant", "constant_half", 0.0),
+        ("linear", "linear_least_squares", 0.05),  # fitted on other states
+        ("random", "uniform_random", 0.3),
+    ):
+        for agent in inside(name).values():
+            found, expected = agent.regions[0], agent.references[same][0]
+            assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
+
+
+def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
+    seen = []
+
+    def policy(observations):
+        seen.append(observations.copy())
+        observations[:] = np.nan  # reaches no other agent
+        return np.full((len(observations), 3), 0.5)
+
+    evaluate(policy, SPEC, SMALL)
+    for index in range(2):
+        (o,) = regions.observations(SMALL, index, SPEC)
+        joint = np.concatenate([o, np.zeros((200, 2), np.float32)], axis=1)
+        expected = shared_observation(TASK, joint)
+        for agent in range(3):
+            np.testing.assert_array_equal(seen[3 * index + agent], expected[:, agent])
+
+
+def test_a_shared_observation_hides_what_the_agent_does_not_observe():
+    joint = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]], np.float32)
+    expected = [
+        [0.1, 0.0, 0.3, 0.0, 0.5, 0.6, 1, 0, 0],
+        [0.0, 0.2, 0.3, 0.4, 0.5, 0.7, 0, 1, 0],
+        [0.1, 0.2, 0.3, 0.4, 0.5, 0.8, 0, 0, 1],
+    ]
+    shown = shared_observation(TASK, joint)
+    assert shown.dtype == np.float32
+    np.testing.assert_array_equal(shown, np.array([expected], np.float32))
+    assert (shared_observation_dim(TASK), shared_action_dim(TASK)) == (9, 3)
+
+
+def test_a_shared_policy_scores_as_separate_ones_that_do_the_same():
+    def shared(observations):  # the first observed channel, which differs between the agents
+        channel = np.where(observations[:, 7] == 1, observations[:, 1], observations[:, 0])
+        return np.stack([channel, 2.0 * channel, -channel], axis=1)
+
+    def own(width):
+        return lambda o: np.stack([o[:, 0], 2.0 * o[:, 0], -o[:, 0]], axis=1)[:, :width]
+
+    separate = {name: own(width) for name, width in zip(NAMES, (1, 3, 2), strict=True)}
+    assert all_numbers(evaluate(shared, SPEC, PROTOCOL)) == all_numbers(
+        evaluate(separate, SPEC, PROTOCOL)
+    )
+
+
+@pytest.mark.parametrize("rows", [1_000, 997])
+def test_batches_of_any_size_give_the_same_numbers(monkeypatch, report, rows):
+    monkeypatch.setattr(regions, "BATCH_ROWS", rows)
+    again = evaluate(SLANTED, SPEC, PROTOCOL)
+    assert all_numbers(again) == pytest.approx(all_numbers(report), abs=1e-11)
+
+
+def test_the_oracle_answers_once_for_each_state_however_many_agents(monkeypatch):
+    from importlib import import_module
+
+    asked = []
+
+    def counting(task):
+        made = engine(task)
+
+        def counted(s):
+            asked.append(len(s))
+            return made.optimal_action(s)
+
+        return dataclasses.replace(made, optimal_action=counted)
+
+    monkeypatch.setattr(import_module("sme_registry.evaluation.evaluate"), "engine", counting)
+    evaluate(half(3), SPEC, SMALL)
+    assert sum(asked) == 2 * 200
+
+
+def test_memory_does_not_grow_with_the_number_of_states(monkeypatch):
+    import tracemalloc
+
+    def peak(states):
+        protocol = EvaluationProtocol(states_per_region=states, epsilons=(0.5,))
+        tracemalloc.start()
+        evaluate(half(3), SPEC, protocol)
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    monkeypatch.setattr(regions, "BATCH_ROWS", 500)
+    monkeypatch.setattr(references, "FIT_STATES", 500)
+    peak(2_000)  # what is allocated once
+    assert peak(20_000) < 1.1 * peak(2_000)
+
+
+def test_a_batch_of_a_large_team_is_kept_small():
+    agents = [{"action_dim": 1}] * 1024
+    large = SMESpec(state_dim=8, action_dim=1024, hidden_width=2048, team={"agents": agents})
+    assert regions.batch_rows(large) * (8 + 1024 + 2048 + 1023) <= regions.BATCH_NUMBERS
+
+
+def with_(**changed):
+    given = {**SLANTED, **changed}
+    return {name: policy for name, policy in given.items() if policy != "left out"}
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (with_(right_1="left out"), r"right_1: policy missing\. Give one for each of left_0, rig"),
+        (
+            {"left_0": half(1), "right_0": half(3), "rigth_1": half(2)},
+            r"right_1: policy missing\. 'rigth_1': no such agent\. Did you mean 'right_1'\?",
+        ),
+        (with_(extra_7=half(1)), r"'extra_7': no such agent\. Give one for each of left_0"),
+        (with_(right_0=half(2)), r"^right_0: .*\(200, 2\): must be of shape \(200, 3\)"),
+        (with_(right_1=half(3)), r"^right_1: .*must be of shape \(200, 2\)"),
+        (with_(right_1=lambda o: np.full((len(o), 2), np.nan)), r"^right_1: .*NaN or infinite"),
+        (with_(left_0=lambda o: 1 / 0), r"^left_0: .*ZeroDivisionError"),
+        (with_(right_0=None), r"^right_0: policy=None: must be a callable .*\[B, 5\] .*\[B, 3\]"),
+        (with_(right_0="absent.zip"), r"^right_0: absent\.zip: there is no such file"),
+        (None, r"must be a dict from each agent's name to its policy; or .*\[B, 9\] to .*\[B, 3\]"),
+        (half(6), r"^left_0: .*\(200, 6\): must be of shape \(200, 3\).*asked for each agent"),
+        (lambda o: o @ np.ones((6, 6)), r"^left_0: .*ValueError: .* for separate policies give a"),
+        (lambda o: np.where(o[:, 7:8] == 1, np.nan, np.full((len(o), 3), 0.5)), "^right_0: .*NaN"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_refused_by_whose_it_is(policy, message):
+    with pytest.raises(PolicyError, match=message):
+        evaluate(policy, SPEC, SMALL)
+
+
+def test_policies_are_named_alike_or_counted():
+    def careful(observations):
+        return observations[:, :1]
+
+    assert as_policy(dict.fromkeys(NAMES, careful), SPEC).name == "careful"
+    assert as_policy({**SLANTED, "left_0": careful}, SPEC).name == "3 policies"
+    assert as_policy(SLANTED, SPEC, name="mine").name == "mine"
+    assert as_policy(careful, SPEC).name == "careful"
+
+
+def test_symmetric_actions_of_all_agents_are_rescaled(report):
+    doubled = {name: (lambda o, act=act: 2.0 * act(o) - 1.0) for name, act in SLANTED.items()}
+    found = evaluate(doubled, SPEC, PROTOCOL, action_range="symmetric")
+    assert found.action_range == "symmetric"
+    assert all_numbers(found) == pytest.approx(all_numbers(report), abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def sb3():
+    return pytest.importorskip("stable_baselines3")
+
+
+def model(sb3, observation_dim, action_dim, low=0.0):
+    import gymnasium
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    class Spaces(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
+        action_space = gymnasium.spaces.Box(low, 1.0, (action_dim,), np.float32)
+
+    return sb3.PPO("MlpPolicy", DummyVecEnv([Spaces]), device="cpu", seed=3)
+
+
+def test_a_shared_model_scores_as_its_file(sb3, tmp_path):
+    ppo = model(sb3, 9, 3, low=-1.0)
+    ppo.save(tmp_path / "team.zip")
+    live, saved = evaluate(ppo, SPEC, SMALL), evaluate(tmp_path / "team.zip", SPEC, SMALL)
+    assert (live.policy, saved.policy) == ("PPO", "team")
+    assert live.action_range == saved.action_range == "symmetric"
+    assert all_numbers(live) == all_numbers(saved)
+
+
+def test_models_of_each_agents_own_are_taken_with_their_own_action_ranges(sb3):
+    given = {
+        "left_0": model(sb3, 4, 1, low=-1.0),
+        "right_0": model(sb3, 5, 3),
+        "right_1": half(2),
+    }
+    found = evaluate(given, SPEC, SMALL)
+    assert found.action_range == "mixed"
+
+    def predicted(observations):
+        action = given["left_0"].predict(observations, deterministic=True)[0]
+        return (action.astype(np.float64) + 1.0) / 2.0
+
+    again = evaluate({**given, "left_0": predicted}, SPEC, SMALL)
+    mine, theirs = found.agents["left_0"].regions, again.agents["left_0"].regions
+    assert [r.mae for r in mine] == pytest.approx([r.mae for r in theirs], abs=1e-6)
+
+
+def test_a_model_of_other_widths_is_refused_by_whose_it_is(sb3):
+    with pytest.raises(PolicyError, match=r"^right_0: .*shape \(4,\): must be \(5,\) for 3 obs"):
+        evaluate({**SLANTED, "right_0": model(sb3, 4, 3)}, SPEC, SMALL)
+    with pytest.raises(PolicyError, match=r"shape \(6,\): must be \(9,\) for a policy that all 3"):
+        evaluate(model(sb3, 6, 6), SPEC, SMALL)
+
+
+def test_a_report_of_a_team_survives_being_written_and_read(report, tmp_path):
+    path = report.write(tmp_path / "report.json")
+    again = EvaluationReport.read(path)
+    assert again == report
+    assert tuple(again.agents) == NAMES
+    assert list(json.loads(path.read_text())["agents"]) == list(NAMES)
+
+
+def test_a_report_of_a_single_agent_has_no_field_for_agents():
+    single = SMESpec(state_dim=4, action_dim=3)
+    report = evaluate(half(3), single, SMALL)
+    assert list(report.plain()) == [
+        "schema_version", "policy", "action_range", "spec", "spec_digest", "protocol",
+        "protocol_digest", "regions", "references", "versions",
+    ]  # fmt: skip
+    assert EvaluationReport.parse(report.plain()) == report
+    assert report.agents == {}
+
+
+def test_the_table_has_three_lines_for_each_agent(report):
+    console = Console(width=80, file=io.StringIO())
+    console.print(report.table())
+    text = console.file.getvalue()
+    assert "…" not in text
+    before, after = text.split("actions clipped")
+    for name, agent in report.agents.items():
+        assert name not in before
+        block = after[after.index(f" {name}") :].splitlines()[:3]
+        linear = agent.references["linear_least_squares"]
+        assert f"{agent.regions[2].similarity:.3f}" in block[0]
+        assert f"{agent.regions[2].normalised_regret:.3f}" in block[1]
+        assert f"{linear[2].normalised_regret:.3f}" in block[2]

@@ -1,0 +1,207 @@
+"""Teams by the definition: who owns and sees what, what each is paid, and what moves with what."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize, observe, step
+from tests.strategies import specs
+
+
+def team(*agents, reward="individual"):
+    return {"agents": [{"action_dim": width, "observes": seen} for width, seen in agents],
+            "reward": reward}  # fmt: skip
+
+
+TRIO = SMESpec(action_dim=6, complexity=2, team=team((1, [0, 5]), (2, "all"), (3, [1, 2, 7])))
+
+
+def near_optimal(task, B, seed=0):
+    random = np.random.default_rng(seed)
+    s = random.random((B, task.spec.state_dim))
+    best = task.optimal_action(s)
+    a = best + 0.4 * random.random((B, 1)) * (random.random(best.shape) - 0.5)
+    return s, np.clip(a, 0.0, 1.0)
+
+
+def same_layers(ours, theirs):
+    assert len(ours) == len(theirs)
+    for (W, b), (other_W, other_b) in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(W, other_W)
+        np.testing.assert_array_equal(b, other_b)
+
+
+@given(specs(team=False), st.sampled_from(["individual", "team"]), st.integers(0, 9))
+def test_a_team_of_one_is_the_single_agents_task_number_for_number(spec, reward, seed):
+    lone = spec.derive(team=team((spec.action_dim, "all"), reward=reward))
+    single, alone = materialize(spec), materialize(lone)
+    assert lone.digest != spec.digest
+    np.testing.assert_array_equal(single.W, alone.W)
+    np.testing.assert_array_equal(single.b, alone.b)
+    same_layers(single.policies[0], alone.policies[0])
+    s, a = near_optimal(single, 7, seed)
+    random = np.random.default_rng(seed)
+    t, r_cum = random.integers(0, spec.horizon, 7), random.random((7, 1))
+    ours, theirs = step(alone, s, t, r_cum, a), step(single, s, t, r_cum, a)
+    for name in ours._fields:
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    np.testing.assert_array_equal(observe(lone, s, t, r_cum), observe(spec, s, t, r_cum))
+
+
+def test_adding_an_agent_moves_no_other_agents_policy_nor_the_transition_offset():
+    three = materialize(TRIO)
+    four = materialize(
+        TRIO.derive(action_dim=8, team=team((1, [0, 5]), (2, "all"), (3, [1, 2, 7]), (2, "all")))
+    )
+    np.testing.assert_array_equal(three.b, four.b)
+    for ours, theirs in zip(three.policies, four.policies[:3], strict=True):
+        same_layers(ours, theirs)
+
+
+def test_adding_a_layer_moves_no_other_layer_of_any_agent():
+    three, four = materialize(TRIO.derive(complexity=3)), materialize(TRIO.derive(complexity=4))
+    for shallow, deep in zip(three.policies, four.policies, strict=True):
+        same_layers(shallow[:2], deep[:2])
+        same_layers(shallow[-1:], deep[-1:])
+
+
+def test_what_an_agent_observes_or_how_the_team_is_paid_moves_no_other_agent():
+    base = materialize(TRIO)
+    wider = materialize(TRIO.derive(team=team((1, "all"), (2, "all"), (3, [1, 2, 7]))))
+    shared = materialize(
+        TRIO.derive(team=team((1, [0, 5]), (2, "all"), (3, [1, 2, 7]), reward="team"))
+    )
+    np.testing.assert_array_equal(base.W, wider.W)
+    for agent in (1, 2):
+        same_layers(base.policies[agent], wider.policies[agent])
+    for ours, theirs in zip(base.policies, shared.policies, strict=True):
+        same_layers(ours, theirs)
+
+
+@given(specs(team=True), st.integers(0, 9))
+def test_a_channel_that_an_agent_does_not_observe_never_moves_its_optimal_action(spec, seed):
+    task, random = materialize(spec), np.random.default_rng(seed)
+    s = random.uniform(-0.5, 1.5, (5, spec.state_dim))
+    best = task.optimal_action(s)
+    for own, channels in zip(task.owned, task.observed, strict=True):
+        hidden = [j for j in range(spec.state_dim) if j not in channels]
+        other = s.copy()
+        other[:, hidden] = random.uniform(-9.0, 9.0, (5, len(hidden)))
+        np.testing.assert_array_equal(task.optimal_action(other)[:, own], best[:, own])
+
+
+def test_a_channel_that_an_agent_observes_does_move_its_optimal_action():
+    task = materialize(TRIO)
+    s = np.full((1, 8), 0.4)
+    for own, channels in zip(task.owned, task.observed, strict=True):
+        for channel in channels:
+            other = s.copy()
+            other[:, channel] = 0.9
+            moved = task.optimal_action(other) - task.optimal_action(s)
+            assert np.abs(moved[:, own]).min() > 1e-6
+
+
+@given(specs(team=True), st.integers(0, 9))
+def test_each_is_paid_for_its_own_channels_or_all_for_all(spec, seed):
+    task = materialize(spec)
+    s, a = near_optimal(task, 9, seed)
+    n = len(task.names)
+    done = step(task, s, np.zeros(9, np.int64), np.zeros((9, n)), a)
+    missed = np.abs(a - done.optimal_action)
+    for agent, own in enumerate(task.owned):
+        similarity = 1.0 - missed[:, own].mean(axis=1)
+        np.testing.assert_allclose(done.similarity[:, agent], similarity, rtol=0, atol=1e-14)
+        if task.pays_the_team:
+            np.testing.assert_array_equal(done.step_reward[:, agent], done.step_reward[:, 0])
+            expected = task.reward_of(task.similarity_of(a, done.optimal_action))
+        else:
+            expected = task.reward_of(done.similarity[:, agent])
+        np.testing.assert_array_equal(done.step_reward[:, agent], expected)
+
+
+def off_by(task, s, *amounts):
+    """Actions that are off the optimum by an amount of each agent's, in each of its channels."""
+    best = task.optimal_action(s)
+    away = np.concatenate([
+        np.full(own.stop - own.start, amount)
+        for own, amount in zip(task.owned, amounts, strict=True)
+    ])  # fmt: skip
+    return np.where(best > 0.5, best - away, best + away)
+
+
+START = np.full((1, 8), 0.3)
+
+
+def one_step(spec, *amounts, t=0, r_cum=(0.0, 0.0, 0.0)):
+    task = materialize(spec)
+    a = off_by(task, START, *amounts)
+    return step(task, START, np.array([t]), np.array([r_cum]), a)
+
+
+def test_r_min_gates_each_agent_by_itself():
+    done = one_step(TRIO.derive(r_min=0.5), 0.05, 0.2, 0.1)
+    np.testing.assert_allclose(done.step_reward, [[0.8, 0.0, 0.6]], rtol=0, atol=1e-12)
+
+
+def test_r_min_gates_a_team_paid_as_one_on_the_mean_over_all_channels():
+    shared = TRIO.derive(team={**TRIO.plain()["team"], "reward": "team"}, r_min=0.4)
+    # Mean distance (0.05 + 2 · 0.2 + 3 · 0.1) / 6 = 0.125, so r̂ = 0.5 although one earns 0.2.
+    done = one_step(shared, 0.05, 0.2, 0.1)
+    np.testing.assert_allclose(done.step_reward, 0.5, rtol=0, atol=1e-12)
+
+
+def test_the_end_of_one_is_the_end_of_all():
+    spec = TRIO.derive(D=0.5)
+    assert not one_step(spec, 0.05, 0.1, 0.1).terminated[0]
+    for amounts in ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)):
+        assert one_step(spec, *amounts).terminated[0]
+    # A team that is paid as one survives what one of it does, as long as the mean is good.
+    shared = spec.derive(team={**TRIO.plain()["team"], "reward": "team"})
+    assert not one_step(shared, 0.2, 0.0, 0.0).terminated[0]
+    assert one_step(shared, 0.2, 0.2, 0.2).terminated[0]
+
+
+def test_every_agent_has_an_account_of_its_own_that_is_paid_every_k_steps():
+    spec = TRIO.derive(k=4)
+    held = one_step(spec, 0.0, 0.05, 0.1, t=1, r_cum=(1.0, 0.5, 0.0))
+    np.testing.assert_array_equal(held.reward, 0.0)
+    np.testing.assert_allclose(held.accumulated_reward, [[2.0, 1.3, 0.6]], rtol=0, atol=1e-12)
+    paid = one_step(spec, 0.0, 0.05, 0.1, t=3, r_cum=(3.0, 0.5, 0.0))
+    np.testing.assert_allclose(paid.reward, [[4.0, 1.3, 0.6]], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(paid.accumulated_reward, 0.0)
+
+
+def test_names_and_channels_are_in_the_order_of_the_spec():
+    task = materialize(TRIO)
+    assert task.names == ("agent_0", "agent_1", "agent_2")
+    assert task.owned == (slice(0, 1), slice(1, 3), slice(3, 6))
+    assert task.observed == ((0, 5), tuple(range(8)), (1, 2, 7))
+    assert [len(policy) for policy in task.layers] == [2, 2, 2]
+    assert [policy[0].W.shape[1] for policy in task.policies] == [2, 8, 3]
+    assert [policy[-1].W.shape[0] for policy in task.policies] == [1, 2, 3]
+
+
+def test_a_team_of_many_is_drawn_and_earns_its_horizon():
+    spec = SMESpec(
+        state_dim=16, action_dim=64, horizon=3, team=team(*[(1, [i % 16]) for i in range(64)])
+    )
+    task = materialize(spec)
+    s = np.random.default_rng(0).random((4, 16))
+    done = step(task, s, np.zeros(4, np.int64), np.zeros((4, 64)), task.policy(s[:, None])[:, 0])
+    np.testing.assert_array_equal(done.step_reward, 1.0)
+    assert done.step_reward.shape == (4, 64)
+
+
+@pytest.mark.parametrize("reward", ["individual", "team"])
+def test_the_optimum_of_a_team_earns_exactly_the_horizon(reward):
+    spec = TRIO.derive(k=7, horizon=20, r_min=0.9, D=0.9, team={**TRIO.plain()["team"],
+                                                                "reward": reward})  # fmt: skip
+    task = materialize(spec)
+    s, r_cum, paid = np.random.default_rng(1).random((3, 8)), np.zeros((3, 3)), np.zeros((3, 3))
+    for t in range(20):
+        done = step(task, s, np.full(3, t), r_cum, task.policy(s[:, None])[:, 0])
+        assert not done.terminated.any()
+        paid, s, r_cum = paid + done.reward, done.state, done.accumulated_reward
+    np.testing.assert_array_equal(paid, 20.0)

@@ -1,0 +1,60 @@
+"""The examples say what they do, and what they lack, whether or not their library is installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+# As on a machine without TorchRL: None in sys.modules makes an import fail as an absent module.
+WITHOUT_TORCHRL = (
+    "import runpy, sys; sys.modules['tensordict'] = sys.modules['torchrl'] = None; "
+    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+)
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
+def test_an_example_explains_itself_without_its_library(example: Path) -> None:
+    done = run("-c", WITHOUT_TORCHRL, example, "--help")
+    assert done.returncode == 0, done.stderr
+    assert "--seeds" in done.stdout
+
+
+def test_without_torchrl_its_example_names_what_to_install() -> None:
+    done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py")
+    assert done.returncode == 2
+    assert "tensordict is not installed. Run `pip install torchrl`." in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_torchrl_example_refuses_bad_options_before_all_else() -> None:
+    done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py", "--steps", "0")
+    assert done.returncode == 2
+    assert "--steps must be at least 1" in done.stderr
+
+
+def test_the_torchrl_example_trains_where_torchrl_is_installed() -> None:
+    pytest.importorskip("torchrl")
+    done = run(ROOT / "examples" / "torchrl_team.py", "--env", "Team2", "--steps", "4096")
+    assert done.returncode == 0, done.stderr
+    before, after = (
+        [float(value) for value in line.split()[3:]]
+        for line in done.stdout.splitlines()
+        if "mean actions" in line
+    )
+    assert len(before) == len(after) == 2
+    assert all(end < 0.7 * start for start, end in zip(before, after, strict=True))

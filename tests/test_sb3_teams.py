@@ -1,0 +1,264 @@
+"""`SMETeamVecEnv`: a policy shared by the agents of a team, on the numbers of `SMETeamEnv`."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.errors import ActionError, EpisodeError, OptionError, SpecError, StateError
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from sme_registry.sb3 import SMETeamVecEnv
+
+# Unequal agents that see parts of the state; ends early and late, pays late, teams drift apart.
+UNEQUAL = sme_registry.SMESpec.parse(
+    {
+        "state_dim": 5, "action_dim": 6, "horizon": 12, "k": 5, "D": 0.2, "r_min": 0.1,
+        "complexity": 2, "seed": 4,
+        "team": {"agents": [
+            {"action_dim": 1, "observes": [1, 3]},
+            {"action_dim": 3},
+            {"action_dim": 2, "observes": [0, 2, 4]},
+        ]},
+    }
+)  # fmt: skip
+SHARED = UNEQUAL.derive(team={**UNEQUAL.plain()["team"], "reward": "team"}, D=0.1)
+# Many a last step is terminated and truncated at once, or either alone.
+BOTH = UNEQUAL.derive(horizon=2, D=0.5)
+
+
+def shown(env: Any, agent: int, own: np.ndarray) -> np.ndarray:
+    """The shared observation of an agent, put together from its own one."""
+    task = env.task
+    S, n = task.spec.state_dim, len(task.names)
+    observation = np.zeros(S + 2 + n, np.float32)
+    channels = list(task.observed[agent])
+    observation[channels] = own[: len(channels)]
+    observation[S : S + 2] = own[len(channels) :]
+    observation[S + 2 + agent] = 1.0
+    return observation
+
+
+@pytest.mark.parametrize("action_range", ["symmetric", "unit"])
+@pytest.mark.parametrize(
+    "spec",
+    [UNEQUAL, SHARED, BOTH, "Team4", "TeamBlindShared4", "Default"],
+    ids=["unequal", "shared", "both-flags", "Team4", "TeamBlindShared4", "team-of-one"],
+)
+def test_every_number_is_that_of_teams_stepped_in_a_loop(spec: Any, action_range: Any) -> None:
+    teams = 3
+    ours = SMETeamVecEnv(spec, teams, action_range=action_range)
+    theirs = [sme_registry.make_parallel(spec, action_range=action_range) for _ in range(teams)]
+    task = ours.get_attr("task", 0)[0]
+    n, own = len(task.names), task.owned
+    assert ours.num_envs == teams * n
+    assert ours.get_attr("agent") == list(task.names) * teams
+    ours.seed(42)
+    got = ours.reset()
+    observed = [env.reset(seed=42 + team)[0] for team, env in enumerate(theirs)]
+    rng = np.random.default_rng(0)
+    low = ours.action_space.low[0]
+    ends = set()
+    for _ in range(120):
+        for lane in range(teams * n):
+            team, agent = divmod(lane, n)
+            name = task.names[agent]
+            expected = shown(theirs[team], agent, observed[team][name])
+            np.testing.assert_array_equal(got[lane], expected, strict=True)
+        optimal = task.optimal_action(np.array([env.state() for env in theirs]))
+        joint = low + (1 - low) * (0.6 * optimal + 0.4 * rng.random(optimal.shape))
+        joint = joint.astype(np.float32)
+        actions = rng.uniform(low, 1, (teams * n, ours.action_space.shape[0])).astype(np.float32)
+        for lane in range(teams * n):
+            team, agent = divmod(lane, n)
+            actions[lane, : own[agent].stop - own[agent].start] = joint[team, own[agent]]
+        got, rewards, dones, infos = ours.step(actions)
+        assert rewards.dtype == np.float32
+        for team, env in enumerate(theirs):
+            acted = {name: joint[team, own[i]] for i, name in enumerate(task.names)}
+            observed[team], paid, dead, late, told = env.step(acted)
+            for agent, name in enumerate(task.names):
+                lane = team * n + agent
+                info = infos[lane]
+                assert rewards[lane] == np.float32(paid[name])
+                assert dones[lane] == (dead[name] or late[name])
+                assert info.pop("TimeLimit.truncated") == (late[name] and not dead[name])
+                assert ("terminal_observation" in info) == dones[lane]
+                if dones[lane]:
+                    ends.add((dead[name], late[name]))
+                    last = info.pop("terminal_observation")
+                    expected = shown(env, agent, observed[team][name])
+                    np.testing.assert_array_equal(last, expected, strict=True)
+                assert info.keys() == told[name].keys()
+                for key, value in told[name].items():
+                    assert type(info[key]) is type(value)
+                    np.testing.assert_array_equal(info[key], value, strict=True)
+            if not env.agents:
+                observed[team], _ = env.reset()
+    assert ends
+    if spec is BOTH:
+        assert ends == {(True, False), (False, True), (True, True)}
+
+
+def test_entries_beyond_an_agents_own_channels_move_nothing() -> None:
+    one, other = SMETeamVecEnv(UNEQUAL, 2, D=0), SMETeamVecEnv(UNEQUAL, 2, D=0)
+    for env in (one, other):
+        env.seed(0)
+        env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 3)).astype(np.float32)
+    changed = actions.copy()
+    changed[[0, 3], 1:] = 0.5  # agent_0 owns one channel
+    changed[[2, 5], 2:] = -0.5  # agent_2 owns two
+    np.testing.assert_array_equal(one.step(actions)[0], other.step(changed)[0])
+    changed[1, 2] = 0.123  # agent_1 owns all three
+    assert not np.array_equal(one.step(actions)[0], other.step(changed)[0])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "kwargs"),
+    [
+        (PPO, {"n_steps": 32, "batch_size": 64, "n_epochs": 1}),
+        (SAC, {"learning_starts": 20, "batch_size": 16, "buffer_size": 1200, "train_freq": 10}),
+    ],
+    ids=["PPO", "SAC"],
+)
+def test_sb3s_algorithms_learn_one_policy_for_all(algorithm: Any, kwargs: dict[str, Any]) -> None:
+    env = VecMonitor(SMETeamVecEnv("Team4", 2, horizon=10, k=5))
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]},
+                      **kwargs)  # fmt: skip
+    model.learn(400)
+    assert model.num_timesteps >= 400
+    assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
+    assert len(model.ep_info_buffer) >= 40  # one for each agent of each team
+
+
+def test_the_optimum_of_each_agent_earns_it_the_horizon() -> None:
+    env = VecMonitor(SMETeamVecEnv(UNEQUAL, 4, D=0.9))
+    env.reset()
+    task = env.get_attr("task", 0)[0]
+    for _ in range(12):
+        joint = 2.0 * task.optimal_action(np.array(env.get_attr("state"))) - 1.0
+        actions = np.zeros((12, 3), np.float32)
+        for lane in range(12):
+            own = task.owned[lane % 3]
+            actions[lane, : own.stop - own.start] = joint[lane, own]
+        _, _, dones, infos = env.step(actions)
+    assert dones.all()
+    assert [info["episode"]["r"] for info in infos] == pytest.approx([12.0] * 12, abs=1e-4)
+    assert max(info["regret"] for info in infos) < 1e-5
+
+
+def test_sb3s_wrappers_work_on_it() -> None:
+    env: Any = VecNormalize(VecMonitor(SMETeamVecEnv(UNEQUAL, 2)))
+    env.seed(0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    episodes = 0
+    for _ in range(20):
+        observations, _, dones, infos = env.step(rng.uniform(-1, 1, (6, 3)).astype(np.float32))
+        assert observations.shape == (6, 5 + 2 + 3)
+        episodes += sum("episode" in info for info in infos)
+        assert all(("terminal_observation" in i) == d for i, d in zip(infos, dones, strict=True))
+    assert episodes > 0
+    assert episodes % 3 == 0
+
+
+def test_a_pickled_copy_goes_on_as_the_original() -> None:
+    env = SMETeamVecEnv(UNEQUAL, 2)
+    env.seed(7)
+    env.reset()
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (30, 6, 3)).astype(np.float32)
+    for action in actions[:5]:
+        env.step(action)
+    twin = pickle.loads(pickle.dumps(env))
+    for action in actions[5:]:
+        got, expected = twin.step(action), env.step(action)
+        for mine, other in zip(got[:3], expected[:3], strict=True):
+            np.testing.assert_array_equal(mine, other)
+        assert [i["regret"] for i in got[3]] == [i["regret"] for i in expected[3]]
+    np.testing.assert_array_equal(twin.get_attr("state"), env.get_attr("state"))
+
+
+def test_options_begin_teams_where_they_say_and_are_used_once() -> None:
+    env = SMETeamVecEnv(UNEQUAL, 2)
+    start = [0.25, 0.5, 0.75, 0.0, 1.0]
+    env.set_options({"state": start})
+    env.reset()
+    assert [list(state) for state in env.get_attr("state")] == [start] * 6
+    env.set_options([{}] * 3 + [{"state": start}] * 3)
+    env.seed(1)
+    env.reset()
+    drawn, given = env.get_attr("state", [0, 3])
+    assert list(given) == start
+    assert list(drawn) != start
+    env.reset()
+    assert list(env.get_attr("state", 3)[0]) != start
+
+
+def test_what_is_returned_can_be_written_into_and_moves_nothing() -> None:
+    env, untouched = SMETeamVecEnv(UNEQUAL, 2), SMETeamVecEnv(UNEQUAL, 2)
+    rng = np.random.default_rng(0)
+    for e in (env, untouched):
+        e.seed(0)
+        e.reset()
+    for _ in range(30):
+        action = rng.uniform(-1, 1, (6, 3)).astype(np.float32)
+        got, expected = env.step(action), untouched.step(action)
+        np.testing.assert_array_equal(got[0], expected[0])
+        for info, other in zip(got[3], expected[3], strict=True):
+            np.testing.assert_array_equal(info["optimal_action"], other["optimal_action"])
+            np.testing.assert_array_equal(
+                info.get("terminal_observation", 0), other.get("terminal_observation", 0)
+            )
+            info["optimal_action"][:] = 9.0
+            info.get("terminal_observation", got[0])[:] = 9.0
+            info.clear()
+        for array in got[:3]:
+            array[:] = 9
+
+
+def test_what_cannot_be_used_is_a_typed_error() -> None:
+    with pytest.raises(OptionError, match="num_envs=0"):
+        SMETeamVecEnv("Team2", 0)
+    with pytest.raises(OptionError, match="action_range"):
+        SMETeamVecEnv("Team2", action_range="wide")  # type: ignore[arg-type]
+    with pytest.raises(SpecError, match="action_dim"):
+        SMETeamVecEnv("Team2", action_dim=7)
+    env = SMETeamVecEnv(UNEQUAL, 2)
+    action = np.zeros((6, 3), np.float32)
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step(action)
+    with pytest.raises(EpisodeError, match="step_async"):
+        env.step_wait()
+    env.seed(0)
+    env.reset()
+    before = env.get_attr("state", 0)[0]
+    with pytest.raises(ActionError, match="shape"):
+        env.step(action[:5])
+    for entry in ((0, 0), (0, 2)):  # one that counts, and one that does not
+        broken = action.copy()
+        broken[entry] = np.nan
+        with pytest.raises(ActionError, match="NaN"):
+            env.step(broken)
+    np.testing.assert_array_equal(env.get_attr("state", 0)[0], before)
+    env.step(action)
+    with pytest.raises(AttributeError):
+        env.env_method("reset")  # an agent cannot be reset without its team
+    for options, error in (
+        ({"state": [2.0] * 5}, StateError),
+        ({"stat": [0.5] * 5}, OptionError),
+        ([{"state": [0.5] * 5}] + [{}] * 5, OptionError),
+        ([{"state": [0.1 * lane] * 5} for lane in range(6)], OptionError),
+    ):
+        env.set_options(options)  # type: ignore[arg-type]
+        with pytest.raises(error):
+            env.reset()
