@@ -170,7 +170,8 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
 
     Args:
       spec: the spec, or whatever `load` takes.
-      **kwargs: arguments of the environment, such as `action_range`.
+      **kwargs: spec fields to override, which give the derived spec its own id; and arguments of
+        the environment, such as `action_range`.
 
     Returns:
       What `gymnasium.make` and `gymnasium.make_vec` take in place of an id.
@@ -180,9 +181,12 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
       FingerprintMismatchError: the spec is of a file whose numbers are not the ones drawn here.
     """
     from sme_registry.envs.naming import content_id
+    from sme_registry.spec import SMESpec
     from sme_registry.spec.resolve import resolve
 
     resolved = _verified(resolve(spec))
+    overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
+    resolved = resolved.derive(**overrides)
     return EnvSpec(
         id=content_id(resolved),
         entry_point=_ENTRY_POINT,

@@ -233,13 +233,21 @@ def _show_task(found: SMESpec | EnvFile, json: bool) -> None:
     print_pairs("Derived", {"digest": spec.digest, **facts})
 
 
+def _env_id(spec: SMESpec) -> str:
+    """The id to make it by: its released name, or its name by content."""
+    from sme_registry.envs.naming import content_id
+
+    title = catalogue.title(spec)
+    return content_id(spec) if title.endswith(spec.content_name) else title
+
+
 def _facts(spec: SMESpec) -> dict[str, Any]:
     """What follows from a spec, without drawing it."""
     from sme_registry.task.memory import parameter_bytes
 
     payouts = math.ceil(spec.horizon / spec.k)
     facts: dict[str, Any] = {
-        "id": f"{catalogue.NAMESPACE}/{spec.content_name}-v1",
+        "id": _env_id(spec),
         **_spaces(spec),
         "parameters": parameter_bytes(spec) // 8,
         "parameter_memory_bytes": parameter_bytes(spec),

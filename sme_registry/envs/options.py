@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, SpecError, StateError, did_you_mean
+from sme_registry.spec.document import plain_number
 from sme_registry.task import Task
 
 
@@ -54,9 +55,10 @@ def checked_seed(seed: Any) -> int | None:
     """
     if seed is None:
         return None
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+    seed = plain_number(seed)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise OptionError(f"seed={seed!r:.60}: must be an integer of at least 0, or None.")
-    return int(seed)
+    return seed
 
 
 def single_agent(task: Task) -> Task:

@@ -20,6 +20,7 @@ from sme_registry.envs.options import checked_seed, initial_states, refuse_unkno
 from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
+from sme_registry.spec.document import plain_number
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import Task, materialize
 
@@ -68,6 +69,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
+        num_envs = plain_number(num_envs)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
         if render_mode is not None:
@@ -235,6 +237,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         seeds = np.full(self.num_envs, None, dtype=object)
         if seed is None:
             return seeds
+        seed = plain_number(seed)
         if not isinstance(seed, list | tuple | np.ndarray):
             first = checked_seed(seed) or 0
             seeds[:] = [first + lane for lane in range(self.num_envs)]

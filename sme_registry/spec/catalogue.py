@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -58,8 +58,13 @@ def entries(kind: type[_E]) -> list[_E]:
     return [_read(kind, path) for path in paths(kind)]
 
 
-def find(kind: type[_E], name: str) -> _E:
+def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     """The file of a name, with or without its version (the newest then).
+
+    Args:
+      kind: of what.
+      name: what was asked for.
+      others: names known elsewhere, which may be meant where there is no such file.
 
     Raises:
       UnknownNameError: there is none; the message names the nearest.
@@ -74,9 +79,10 @@ def find(kind: type[_E], name: str) -> _E:
     ]
     if versions:
         return find(kind, max(versions)[1])
+    known += others
     short = [_VERSION.sub("", full) for full in known]
     raise UnknownNameError(
-        f"{name!r}: no {kind.content} of this name is in the catalogue."
+        f"{name!r}: no {kind.content} of this name is known."
         + (did_you_mean(name, known) or did_you_mean(name, short))
         + " `sme list` shows what there is."
     )

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sme_registry.errors import MalformedDocumentError, UnknownNameError, did_you_mean
+from sme_registry.errors import MalformedDocumentError, UnknownNameError
 from sme_registry.files import read_json
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile, SuiteFile
@@ -48,13 +48,8 @@ def resolve(task: SMESpec | dict[str, Any] | str | os.PathLike[str]) -> SMESpec:
             return registered[env_id]
     if short.startswith(("sha256:", "sha256-")):
         return _by_content(short)
-    try:
-        return with_fingerprint(catalogue.find(EnvFile, short))
-    except UnknownNameError:
-        hint = did_you_mean(full, registered)
-        if not hint:
-            raise
-        raise UnknownNameError(f"{name!r}: no task of this name is registered.{hint}") from None
+    own = [env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered]
+    return with_fingerprint(catalogue.find(EnvFile, short, own))
 
 
 def read_env_file(path: str | os.PathLike[str]) -> EnvFile:

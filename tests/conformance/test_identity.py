@@ -149,3 +149,12 @@ def test_making_with_a_bad_argument_is_a_typed_error(
 def test_an_unknown_name_says_what_is_near() -> None:
     with pytest.raises(UnknownNameError, match="Complexity10"):
         sme_registry.make("Complexty10")
+
+
+def test_an_env_spec_with_overrides_goes_by_the_derived_content() -> None:
+    derived = sme_registry.load("Default").derive(complexity=10)
+    made = sme_registry.env_spec(sme_registry.load("Default"), complexity=10, action_range="unit")
+    assert made.id == f"SME/{derived.content_name}-v1"
+    assert made.kwargs == {"spec": derived.plain(), "action_range": "unit"}
+    with pytest.raises(sme_registry.SMEError, match="complexity=0"):
+        sme_registry.env_spec(derived, complexity=0)

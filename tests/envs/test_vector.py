@@ -249,3 +249,10 @@ def test_a_pickled_batch_keeps_its_resting_lanes(mode: str) -> None:
     for _ in range(5):
         for got, expected in zip(twin.step(HALF)[:4], env.step(HALF)[:4], strict=True):
             np.testing.assert_array_equal(got, expected)
+
+
+def test_numpy_integers_serve_as_seed_and_number_of_lanes():
+    env = SMEVectorEnv("Default-v1", num_envs=np.int64(3))
+    assert env.num_envs == 3
+    first = env.reset(seed=np.array(5))[0]
+    np.testing.assert_array_equal(first, env.reset(seed=5)[0])
