@@ -126,7 +126,8 @@ def _numba_engine(task: Task) -> Engine:
         buffer = np.concatenate([prefix, np.zeros(kernels.lane_size(packed))])
         return buffer, buffer[prefix.size : prefix.size + 2 + task.spec.state_dim]
 
-    return Engine("numba", packed, new_lane, steps[0], steps[1], kernels.step_many, optimal_action)
+    step_many = kernels.step_many.get_overload(kernels.STEP_MANY)
+    return Engine("numba", packed, new_lane, steps[0], steps[1], step_many, optimal_action)
 
 
 def _numpy_engine(task: Task) -> Engine:

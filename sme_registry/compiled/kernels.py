@@ -231,22 +231,21 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
             y[o, lane] = normal_cdf(y[o, lane])
 
 
-@njit(
-    boolean(
-        _PACKED,
-        float64[:, ::1],
-        int64[::1],
-        float64[:, ::1],
-        float64[:, ::1],
-        float64[:, ::1],
-        float32[:, ::1],
-        float64[:, ::1],
-        float64[:, :, ::1],
-        boolean[:, ::1],
-    ),
-    error_model="numpy",
-    cache=True,
+STEP_MANY = boolean(
+    _PACKED,
+    float64[:, ::1],
+    int64[::1],
+    float64[:, ::1],
+    float64[:, ::1],
+    float64[:, ::1],
+    float32[:, ::1],
+    float64[:, ::1],
+    float64[:, :, ::1],
+    boolean[:, ::1],
 )
+
+
+@njit(STEP_MANY, error_model="numpy", cache=True)
 def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards, ends):  # type: ignore[no-untyped-def]
     """One step of `B` lanes of a team of n agents; a single agent is a team of one.
 
@@ -347,11 +346,12 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
 
         # Short loops rather than one long one: all but the last fill vector registers.
         for lane in range(count):
-            total_missed[lane] = 0.0
             ends[0, first + lane] = False
-        for agent in range(agents):
-            for lane in range(count):
-                total_missed[lane] += missed[agent, lane]
+        if pays_the_team:
+            total_missed[:] = 0.0
+            for agent in range(agents):
+                for lane in range(count):
+                    total_missed[lane] += missed[agent, lane]
         for agent in range(agents):
             for lane in range(count):
                 i = first + lane
@@ -365,21 +365,29 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
                 rewards[1, agent, i] = step_reward
                 rewards[2, agent, i] = 1.0 - step_reward
                 ends[0, i] |= step_reward < D
-            for lane in range(count):
-                i = first + lane
-                steps = float64(t[i] + 1)
-                total = accumulated[agent, i] + rewards[1, agent, i]
-                truncated = steps >= T
-                # Exact: no quotient of integers below 2³¹ rounds to a whole number it is not.
-                paid = truncated | (np.floor(steps / k) * k == steps)
-                rewards[3, agent, i] = total if paid else 0.0
-                kept = 0.0 if paid else total
-                rewards[4, agent, i] = kept
-                ends[1, i] = truncated
-                best[0, lane] = steps / T
-                missed[agent, lane] = kept / k
+            if k == 1.0:  # paid at every step, without a division
+                for lane in range(count):
+                    i = first + lane
+                    rewards[3, agent, i] = accumulated[agent, i] + rewards[1, agent, i]
+                    rewards[4, agent, i] = 0.0
+                    missed[agent, lane] = 0.0
+            else:
+                for lane in range(count):
+                    i = first + lane
+                    steps = float64(t[i] + 1)
+                    total = accumulated[agent, i] + rewards[1, agent, i]
+                    # Exact: no quotient of integers below 2³¹ rounds to a whole number it is not.
+                    paid = (steps >= T) | (np.floor(steps / k) * k == steps)
+                    rewards[3, agent, i] = total if paid else 0.0
+                    kept = 0.0 if paid else total
+                    rewards[4, agent, i] = kept
+                    missed[agent, lane] = kept / k
             for lane in range(count):
                 observation[first + lane, S + 1 + agent] = missed[agent, lane]
+        for lane in range(count):
+            steps = float64(t[first + lane] + 1)
+            ends[1, first + lane] = steps >= T
+            best[0, lane] = steps / T
         for lane in range(count):
             observation[first + lane, S] = best[0, lane]
     return finite

@@ -27,6 +27,8 @@ Observation = npt.NDArray[np.float32]
 class Advanced(NamedTuple):
     """What one step of all lanes gives; every array is fresh.
 
+    The batch goes on from `values[4]`: copy it before handing it to whoever might write into it.
+
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
       optimal: `[B, A]` π* of the states acted in, in the unit range.
@@ -54,7 +56,9 @@ class Batch:
     """
 
     def __init__(self, task: Task, lanes: int) -> None:
-        self._dimensions = S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
+        S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
+        # Of what a step writes: next states, observations, optimal actions, values, ends.
+        self._shapes = (S, lanes), (lanes, S + 1 + n), (lanes, A), (5, n, lanes), (2, lanes)
         refuse_above_limit(
             lanes * 8 * (4 * S + 4 * A + 16 * n + 48),
             f"num_envs={lanes}: a batch this large",
@@ -116,9 +120,11 @@ class Batch:
         Raises:
           ActionError: not finite; nothing has moved then.
         """
-        B, (S, A, n) = self.lanes, self._dimensions
-        moved, observation = np.empty((S, B)), np.empty((B, S + 1 + n), np.float32)
-        optimal, values, ends = np.empty((B, A)), np.empty((5, n, B)), np.empty((2, B), bool)
+        # Machine code reads memory as it is told to: anything but this would be misread.
+        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        state, seen, best, paid, ended = self._shapes
+        moved, observation = np.empty(state), np.empty(seen, np.float32)
+        optimal, values, ends = np.empty(best), np.empty(paid), np.empty(ended, bool)
         if not self._step_many(
             self._params, self._s, self._t, self._accumulated, actions,
             moved, observation, optimal, values, ends,
@@ -126,5 +132,5 @@ class Batch:
             raise not_finite()
         self._s = moved
         self._t += 1
-        self._accumulated = values[4].copy()
+        self._accumulated = values[4]
         return Advanced(observation, optimal, values, ends[0], ends[1])

@@ -201,7 +201,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             "similarity": similarity,
             "step_reward": step_reward,
             "regret": regret,
-            "accumulated_reward": accumulated,
+            "accumulated_reward": accumulated.copy(),  # the batch goes on from the original
         }
         live = None
         if any_resting:
