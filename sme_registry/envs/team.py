@@ -77,7 +77,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
         self.render_mode = render_mode
         self._task = materialize(resolve(spec).derive(**overrides))
-        self._batch = Batch(self._task, 1)
+        self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
         self._every_column = np.concatenate(columns)
         ends = np.cumsum([len(part) for part in columns]).tolist()
@@ -100,9 +100,24 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             self._observation_spaces[name] = gymnasium.spaces.Box(
                 0.0, 1.0, (len(columns[agent]),), np.float32
             )
-        self._joint_shape = (1, self.sme_spec.action_dim)
+        self._arrange()
         self._joint_space, _ = action_ranges.space(action_range, self.sme_spec.action_dim)
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
+
+    def _arrange(self) -> None:
+        """The joint action `[1, A]`, and each agent's part of it: a view to write into."""
+        self._joint_action = np.zeros((1, self.sme_spec.action_dim))
+        row = self._joint_action[0]
+        self._slots = [(name, row[own].shape, row[own]) for _, name, own in self._parts]
+
+    # A copied view is a view no longer: the parts are laid out again where the copy lives.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = ("_joint_action", "_slots")
+        return {name: value for name, value in self.__dict__.items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._arrange()
 
     @property
     def task(self) -> Task:
@@ -206,7 +221,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         )
 
     def _infos(self, optimal: Array, values: list[list[float]]) -> dict[str, dict[str, Any]]:
-        optimal = action_ranges.to_range(optimal, self._rescaled)
+        optimal = action_ranges.to_range(optimal.copy(), self._rescaled)
         similarity, step_reward, regret, _, accumulated = values
         return {
             name: {
@@ -229,21 +244,17 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         if not self.agents:
             what = "has ended" if self._begun else "has not begun"
             raise EpisodeError(f"step: the episode {what}. Call reset() first.")
-        joint = np.empty(self._joint_shape)
-        row = joint[0]
-        for _, name, own in self._parts:
+        for name, shape, own in self._slots:
             try:
                 action = actions[name]
             except (KeyError, TypeError, IndexError):
                 raise self._bad_keys(actions) from None
             # Most actions are arrays as they should be, and checking costs as much as the step.
             usual = type(action) is np.ndarray and action.dtype.char in "fd"
-            if not usual or action.shape != (own.stop - own.start,):
-                action = self._checked(name, action)
-            row[own] = action
+            own[...] = action if usual and action.shape == shape else self._checked(name, action)
         if len(actions) != len(self.possible_agents):
             raise self._bad_keys(actions)
-        return (joint + 1.0) / 2.0 if self._rescaled else joint
+        return (self._joint_action + 1.0) / 2.0 if self._rescaled else self._joint_action
 
     def _checked(self, name: str, action: Any) -> Array:
         """One agent's action as float64, in the environment's range."""
