@@ -185,6 +185,7 @@ def _numpy_engine(task: Task) -> Engine:
         for row, value in zip(rewards, values, strict=True):
             row[:] = value.T
         ends[:] = done.terminated, done.truncated
+        t += 1
         return True
 
     def optimal_action(s: Array) -> Array:

@@ -252,7 +252,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
     Args:
       p: the packed task.
       s: `[S, B]` states, channel by channel.
-      t: `[B]` steps done before this one.
+      t: `[B]` steps done before this one; advanced in place.
       accumulated: `[n, B]` each agent's r_cum before this step.
       action: `[B, A]`, clipped here.
       moved: `[S, B]`, written: the next states.
@@ -263,7 +263,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:
-      False where an action was not finite; nothing is of use then.
+      False where an action was not finite; nothing has advanced then.
     """
     S, A, k, T = int(p[0]), int(p[1]), p[2], p[3]
     r_min, D, agents, widest = p[4], p[5], int(p[6]), int(p[7])
@@ -390,6 +390,9 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards
             best[0, lane] = steps / T
         for lane in range(count):
             observation[first + lane, S] = best[0, lane]
+    if finite:
+        for i in range(batch):
+            t[i] += 1
     return finite
 
 

@@ -23,6 +23,8 @@ Mask = npt.NDArray[np.bool_]
 Lanes = npt.NDArray[np.int64]
 Observation = npt.NDArray[np.float32]
 
+_FLOAT64 = np.dtype(np.float64)
+
 
 class Advanced(NamedTuple):
     """What one step of all lanes gives; every array is fresh, unless the batch reuses them.
@@ -75,16 +77,18 @@ class Batch:
         self._arrays = (self._allocate(), self._allocate()) if reuse else None
         self._load_engine()
 
-    def _allocate(self) -> tuple[Array, Observation, Array, Array, Mask]:
-        """What a step writes: next states, observation, optimal actions, values, ends."""
+    def _allocate(self) -> tuple[Array, Mask, Advanced]:
+        """What a step writes: next states, ends, and what it gives (with the ends as its last)."""
         state, observation, optimal, values, ends = self._shapes
-        return (
-            np.empty(state),
+        ended = np.empty(ends, bool)
+        given = Advanced(
             np.empty(observation, np.float32),
             np.empty(optimal),
             np.empty(values),
-            np.empty(ends, bool),
+            terminated=ended[0],
+            truncated=ended[1],
         )
+        return np.empty(state), ended, given
 
     def _load_engine(self) -> None:
         made = engine(self.task)
@@ -135,19 +139,19 @@ class Batch:
           ActionError: not finite; nothing has moved then.
         """
         # Machine code reads memory as it is told to: anything but this would be misread.
-        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        if actions.dtype is not _FLOAT64 or not actions.flags.c_contiguous:
+            actions = np.ascontiguousarray(actions, dtype=np.float64)
         if self._arrays is None:
             arrays = self._allocate()
         else:
             arrays, other = self._arrays
             self._arrays = other, arrays
-        moved, observation, optimal, values, ends = arrays
+        moved, ended, given = arrays
         if not self._step_many(
             self._params, self._s, self._t, self._accumulated, actions,
-            moved, observation, optimal, values, ends,
+            moved, given.observation, given.optimal, given.values, ended,
         ):  # fmt: skip
             raise not_finite()
         self._s = moved
-        self._t += 1
-        self._accumulated = values[4]
-        return Advanced(observation, optimal, values, ends[0], ends[1])
+        self._accumulated = given.values[4]
+        return given

@@ -264,10 +264,8 @@ def _masked(info: dict[str, Array], mask: Mask | None) -> dict[str, Any]:
     """Gymnasium's form of batched info: each key with its mask; zero where the mask is False."""
     masked: dict[str, Any] = {}
     if mask is None:
-        lanes = len(info["similarity"])
-        for (key, value), everywhere in zip(
-            info.items(), np.ones((len(info), lanes), bool), strict=True
-        ):
+        everywhere = np.ones(len(info["similarity"]), bool)
+        for key, value in info.items():
             masked[key], masked[f"_{key}"] = value, everywhere
         return masked
     for key, value in info.items():
