@@ -73,8 +73,7 @@ class Batch:
         self._s = np.zeros((S, lanes))
         self._t = np.zeros(lanes, np.int64)
         self._accumulated = np.zeros((n, lanes))
-        # Two sets in turn: a step reads the state from the one that it does not write.
-        self._arrays = (self._allocate(), self._allocate()) if reuse else None
+        self._reuse = reuse
         self._load_engine()
 
     def _allocate(self) -> tuple[Array, Mask, Advanced]:
@@ -93,10 +92,12 @@ class Batch:
     def _load_engine(self) -> None:
         made = engine(self.task)
         self._params, self._step_many = made.params, made.step_many
+        # Two sets in turn: a step reads the state from the one that it does not write.
+        self._arrays = (self._allocate(), self._allocate()) if self._reuse else None
 
-    # Machine code cannot be pickled or copied: it is looked up again where the copy lives.
+    # Machine code cannot be pickled or copied, nor can views: both are made anew with the copy.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_params", "_step_many")
+        dropped = ("_params", "_step_many", "_arrays")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

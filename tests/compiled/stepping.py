@@ -61,8 +61,8 @@ def step_batch(
     )
     values, ends = np.empty((5, n, B)), np.empty((2, B), bool)
     if not engine.step_many(
-        engine.params, np.ascontiguousarray(states.T), t, np.ascontiguousarray(r_cum.T), actions,
-        moved, observation, optimal, values, ends,
+        engine.params, np.ascontiguousarray(states.T), t.copy(), np.ascontiguousarray(r_cum.T),
+        actions, moved, observation, optimal, values, ends,
     ):  # fmt: skip
         return None
     return Result(moved.T, observation, optimal, *values.transpose(0, 2, 1), *ends)
