@@ -43,7 +43,7 @@ def demo(
 
       sme demo
 
-      sme demo --quick --out /tmp/demo
+      sme demo --quick --out demo
     """
     from sme_registry import training
     from sme_registry.cli.runs import how_to_go_on
