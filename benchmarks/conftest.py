@@ -54,7 +54,8 @@ def compare(benchmark: Any) -> Callable[..., None]:
     """`compare(title, unit, ours, peers, units)`: rows for one of our functions and its peers.
 
     Each function does `n` units of work when called with n; `peers` maps a name to
-    `(function, n of a round, bar)`; a bar is the least peer time divided by our time.
+    `(function, n of a round, bar)`; a bar is the least peer time divided by our time, 0 where
+    the peer only stands there to compare.
     """
 
     def measure(
@@ -95,9 +96,12 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         )
     for row in rows:
         met = "met" if row.ratio >= row.bar else "[bold]missed[/bold]"
+        bar = f"{row.bar:.3g} ×"
+        if not row.bar:
+            met, bar = "", "none"
         table.add_row(
             row.title, row.unit, _time(row.ours), row.peer_name, _time(row.peer),
-            f"{row.ratio:.2f} ×", f"{row.bar:.3g} ×", met,
+            f"{row.ratio:.2f} ×", bar, met,
         )  # fmt: skip
     terminalreporter.write_line("")
     console = Console(file=sys.stdout, width=130)
