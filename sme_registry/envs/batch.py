@@ -15,6 +15,7 @@ import numpy.typing as npt
 from sme_registry.compiled import engine
 from sme_registry.envs.actions import not_finite
 from sme_registry.envs.initial_states import InitialStates
+from sme_registry.errors import ActionError
 from sme_registry.task import Task, observe
 from sme_registry.task.memory import refuse_above_limit
 
@@ -137,9 +138,13 @@ class Batch:
           actions: `[B, A]` float64 of the unit range; clipped.
 
         Raises:
-          ActionError: not finite; nothing has moved then.
+          ActionError: of another shape, or not finite; nothing has moved then.
         """
         # Machine code reads memory as it is told to: anything but this would be misread.
+        if actions.shape != self._shapes[2]:
+            raise ActionError(
+                f"action of shape {actions.shape}: must be of shape {self._shapes[2]}."
+            )
         if actions.dtype is not _FLOAT64 or not actions.flags.c_contiguous:
             actions = np.ascontiguousarray(actions, dtype=np.float64)
         if self._arrays is None:

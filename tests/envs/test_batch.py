@@ -145,3 +145,26 @@ def test_the_state_that_is_handed_out_is_a_copy(lanes: int, state_dim: int) -> N
 def test_a_batch_too_large_for_memory_is_refused() -> None:
     with pytest.raises(ResourceLimitError, match="num_envs=1000000000"):
         Batch(materialize(SPECS["individual"]), 10**9)
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (3, 4), (2, 8), (8,)])
+def test_actions_of_another_shape_are_refused_before_machine_code_reads_them(
+    backend: str, shape: tuple[int, ...]
+) -> None:
+    batch = Batch(materialize(SPECS["one"]), 2)
+    batch.begin(np.arange(2), batch.observe())
+    before = batch.state
+    with pytest.raises(ActionError, match="must be of shape"):
+        batch.advance(np.full(shape, 0.5))
+    np.testing.assert_array_equal(batch.state, before)
+
+
+def test_actions_laid_out_otherwise_are_read_as_they_mean(backend: str) -> None:
+    batches = [Batch(materialize(SPECS["one"]), 3) for _ in range(3)]
+    for batch in batches:
+        batch.begin(np.arange(3), batch.observe(), np.full((3, 8), 0.3))
+    a = np.random.default_rng(0).random((3, 4))
+    strided = np.repeat(a, 2, axis=1)[:, ::2]
+    for batch, actions in zip(batches, (a, np.asfortranarray(a), strided), strict=True):
+        batch.advance(actions)
+        np.testing.assert_array_equal(batch.state, batches[0].state)
