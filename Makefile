@@ -2,6 +2,7 @@
 # Everything is installed into .venv, in the versions of constraints.txt.
 
 VENV := .venv
+BOARD := runs/board
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
@@ -11,15 +12,20 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench docs clean
+.PHONY: help install demo serve test check bench docs clean
 
 help:            ## show this list
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
 
 install: $(INSTALLED)  ## the virtual environment, with everything in it
 
-demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, draw the figures
+demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, put it on a leaderboard
 	$(VENV)/bin/sme demo
+	$(VENV)/bin/sme-leaderboard demo
+
+serve: $(INSTALLED)    ## a leaderboard on this machine: the pages, and an API that takes submissions
+	@test -f $(BOARD)/board.json || $(VENV)/bin/sme-leaderboard init $(BOARD)
+	$(VENV)/bin/sme-leaderboard serve $(BOARD)
 
 test: $(INSTALLED)     ## the whole test suite, as CI runs it
 	$(PY) -m pytest -n auto

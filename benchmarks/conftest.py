@@ -55,11 +55,17 @@ def compare(benchmark: Any) -> Callable[..., None]:
 
     Each function does `n` units of work when called with n; `peers` maps a name to
     `(function, n of a round, bar)`; a bar is the least peer time divided by our time, 0 where
-    the peer only stands there to compare.
+    the peer only stands there to compare. `clock` is wall time, or `time.thread_time` for work so
+    long that other jobs on the machine would be measured with it.
     """
 
     def measure(
-        title: str, unit: str, ours: Work, units: int, peers: dict[str, tuple[Work, int, float]]
+        title: str,
+        unit: str,
+        ours: Work,
+        units: int,
+        peers: dict[str, tuple[Work, int, float]],
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         works = {"ours": (ours, units), **{name: peer[:2] for name, peer in peers.items()}}
         for work, count in works.values():  # warm up: compilation, caches, lazy imports
@@ -67,9 +73,9 @@ def compare(benchmark: Any) -> Callable[..., None]:
         seconds: dict[str, list[float]] = {name: [] for name in works}
         for _ in range(ROUNDS):
             for name, (work, count) in works.items():
-                begun = time.perf_counter()
+                begun = clock()
                 work(count)
-                seconds[name].append((time.perf_counter() - begun) / count)
+                seconds[name].append((clock() - begun) / count)
         medians = {name: statistics.median(values) for name, values in seconds.items()}
         for name, (_, _, bar) in peers.items():
             row = Row(title, unit, medians["ours"], name, medians[name], bar)

@@ -1,14 +1,15 @@
-"""Writes `docs/catalogue.md` from the files under `specs/`: `make docs`."""
+"""Writes the pages of `docs/` that are lists of what the code and `specs/` hold: `make docs`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from leaderboard.errors import CODES
 from sme_registry.files import write_atomically
 from sme_registry.spec import EnvFile, ProtocolFile, SuiteFile
 from sme_registry.spec.catalogue import entries
 
-PAGE = Path(__file__).with_name("catalogue.md")
+FOLDER = Path(__file__).parent
 _FIELDS = ("state_dim", "action_dim", "k", "r_min", "D", "complexity", "hidden_width")
 _SYMBOLS = ("S", "A", "k", "r_min", "D", "L", "H")
 
@@ -46,10 +47,27 @@ def catalogue() -> str:
     return "\n".join(lines) + "\n"
 
 
+def leaderboard_codes() -> str:
+    """The page of the codes with which a board refuses."""
+    lines = [
+        "# Codes",
+        "",
+        "Written by `make docs`. With these a board refuses: at the command line (exit code 1),",
+        "over HTTP (`code`), and in a rejected result. What is released keeps its meaning.",
+        "",
+        "| Code | |",
+        "|---|---|",
+        *(f"| `{code}` | {meaning} |" for code, meaning in CODES.items()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def _short(digest: str) -> str:
     return digest[: len("sha256:") + 12]
 
 
+PAGES = {"catalogue.md": catalogue, "leaderboard-codes.md": leaderboard_codes}
+
 if __name__ == "__main__":
-    write_atomically(PAGE, catalogue())
-    print(f"wrote {PAGE}")
+    for name, page in PAGES.items():
+        print(f"wrote {write_atomically(FOLDER / name, page())}")

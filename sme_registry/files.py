@@ -1,4 +1,4 @@
-"""Reading strict JSON, and writes that are whole or absent.
+"""Reading strict JSON, importing what a file names, and writes that are whole or absent.
 
 Every file this package writes goes through `write_atomically`: into a temporary file beside
 the target, then renamed over it. A killed process leaves the old file, never half a new one.
@@ -7,13 +7,15 @@ the target, then renamed over it. A killed process leaves the old file, never ha
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
-import tempfile
+import secrets
+import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sme_registry.errors import MalformedDocumentError, OptionError
+from sme_registry.errors import MalformedDocumentError, OptionError, SMEError, did_you_mean
 
 MAX_DOCUMENT_BYTES = 64 * 2**20
 
@@ -86,6 +88,35 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     return parse_json(text, str(path))
 
 
+def imported(name: str, field: str, error: type[SMEError]) -> Any:
+    """What `module:function` names; the module is looked for in this folder, too.
+
+    Args:
+      name: `module:function`. Importing a module runs it.
+      field: what the name was given for, which a message begins with.
+      error: the kind of error to raise.
+
+    Raises:
+      SMEError: of that kind: the module or its function is not there, or fails when it is imported.
+    """
+    module_name, _, attribute = name.partition(":")
+    folder, near = os.getcwd(), ""
+    sys.path.insert(0, folder)
+    try:
+        module = importlib.import_module(module_name)
+        near = did_you_mean(attribute, dir(module))
+        return getattr(module, attribute)
+    except SMEError:
+        raise
+    except Exception as reason:
+        raise error(
+            f"{field}={name!r}: cannot be imported: {type(reason).__name__}: {reason}.{near} It "
+            "must be module:function, the module in this folder or installed."
+        ) from reason
+    finally:
+        sys.path.remove(folder)
+
+
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
     """Write a file whole or not at all; the folder is made where it is missing.
 
@@ -104,14 +135,13 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
     try:
         data = content.encode("utf-8") if isinstance(content, str) else content
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:64]}.", dir=path.parent)
+        temporary = str(path.parent / f".{path.name[:64]}.{secrets.token_hex(8)}")
+        # Not mkstemp, whose 0600 would hide results from colleagues; the umask is the user's.
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's 0600 would hide results from colleagues
         os.replace(temporary, path)
         temporary = None
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
@@ -121,7 +151,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
         ) from None
     finally:
         if temporary is not None:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):
                 os.unlink(temporary)
     return path
 

@@ -1,8 +1,8 @@
 """Figures: decay outside the training cube, similarity over the plane, regret during training.
 
-Every function writes one file, PNG, PDF or SVG by its ending, and draws off screen, without a
-display. Colours are those of Okabe and Ito, which the colour-blind tell apart; lines also differ in
-dash and marker, and maps in lightness, so that a print in grey can be read.
+Every figure is one file, PNG, PDF or SVG by its ending, and is drawn off screen, without a
+display; `drawing` is how. Colours are those of Okabe and Ito, which the colour-blind tell apart;
+lines also differ in dash and marker, and maps in lightness, so that a print in grey can be read.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ Measure = Literal["similarity", "normalised_regret"]
 _UNDATED: dict[str, Any] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 FORMATS = tuple(_UNDATED)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_MARKERS = "osD^vPX"
-_GREY = "#707070"
+MARKERS = "osD^vPX"
+GREY = "#707070"
 _DRAWN_POINTS = 400  # of a smoothed line: enough for its every bend at this size
-_REFERENCE_DASHES: dict[str, Any] = {
+REFERENCE_DASHES: dict[str, Any] = {
     "optimal": "-",
     "linear_least_squares": (0, (6, 2)),
     "best_constant": (0, (3, 1, 1, 1)),
@@ -119,10 +119,10 @@ def _decay_panel(
         axes.plot(
             *line(report.regions),
             color=COLOURS[index % len(COLOURS)],
-            marker=_MARKERS[index % len(_MARKERS)],
+            marker=MARKERS[index % len(MARKERS)],
             markersize=4.5,
             linewidth=2,
-            label=_literal(report.policy),
+            label=literal(report.policy),
         )
     agents = reports[0].agents if len(reports) == 1 else {}
     for index, (name, agent) in enumerate(agents.items()):
@@ -131,7 +131,7 @@ def _decay_panel(
         axes.plot(
             *line(agent.regions),
             color=COLOURS[5 if several else index + 1],
-            marker="" if several else _MARKERS[index + 1],
+            marker="" if several else MARKERS[index + 1],
             markersize=3.5,
             linewidth=1.2,
             alpha=0.8,
@@ -145,14 +145,14 @@ def _decay_panel(
         for name, regions in reports[index].references.items():
             axes.plot(
                 *line(regions),
-                color=_GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)],
+                color=GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)],
                 linewidth=1.1,
-                linestyle=_REFERENCE_DASHES.get(name, "-"),
+                linestyle=REFERENCE_DASHES.get(name, "-"),
                 zorder=1.5,
             )
     for name in reports[0].references if references else ():
-        dash = _REFERENCE_DASHES.get(name, "-")
-        axes.plot([], [], color=_GREY, linewidth=1.1, linestyle=dash, label=LABELS.get(name, name))
+        dash = REFERENCE_DASHES.get(name, "-")
+        axes.plot([], [], color=GREY, linewidth=1.1, linestyle=dash, label=LABELS.get(name, name))
     levels = sorted({r.epsilon_high for report in reports for r in report.regions})
     dims = sorted({report.spec.state_dim for report in reports})
     warning = (
@@ -212,7 +212,7 @@ def similarity_map(
     low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0
     with _drawing(path, (5.0, 4.2)) as figure:
         side = low + (np.arange(int(resolution)) + 0.5) * (high - low) / int(resolution)
-        similarity = _similarity_on_grid(asked, spec, side, time)
+        similarity = similarity_on_grid(asked, spec, side, time)
         axes = figure.add_subplot()
         axes.grid(visible=False)
         image = axes.imshow(
@@ -232,7 +232,7 @@ def similarity_map(
         inside = (side >= 0.0) & (side <= 1.0)
         means = [similarity[np.ix_(inside, inside)].mean(), similarity.mean()]
         axes.set_title(
-            f"{_literal(asked.name)} on {catalogue.title(spec)}, L = {spec.complexity}\n"
+            f"{literal(asked.name)} on {catalogue.title(spec)}, L = {spec.complexity}\n"
             f"mean r̃ {means[0]:.3f} in the unit square, {means[1]:.3f} in all shown"
         )
         axes.locator_params(nbins=5)
@@ -241,8 +241,18 @@ def similarity_map(
     return Path(path)
 
 
-def _similarity_on_grid(asked: Any, spec: SMESpec, side: Array, time: float) -> Array:
-    """r̃ `[N, N]`, rows by the second state channel."""
+def similarity_on_grid(asked: Any, spec: SMESpec, side: Array, time: float) -> Array:
+    """r̃ of a policy over the plane of a task with two state channels.
+
+    Args:
+      asked: what `as_policy` returns.
+      spec: the task.
+      side: `[N]` of each state channel.
+      time: the input t/T.
+
+    Returns:
+      `[N, N]` in [0, 1], rows by the second state channel.
+    """
     task = materialize(spec)
     oracle = engine(task).optimal_action
     rows = []
@@ -287,13 +297,13 @@ def training_curve(
     with _drawing(path, (6.2, 3.6)) as figure:
         axes = figure.add_subplot()
         axes.scatter(
-            step, regret, s=8, color=_GREY, alpha=0.4, linewidths=0, rasterized=True,
+            step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True,
             label="one episode",
         )  # fmt: skip
         drawn, smooth = _running_median(step, regret, int(window))
         label = f"median of {int(window)} episodes"
         axes.plot(drawn, smooth, color=COLOURS[0], linewidth=2.2, label=label)
-        axes.axhline(0.0, color=_GREY, linewidth=1.1)
+        axes.axhline(0.0, color=GREY, linewidth=1.1)
         axes.annotate(
             "optimal", (1.0, 0.0), xycoords=("axes fraction", "data"), xytext=(0, 3),
             textcoords="offset points", ha="right", color="#555555", fontsize=8,
@@ -303,7 +313,7 @@ def training_curve(
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.set_xlabel("environment steps")
         axes.set_ylabel("mean regret per step  (1 − r)")
-        axes.set_title(_literal(title))
+        axes.set_title(literal(title))
         axes.legend(loc="upper right")
     return Path(path)
 
@@ -351,8 +361,29 @@ def _drawing(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
     """A figure that is written when the block ends without an error: whole, or not at all."""
     path = Path(path)
     ending = path.suffix.removeprefix(".").lower()
-    if ending not in _UNDATED:
-        raise OptionError(f"{path}: must end in {', '.join('.' + known for known in _UNDATED)}.")
+    if ending not in FORMATS:
+        raise OptionError(f"{path}: must end in {', '.join('.' + known for known in FORMATS)}.")
+    with drawing(size, (ending,)) as (figure, drawn):
+        yield figure
+    write_atomically(path, drawn[ending])
+
+
+@contextlib.contextmanager
+def drawing(
+    size: tuple[float, float], formats: Iterable[str]
+) -> Iterator[tuple[Figure, dict[str, bytes]]]:
+    """A figure in this package's style, and what it is as files once the block has ended.
+
+    Args:
+      size: width and height in inches.
+      formats: of `FORMATS`.
+
+    Yields:
+      The figure to draw in, and a dict which holds each format's bytes after the block.
+
+    Raises:
+      MissingDependencyError: Matplotlib is not installed.
+    """
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -362,16 +393,25 @@ def _drawing(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
             "Figures need Matplotlib, which is not installed. "
             "Run `pip install 'sme-registry[plot]'`."
         ) from None
-    content = io.BytesIO()
+    drawn: dict[str, bytes] = {}
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size)
         FigureCanvasAgg(figure)
-        yield figure
-        figure.savefig(content, format=ending, dpi=160, metadata=_UNDATED[ending])
-    write_atomically(path, content.getvalue())
+        yield figure, drawn
+        for ending in formats:
+            content = io.BytesIO()
+            figure.savefig(content, format=ending, dpi=160, metadata=_UNDATED[ending])
+            drawn[ending] = content.getvalue()
 
 
-def _literal(text: str) -> str:
+def shades(count: int) -> list[tuple[float, ...]]:
+    """Colours for values in an order, dark to light, all of them legible on white."""
+    from matplotlib import colormaps
+
+    return [tuple(colour) for colour in colormaps["viridis"](np.linspace(0.0, 0.85, count))]
+
+
+def literal(text: str) -> str:
     """Text of a user's that Matplotlib does not read as a formula."""
     return text.replace("$", r"\$")
 

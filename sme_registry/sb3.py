@@ -83,7 +83,7 @@ class _SingleLane(_Lane):
         return observations[self._row], info
 
 
-class _LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
+class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
     """What a `VecEnv` does with its lanes, whatever steps them.
 
     Args:
@@ -162,7 +162,7 @@ class _LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped c
         return [False for _ in self._get_indices(indices)]
 
 
-class SMEVecEnv(_LanesVecEnv):
+class SMEVecEnv(LanesVecEnv):
     """`num_envs` lanes of one task for SB3's algorithms and `VecEnv` wrappers.
 
     As in SB3's own, a finished lane begins its next episode at once, its last observation is
@@ -241,7 +241,7 @@ class SMEVecEnv(_LanesVecEnv):
         return observations, rewards.astype(np.float32), dones, infos
 
 
-class SMETeamVecEnv(_LanesVecEnv):
+class SMETeamVecEnv(LanesVecEnv):
     """`num_envs` teams of one task, each of their agents a lane: one policy for all agents.
 
     Lane e·n + i is agent i of team e. It sees its *shared observation* `[S + 2 + n]` in [0, 1]: the

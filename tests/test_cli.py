@@ -17,12 +17,15 @@ from typer.testing import CliRunner, Result
 import sme_registry
 from sme_registry import EvaluationReport, SMESpec, load
 from sme_registry.cli import app
-from sme_registry.spec import EnvFile, ProtocolFile, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
 from sme_registry.task.certify import certify
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
-KINDS = (EnvFile, SuiteFile, ProtocolFile)
-COMMANDS = ["list", "show", "new", "validate", "certify", "evaluate", "train", "demo"]
+KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
+COMMANDS = [
+    *("list", "show", "new", "validate", "certify"),
+    *("evaluate", "train", "diagnose", "study", "demo"),
+]
 
 
 def sme(*arguments: str | Path) -> Result:
@@ -315,7 +318,7 @@ class TestNew:
 class TestValidate:
     def test_each_kind_is_told_and_folders_are_searched(self) -> None:
         results = json.loads(good("validate", catalogue.spec_folder(), "--json").stdout)
-        assert {result["kind"] for result in results} == {"env", "suite", "protocol"}
+        assert {result["kind"] for result in results} == {"env", "suite", "protocol", "study"}
         assert all(result["valid"] for result in results)
         assert len(results) == sum(len(catalogue.paths(kind)) for kind in KINDS)
 

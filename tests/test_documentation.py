@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/specs.md", "docs/teams.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/specs.md", "docs/teams.md", "docs/datasets.md"]
+)
 def test_the_python_of_a_page_runs_from_top_to_bottom(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -36,9 +39,14 @@ def test_every_relative_link_leads_to_a_file(page: Path) -> None:
     assert not missing
 
 
-def test_the_catalogue_page_is_what_make_docs_writes() -> None:
-    generate = runpy.run_path(str(ROOT / "docs" / "generate.py"))
-    assert generate["PAGE"].read_text() == generate["catalogue"](), "run `make docs`"
+GENERATED: dict[str, Callable[[], str]] = runpy.run_path(str(ROOT / "docs" / "generate.py"))[
+    "PAGES"
+]
+
+
+@pytest.mark.parametrize("name", GENERATED)
+def test_a_generated_page_is_what_make_docs_writes(name: str) -> None:
+    assert (ROOT / "docs" / name).read_text() == GENERATED[name](), "run `make docs`"
 
 
 def test_the_readme_names_every_environment_and_suite() -> None:

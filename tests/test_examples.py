@@ -58,3 +58,11 @@ def test_the_torchrl_example_trains_where_torchrl_is_installed() -> None:
     )
     assert len(before) == len(after) == 2
     assert all(end < 0.7 * start for start, end in zip(before, after, strict=True))
+
+
+def test_the_sb3_contrib_example_trains_all_it_names() -> None:
+    pytest.importorskip("sb3_contrib")
+    done = run(ROOT / "examples" / "sb3_contrib_cell.py", "--env", "Plane1", "--steps", "64")
+    assert done.returncode == 0, done.stderr
+    rows = [line[:12].strip() for line in done.stdout.splitlines()]
+    assert rows == ["algorithm", "PPO", "TRPO", "TRPO, wide", "linear"]

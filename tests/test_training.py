@@ -28,10 +28,10 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
+from sme_registry.terminal.progress import Meter, duration
 from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, checkpoint, train
 from sme_registry.training.algorithms import known_algorithm
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
-from sme_registry.training.progress import Meter, duration
 
 pytest.importorskip("stable_baselines3")
 

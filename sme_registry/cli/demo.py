@@ -11,8 +11,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli.output import err, out
 from sme_registry.files import write_atomically
+from sme_registry.terminal.output import err, out
 
 if TYPE_CHECKING:
     from sme_registry.training import TrainingResult

@@ -13,13 +13,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from sme_registry.cli import names
-from sme_registry.cli.output import err, mark, out, print_json, print_pairs
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.files import read_json
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
     SMESpec,
+    StudyFile,
+    StudyPlan,
     Suite,
     SuiteFile,
     TeamSpec,
@@ -28,6 +29,7 @@ from sme_registry.spec import (
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import resolve, with_fingerprint
+from sme_registry.terminal.output import err, mark, out, print_json, print_pairs
 
 Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
 
@@ -38,6 +40,7 @@ class Kind(enum.StrEnum):
     env = "env"
     suite = "suite"
     protocol = "protocol"
+    study = "study"
 
 
 class Schema(enum.StrEnum):
@@ -49,6 +52,8 @@ class Schema(enum.StrEnum):
     suite_file = "suite-file"
     protocol = "protocol"
     protocol_file = "protocol-file"
+    study = "study"
+    study_file = "study-file"
 
 
 _SCHEMAS: dict[Schema, type[BaseModel]] = {
@@ -58,19 +63,19 @@ _SCHEMAS: dict[Schema, type[BaseModel]] = {
     Schema.suite_file: SuiteFile,
     Schema.protocol: EvaluationProtocol,
     Schema.protocol_file: ProtocolFile,
+    Schema.study: StudyPlan,
+    Schema.study_file: StudyFile,
 }
 
 
 def list_(
-    kind: Annotated[
-        Kind | None, typer.Option("--kind", "-k", help="Only environments, suites or protocols.")
-    ] = None,
+    kind: Annotated[Kind | None, typer.Option("--kind", "-k", help="Only one kind.")] = None,
     tag: Annotated[
         list[str] | None, typer.Option("--tag", "-t", help="Only what has this tag; repeatable.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """The catalogue: environments, suites and protocols.
+    """The catalogue: environments, suites, protocols and studies.
 
     Examples:
 
@@ -164,7 +169,30 @@ def _protocol_table(files: list[ProtocolFile]) -> Table:
     return table
 
 
-_TABLES: dict[str, Any] = {"env": _env_table, "suite": _suite_table, "protocol": _protocol_table}
+def _study_table(files: list[StudyFile]) -> Table:
+    table = Table(title="Studies", title_justify="left")
+    for column in ("name", "classes", "algorithms", "runs", "description"):
+        table.add_column(column, no_wrap=column == "name")
+    for file in files:
+        plan = file.plan
+        algorithms = ", ".join(algorithm.name for algorithm in plan.algorithms)
+        runs = len(plan.classes) * len(plan.algorithms) * plan.seeds
+        table.add_row(
+            file.versioned_name,
+            str(len(plan.classes)),
+            escape(algorithms),
+            f"{runs:,}",
+            escape(file.description),
+        )
+    return table
+
+
+_TABLES: dict[str, Any] = {
+    "env": _env_table,
+    "suite": _suite_table,
+    "protocol": _protocol_table,
+    "study": _study_table,
+}
 
 
 def show(
@@ -208,6 +236,9 @@ def show(
         print_json(found.plain())
     elif isinstance(document, Suite):
         _show_suite(cast(SuiteFile, found))
+    elif isinstance(found, StudyFile):
+        out().print(_study_table([found]))
+        out().print(f"{found.digest}\nIts runs and what they take: sme study plan {escape(name)}")
     else:
         print_pairs(_title(found), {**document.plain(), "digest": found.digest})
 
@@ -531,12 +562,14 @@ def _validated(path: Path) -> dict[str, Any]:
     result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
     try:
         file = names.read_any(path)
-        result["kind"] = "env" if isinstance(file, EnvFile) else file.content
+        result["kind"] = next(kind for kind, of in names.KINDS.items() if isinstance(file, of))
         result |= {"name": file.versioned_name, "digest": file.digest}
         if isinstance(file, EnvFile):
             materialize(with_fingerprint(file))
         elif isinstance(file, SuiteFile):
             _ = file.suite.instances
+        elif isinstance(file, StudyFile):
+            _ = file.plan.cells
         result["valid"] = True
     except SMEError as error:
         text = str(error)
@@ -586,8 +619,9 @@ def _tasks_of(name: str) -> list[tuple[str, SMESpec]]:
             for member in found.suite.classes
             for spec in member.instances
         ]
-    if isinstance(found, ProtocolFile):
-        raise UnknownNameError(f"{name!r}: is a protocol. Give a task or a suite.")
+    if isinstance(found, ProtocolFile | StudyFile):
+        kind = "protocol" if isinstance(found, ProtocolFile) else "study"
+        raise UnknownNameError(f"{name!r}: is a {kind}. Give a task or a suite.")
     spec = found if isinstance(found, SMESpec) else with_fingerprint(cast(EnvFile, found))
     return [(name, spec)]
 

@@ -14,11 +14,18 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.files import parse_json, read_json
-from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.resolve import refuse_bare_spec, resolve
 
-KINDS: dict[str, type[Envelope]] = {"env": EnvFile, "suite": SuiteFile, "protocol": ProtocolFile}
+# The first of a name is what is meant by it: `smoke` is a suite, and the study of that name is what
+# `sme study` takes.
+KINDS: dict[str, type[Envelope]] = {
+    "env": EnvFile,
+    "suite": SuiteFile,
+    "protocol": ProtocolFile,
+    "study": StudyFile,
+}
 
 
 def read_any(path: str | os.PathLike[str]) -> Envelope:
@@ -46,7 +53,7 @@ def find_any(name: str) -> Envelope | SMESpec:
     """The file of a name, path or digest; a spec alone where it has no file of its own.
 
     Raises:
-      UnknownNameError: no environment, suite or protocol has this name or digest.
+      UnknownNameError: no environment, suite, protocol or study has this name or digest.
     """
     if is_path(name):
         return read_any(name)

@@ -11,11 +11,11 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli import names
-from sme_registry.cli.output import err, out, print_json
 from sme_registry.cli.policies import REFERENCES, find_policy
 from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.resolve import resolve
+from sme_registry.terminal.output import err, out, print_json
 
 TaskName = Annotated[str, typer.Argument(metavar="TASK", help="A name, a path, or a digest.")]
 Protocol = Annotated[
@@ -32,7 +32,7 @@ def evaluate(
         str,
         typer.Argument(
             metavar="POLICY",
-            help=f"A model's .zip, module:function, or {', '.join(REFERENCES)}.",
+            help=f"A .zip, .onnx or .npz, module:function, or {', '.join(REFERENCES)}.",
         ),
     ],
     task: TaskName,
@@ -52,9 +52,10 @@ def evaluate(
     """Judge a policy within and out of distribution, beside policies that know nothing or all.
 
     A function takes observations `[B, S + 2]` and returns actions `[B, A]`. A .zip of
-    Stable-Baselines3 is code: open only those whose author you trust.
+    Stable-Baselines3 is code: open only those whose author you trust. An .onnx file's network is
+    as a function: in the unit range, unless --action-range says otherwise.
 
-    A team's function or .zip is the policy that all agents share: it is asked for each agent in
+    A team's function or file is the policy that all agents share: it is asked for each agent in
     turn, with its shared observation `[B, S + 2 + n]` (the state with what the agent does not
     observe set to 0, t/T, its r_cum/k, the one-hot of the agent), and returns `[B, max a_i]`.
     The report has each agent, too.
@@ -65,12 +66,14 @@ def evaluate(
 
       sme evaluate runs/demo/model.zip Default --out runs/demo-again
 
+      sme evaluate actor.onnx Default --action-range symmetric
+
       sme evaluate mypolicy:act Default --protocol quick-v1 --json
 
       sme evaluate runs/Team4-PPO-seed0/model.zip Team4
     """
     from sme_registry import evaluation
-    from sme_registry.training.progress import Meter
+    from sme_registry.terminal.progress import Meter
 
     spec = resolve(task).derive(**names.overrides(set_ or []))
     judged_by = evaluation.resolve_protocol(protocol)

@@ -131,6 +131,18 @@ class Batch:
         observation[lanes, :S] = states
         observation[lanes, S:] = 0.0
 
+    def place(self, states: Array, t: Lanes, accumulated: Array) -> None:
+        """Put every lane where an episode can be, also in its middle; `observe` says what is seen.
+
+        Args:
+          states: `[B, S]` in [0, 1].
+          t: `[B]` steps completed, in [0, T).
+          accumulated: `[B, n]` each agent's r_cum.
+        """
+        self._s[:] = states.T
+        self._t[:] = t
+        self._accumulated[:] = accumulated.T
+
     def advance(self, actions: Array) -> Advanced:
         """One step of every lane.
 

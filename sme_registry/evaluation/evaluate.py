@@ -46,7 +46,8 @@ def evaluate(
     Args:
       policy: a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, a
         Stable-Baselines3 model, or the path of such a model's .zip (which can run code of whoever
-        made it). Models act deterministically. Actions are clipped as the environment clips them.
+        made it) or of an .onnx file. Models act deterministically. Actions are clipped as the
+        environment clips them.
         For a team, a dict from each agent's name to such a policy of the agent's own, from its
         observations `[B, |O_i| + 2]` to its actions `[B, a_i]`; or one such policy that all agents
         share, asked for each in turn, from its shared observation `[B, S + 2 + n]` (see
@@ -54,7 +55,7 @@ def evaluate(
       spec_or_id: the task: a spec, its fields, an id, a digest or a path.
       protocol: a protocol, its fields, its name in the catalogue, or the path of its file.
       action_range: what the policy's actions are in, "unit" for [0, 1] or "symmetric" for
-        [−1, 1]; None takes an SB3 model's own action space, and "unit" for a callable.
+        [−1, 1]; None takes an SB3 model's own action space, and "unit" for any other policy.
       name: what the report calls the policy.
       progress: called after each batch with the states done and the states in all.
 
@@ -149,6 +150,7 @@ def resolve_protocol(
 
 
 _POLICY = ""  # the key of the policy in question among the references' names
+_POLICIES_OWN = ("torch", "stable_baselines3", "onnxruntime")
 _WHOLE = ""  # the key of all action channels among the agents' names
 
 
@@ -205,7 +207,7 @@ def _versions(fast: Engine) -> dict[str, str]:
 
     packages = ["numpy", "scipy", "gymnasium"]
     packages += ["numba"] if fast.backend == "numba" else []
-    packages += [name for name in ("torch", "stable_baselines3") if name in sys.modules]
+    packages += [name for name in _POLICIES_OWN if name in sys.modules]
     return {
         "sme_registry": __version__,
         "python": platform.python_version(),

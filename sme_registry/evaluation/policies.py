@@ -1,7 +1,8 @@
 """Policies: whatever a user has, as one function from observations to actions of the unit range.
 
 A policy is a callable `[B, S + 2] → [B, A]`, a Stable-Baselines3 model or policy, or the path of an
-SB3 model's .zip. An SB3 .zip is code: open only those whose author you trust.
+SB3 model's .zip or of an .onnx file. An SB3 .zip is code, and an .onnx file is run in this process
+without any limit: open only those whose author you trust.
 
 A team's is a dict from each agent's name to a policy of what that agent observes and owns,
 `[B, |O_i| + 2] → [B, a_i]`; or one policy for all agents, asked for each in turn with its shared
@@ -151,14 +152,15 @@ def as_policy(
       policy: the policy.
       spec: the task it is for.
       action_range: the range of its actions; None takes an SB3 model's own action space, and
-        "unit" for a callable.
+        "unit" for a callable or an .onnx file.
       name: what reports call it; None takes the file's, algorithm's or function's name.
 
     Raises:
       PolicyError: it is none of these, cannot be loaded, or is made for other spaces; or an agent
         of a team is missing or unknown.
       OptionError: `action_range` is neither "unit" nor "symmetric".
-      MissingDependencyError: a .zip is given and Stable-Baselines3 is not installed.
+      MissingDependencyError: a .zip is given and Stable-Baselines3 is not installed, or an .onnx
+        file and onnxruntime is not.
     """
     if action_range not in (None, *_LOW):
         raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
@@ -192,7 +194,8 @@ def _prepared(
     """
     if isinstance(policy, str | os.PathLike):
         name = Path(policy).stem if name is None else name
-        policy = load_sb3(policy)
+        is_onnx = Path(policy).suffix == ".onnx"
+        policy = load_onnx(policy, dims, of) if is_onnx else load_sb3(policy)
     if hasattr(policy, "predict"):
         _refuse_other_spaces(policy, dims, of)
         act = _predictor(policy)
@@ -202,7 +205,8 @@ def _prepared(
     else:
         raise PolicyError(
             f"policy={policy!r:.80}: must be {form}a callable from observations [B, {dims[0]}]"
-            f" to actions [B, {dims[1]}], a Stable-Baselines3 model, or a model's .zip."
+            f" to actions [B, {dims[1]}], a Stable-Baselines3 model, or the path of a model's .zip "
+            "or .onnx."
         )
     return Policy(name or _name_of(policy), cast(ActionRange, range_), act, dims[1], asked)
 
@@ -320,6 +324,67 @@ def load_sb3(path: str | os.PathLike[str]) -> Any:
             "Save it again with the installed stable-baselines3, or load it yourself and give "
             "the model."
         ) from error
+
+
+def load_onnx(
+    path: str | os.PathLike[str], dims: tuple[int, int], of: str = "this task"
+) -> Callable[[Observations], Any]:
+    """Load an ONNX file's network, on one thread of the CPU.
+
+    Args:
+      path: an .onnx file with one float32 input `[B, dims[0]]` and one output `[B, dims[1]]`.
+        It runs in this process: give no stranger's.
+      dims: entries of an observation, and of an action.
+      of: what these widths are of, for a network made for others.
+
+    Returns:
+      Its actions, as a function of observations.
+
+    Raises:
+      PolicyError: missing, refused by onnxruntime, or of another interface.
+      MissingDependencyError: onnxruntime is not installed.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PolicyError(f"{path}: there is no such file. Give the path of an .onnx file.")
+    # Its telemetry, on by default from 1.31 on, is nothing that an evaluation should switch on.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    try:
+        import onnxruntime
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: onnxruntime is needed to run it and is not installed. "
+            "Run `pip install 'sme-registry[onnx]'`."
+        ) from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # what is wrong is raised
+    try:
+        session = onnxruntime.InferenceSession(
+            os.fspath(path), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:
+        raise PolicyError(
+            f"{path}: not a network that onnxruntime loads: {error}. Export it again, with an "
+            "opset from 13 to 23, or give a callable."
+        ) from error
+    for what, ends, width in zip(
+        ("input", "output"), (session.get_inputs(), session.get_outputs()), dims, strict=True
+    ):
+        told = ", ".join(f"{end.name} {end.type} {end.shape}" for end in ends)
+        # A length that is not a number is open: it is known when the network has run.
+        fits = len(ends) == 1 and ends[0].type == "tensor(float)" and len(ends[0].shape) == 2
+        if not fits or any(
+            isinstance(length, int) and length != wanted
+            for length, wanted in zip(ends[0].shape, (None, width), strict=True)
+        ):
+            raise PolicyError(
+                f"{path}: its {what}s are {told or 'none'}: must be one tensor(float) "
+                f"[batch, {width}] for {of}, the batch of any size. Evaluate it on the task it was "
+                "trained for, and export it with a dynamic batch axis."
+            )
+    observation = session.get_inputs()[0].name
+    return lambda observations: session.run(None, {observation: observations})[0]
 
 
 def _saved_fields(path: Path) -> set[str]:

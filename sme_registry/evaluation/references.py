@@ -18,13 +18,20 @@ channels at once, would be another policy, which no agent that observes a part o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from sme_registry.compiled import engine
+from sme_registry.envs.shared import Observation
 from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
 from sme_registry.task.draw import Array
+
+Act = Callable[[Observation], Any]
+Joint = Callable[[Array], Array]  # states [B, S] to joint actions [B, A]
 
 NAMES = (
     "optimal",
@@ -101,3 +108,62 @@ def fit(
         slope[np.ix_(channels, owned)] = solution[:-1]
         intercept[owned] = solution[-1]
     return References(np.median(optimal, axis=0), slope, intercept)
+
+
+def _optimal(spec: SMESpec) -> Joint:
+    return engine(materialize(spec)).optimal_action
+
+
+def _constant(spec: SMESpec) -> Joint:
+    return lambda s: np.full((len(s), spec.action_dim), 0.5)
+
+
+def _random(spec: SMESpec) -> Joint:
+    generator = np.random.default_rng(0)
+    return lambda s: generator.random((len(s), spec.action_dim))
+
+
+def _linear(spec: SMESpec) -> Joint:
+    task = materialize(spec)
+    s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
+    agents = zip(task.observed, task.owned, strict=True)
+    fitted = fit(s, engine(task).optimal_action(s), agents)
+    return lambda s: (s - 0.5) @ fitted.slope + fitted.intercept
+
+
+# The ones that can be asked by name, without a protocol.
+POLICIES: dict[str, Callable[[SMESpec], Joint]] = {
+    "optimal": _optimal,
+    "constant": _constant,
+    "random": _random,
+    "linear": _linear,
+}
+
+
+def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
+    """A policy that learns nothing, as `evaluate` takes it.
+
+    Args:
+      name: one of `POLICIES`.
+      spec: the task.
+
+    Returns:
+      From observations `[B, S + 2]` to actions `[B, A]` of the unit range; of a team, one for each
+      agent.
+    """
+    joint, S = POLICIES[name](spec), spec.state_dim
+    if spec.team is None:
+        return lambda observations: joint(observations[:, :S].astype(np.float64))
+    task = materialize(spec)
+
+    def of(observed: tuple[int, ...], own: slice) -> Act:
+        def act(observations: Observation) -> Array:
+            # What the agent does not observe has no part in its own channels of the joint action.
+            s = np.zeros((len(observations), S))
+            s[:, observed] = observations[:, : len(observed)]
+            return joint(s)[:, own]
+
+        return act
+
+    agents = zip(task.names, task.observed, task.owned, strict=True)
+    return {agent: of(observed, own) for agent, observed, own in agents}

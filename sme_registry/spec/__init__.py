@@ -1,20 +1,44 @@
 """Documents: what is frozen, hashed and shared."""
 
-from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, SuiteFile
+from sme_registry.spec.document import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    Real,
+    SchemaVersion,
+    StrictModel,
+    explained,
+)
+from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import AgentSpec, SMESpec, TeamSpec, as_spec
+from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import Suite, SuiteClass
 
 __all__ = [
     "AgentSpec",
+    "Cell",
+    "Digest",
+    "Document",
     "EnvFile",
     "EvaluationProtocol",
     "Fingerprint",
+    "Integer",
+    "Name",
+    "PlannedCell",
     "ProtocolFile",
+    "Real",
     "SMESpec",
+    "SchemaVersion",
+    "StrictModel",
+    "StudyAlgorithm",
+    "StudyFile",
+    "StudyPlan",
     "Suite",
     "SuiteClass",
     "SuiteFile",
     "TeamSpec",
     "as_spec",
+    "explained",
 ]

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.files import read_json
-from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, SuiteFile
+from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec
 
 NAMESPACE = "SME"
@@ -23,6 +23,7 @@ _FOLDERS: dict[type[Envelope], str] = {
     EnvFile: "envs",
     SuiteFile: "suites",
     ProtocolFile: "protocols",
+    StudyFile: "studies",
 }
 _VERSION = re.compile(r"-v(\d+)$")
 

@@ -71,6 +71,10 @@ Integer = int
 Real = Annotated[float, Field(allow_inf_nan=False)]
 SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", min_length=1, max_length=64)]
+Digest = Annotated[
+    str,
+    Field(pattern=r"^sha256:[0-9a-f]{64}$", description="'sha256:' and 64 lower-case hex digits"),
+]
 
 
 def explained(message: str) -> PydanticCustomError:
@@ -252,6 +256,8 @@ def _allowed(field: FieldInfo) -> str:
 
 def _kind(annotation: Any) -> str:
     origin = get_origin(annotation)
+    if origin is Annotated:
+        return _kind(get_args(annotation)[0])
     if annotation is int:
         return "an integer"
     if annotation is float:

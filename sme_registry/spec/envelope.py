@@ -13,9 +13,10 @@ from pydantic import Field
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.files import read_json, to_json, write_atomically
-from sme_registry.spec.document import Integer, Name, StrictModel
+from sme_registry.spec.document import Digest, Integer, Name, StrictModel
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.study import StudyPlan
 from sme_registry.spec.suite import Suite
 
 _ROW = Annotated[tuple[float, ...], Field(strict=False)]
@@ -38,12 +39,7 @@ class Envelope(StrictModel):
     version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
     description: Annotated[str, Field(max_length=2000)] = ""
     tags: Annotated[tuple[Name, ...], Field(strict=False, max_length=64)] = ()
-    digest: Annotated[
-        str,
-        Field(
-            pattern=r"^sha256:[0-9a-f]{64}$", description="'sha256:' and 64 lower-case hex digits"
-        ),
-    ]
+    digest: Digest
 
     @property
     def versioned_name(self) -> str:
@@ -107,6 +103,14 @@ class SuiteFile(Envelope):
     content = "suite"
 
     suite: Suite
+
+
+class StudyFile(Envelope):
+    """A study's file: `specs/studies/*.json`."""
+
+    content = "plan"
+
+    plan: StudyPlan
 
 
 class ProtocolFile(Envelope):

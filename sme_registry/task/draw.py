@@ -52,10 +52,13 @@ def transition_offset(spec: SMESpec) -> Array:
     return uniform(spec.seed, "transition/b", spec.state_dim)
 
 
-def optimal_policies(spec: SMESpec) -> tuple[tuple[Layer, ...], ...]:
-    """The layers of each agent's optimal policy; a single agent is a team of one."""
+def optimal_policies(spec: SMESpec, stream: str = "policy") -> tuple[tuple[Layer, ...], ...]:
+    """The layers of each agent's optimal policy; a single agent is a team of one.
+
+    Another `stream` gives policies of the same shape and distribution, independent of these.
+    """
     return tuple(
-        _optimal_policy(spec, f"policy/{index}", observed, agent.action_dim)
+        _optimal_policy(spec, f"{stream}/{index}", observed, agent.action_dim)
         for index, (agent, observed) in enumerate(
             zip(agents(spec), observed_channels(spec), strict=True)
         )

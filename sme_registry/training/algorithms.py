@@ -1,4 +1,7 @@
-"""The algorithms by name, loaded when they are needed: importing PyTorch takes seconds."""
+"""The algorithms by name, loaded when they are needed: importing PyTorch takes seconds.
+
+And how all of them are run here: on one thread, quietly, with a replay buffer of the size needed.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import importlib
 import importlib.util
 import io
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 from sme_registry.errors import MissingDependencyError, UnknownNameError, did_you_mean
@@ -23,6 +27,7 @@ ALGORITHMS = {
 _ON_POLICY = ("PPO", "A2C")
 _TEAMS_AT_ONCE = 8
 _ROLLOUT, _FEWEST_STEPS = 2048, 16  # SB3's PPO collects this many of one environment
+_MAX_REPLAY = 1_000_000  # SB3's default
 
 
 def default_algorithm(spec: SMESpec) -> str:
@@ -94,3 +99,50 @@ def load_algorithm(name: str) -> Any:
     with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return getattr(importlib.import_module("stable_baselines3"), name)
+
+
+def is_sb3(found: Any) -> bool:
+    """Whether this is a class of Stable-Baselines3's kind, or an object of one."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    return issubclass(found if isinstance(found, type) else type(found), BaseAlgorithm)
+
+
+def replay_settings(algorithm: Any, transitions: int) -> dict[str, int]:
+    """The size of an off-policy algorithm's replay buffer; nothing for another.
+
+    Never smaller than what will be stored, so nothing that SB3's default would do changes.
+    """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    if not issubclass(algorithm, OffPolicyAlgorithm):
+        return {}
+    return {"buffer_size": min(_MAX_REPLAY, transitions)}
+
+
+def silence(model: Any) -> None:
+    """Have an SB3 model log nowhere; left to itself it makes a folder among temporary files."""
+    from stable_baselines3.common.logger import Logger
+
+    model.set_logger(Logger(None, []))
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """No warnings of the libraries below: they speak to programmers about their own insides."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for PyTorch, whose default is put back afterwards."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

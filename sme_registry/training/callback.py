@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sme_registry.terminal.progress import Meter
 from sme_registry.training.episodes import Episode, EpisodeLog
-from sme_registry.training.progress import Meter
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 

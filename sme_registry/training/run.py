@@ -13,13 +13,10 @@ The folder of a run:
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import io
 import os
 import shutil
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,6 +30,7 @@ from sme_registry.files import write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
+from sme_registry.terminal.progress import Meter
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
@@ -40,11 +38,13 @@ from sme_registry.training.algorithms import (
     default_num_envs,
     known_algorithm,
     load_algorithm,
+    one_thread,
+    quiet,
     refuse_without_dependencies,
+    replay_settings,
     rollout_steps,
 )
 from sme_registry.training.episodes import Episode, EpisodeLog
-from sme_registry.training.progress import Meter
 from sme_registry.training.record import DEFAULTS, RunRecord, installed_versions
 from sme_registry.training.record import FILE as RECORD
 
@@ -64,7 +64,6 @@ _OWN_FILES = (
 )  # fmt: skip
 
 MAX_STEPS = 10**10
-_MAX_REPLAY = 1_000_000  # SB3's default
 _CHECKPOINTS = 20
 _FEWEST_STEPS_BETWEEN_CHECKPOINTS = 1_000
 
@@ -185,7 +184,7 @@ def train(
     folder = Path(folder)
     before = _claim(folder, asked, resume=resume, force=force)
     asked.updated(**before).write(folder)
-    with _quiet(), _one_thread():
+    with quiet(), one_thread():
         record, episodes, model = _learn(asked.updated(**before), folder, progress, console)
         report = _evaluate(model, record, folder, progress, console)
         figures = _draw(report, folder, model)
@@ -258,11 +257,8 @@ def _learn(
     settings: dict[str, Any] = {
         "tensorboard_log": str(folder / TENSORBOARD) if has_tensorboard else None
     }
-    if _is_off_policy(algorithm):
-        # Never smaller than what is stored, so nothing that SB3's default would do changes.
-        transitions = (record.steps + record.num_envs) * record.agents
-        settings["buffer_size"] = min(_MAX_REPLAY, transitions)
-
+    transitions = (record.steps + record.num_envs) * record.agents
+    settings |= replay_settings(algorithm, transitions)
     n_steps = rollout_steps(record.spec, record.algorithm, record.num_envs)
     if n_steps is not None:
         settings["n_steps"] = n_steps
@@ -327,12 +323,6 @@ def _so_far(steps_done: int, log: EpisodeLog, callback: RunCallback) -> dict[str
     }
 
 
-def _is_off_policy(algorithm: Any) -> bool:
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
-    return issubclass(algorithm, OffPolicyAlgorithm)
-
-
 def _evaluate(
     model: Any, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> EvaluationReport:
@@ -366,24 +356,3 @@ def _draw(report: EvaluationReport, folder: Path, model: Any) -> tuple[Path, ...
         path = folder / SIMILARITY_MAP
         figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
     return tuple(figures)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """No warnings of the libraries below: they speak to programmers about their own insides."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for PyTorch, whose default is put back afterwards."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

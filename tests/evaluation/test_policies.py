@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 import zipfile
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import sme_registry
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.cli import app
+from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
 from sme_registry.evaluation import as_policy, evaluate
 from sme_registry.spec import SMESpec
 
@@ -108,7 +111,8 @@ def test_a_policy_is_named_after_its_function():
     [
         ("absent.zip", None, "there is no such file"),
         ("text.zip", b"hello", "not a model that Stable-Baselines3 saved"),
-        ("policy.onnx", b"\x08\x07", "not a model that Stable-Baselines3 saved"),
+        ("policy", b"\x08\x07", "not a model that Stable-Baselines3 saved"),
+        ("absent.onnx", None, r"there is no such file. Give the path of an \.onnx"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused(tmp_path, name, content, message):
@@ -203,3 +207,94 @@ def test_a_model_behind_vec_normalize_is_refused(sb3):
     model = sb3.PPO("MlpPolicy", env, device="cpu")
     with pytest.raises(PolicyError, match="VecNormalize"):
         judged(model)
+
+
+@pytest.fixture(scope="module")
+def onnx():
+    pytest.importorskip("onnxruntime")
+    return pytest.importorskip("onnx")
+
+
+def network(onnx, path, o=5, a=2, dtype="FLOAT", batch="batch", operator="MatMul"):
+    """A linear policy's file, and its weights `[o, a]`."""
+    W = np.random.default_rng(2).normal(scale=0.4, size=(o, a)).astype(np.float32)
+    value, type = onnx.helper.make_tensor_value_info, getattr(onnx.TensorProto, dtype)
+    graph = onnx.helper.make_graph(
+        [onnx.helper.make_node(operator, ["o", "W"], ["a"])],
+        "policy",
+        [value("o", type, [batch, o])],
+        [value("a", type, [batch, a])],
+        [onnx.numpy_helper.from_array(W.astype("f8") if dtype == "DOUBLE" else W, "W")],
+    )
+    opset = onnx.helper.make_opsetid("", 17)
+    model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)
+    path.write_bytes(model.SerializeToString())
+    return W
+
+
+@pytest.mark.parametrize("action_range", [None, "unit", "symmetric"])
+def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_range):
+    W = network(onnx, tmp_path / "actor.onnx")
+    report = judged(tmp_path / "actor.onnx", action_range=action_range)
+    same = judged(lambda o: o @ W, action_range=action_range)
+    assert (report.policy, report.action_range) == ("actor", action_range or "unit")
+    assert "onnxruntime" in report.versions
+    for mine, theirs in zip(report.regions, same.regions, strict=True):
+        assert mine.similarity == pytest.approx(theirs.similarity, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"o": 4}, r"its inputs are o tensor\(float\) \['batch', 4\]: must be .* \[batch, 5\]"),
+        ({"a": 3}, r"its outputs are a tensor\(float\) \['batch', 3\]: must be .* \[batch, 2\]"),
+        ({"batch": 1}, "the batch of any size"),
+        ({"dtype": "DOUBLE"}, r"its inputs are o tensor\(double\)"),
+        ({"operator": "Nonsense"}, "not a network that onnxruntime loads"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
+)
+def test_an_onnx_file_that_does_not_fit_is_refused(onnx, tmp_path, made, message):
+    network(onnx, tmp_path / "actor.onnx", **made)
+    with pytest.raises(PolicyError, match=message):
+        judged(tmp_path / "actor.onnx")
+
+
+@pytest.mark.parametrize("content", [b"", b"\x08\x07", b"hello"])
+def test_bytes_that_are_no_onnx_file_are_refused(onnx, tmp_path, content):
+    (tmp_path / "actor.onnx").write_bytes(content)
+    with pytest.raises(PolicyError, match="not a network that onnxruntime loads"):
+        judged(str(tmp_path / "actor.onnx"))
+
+
+def test_without_onnxruntime_an_onnx_file_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    (tmp_path / "actor.onnx").write_bytes(b"")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[onnx\]'"):
+        judged(tmp_path / "actor.onnx")
+
+
+def test_onnx_files_play_as_a_team_apart_and_together(onnx, tmp_path):
+    agents = [
+        {"name": "left_0", "action_dim": 1, "observes": [0, 2]},
+        {"name": "right_0", "action_dim": 3},
+    ]
+    team = SMESpec(state_dim=3, action_dim=4, team={"agents": agents})
+    left = network(onnx, tmp_path / "left.onnx", o=4, a=1)
+    right = network(onnx, tmp_path / "right.onnx", o=5, a=3)
+    both = network(onnx, tmp_path / "both.onnx", o=7, a=3)
+    files = {"left_0": tmp_path / "left.onnx", "right_0": tmp_path / "right.onnx"}
+    functions = {"left_0": lambda o: o @ left, "right_0": lambda o: o @ right}
+    for policy, same in ((files, functions), (tmp_path / "both.onnx", lambda o: o @ both)):
+        mine, theirs = evaluate(policy, team, PROTOCOL), evaluate(same, team, PROTOCOL)
+        assert mine.regions[0].similarity == pytest.approx(theirs.regions[0].similarity, abs=1e-6)
+    with pytest.raises(PolicyError, match=r"left_0: .*its inputs are .*5.*must be .*\[batch, 4\]"):
+        evaluate({**files, "left_0": tmp_path / "right.onnx"}, team, PROTOCOL)
+
+
+def test_the_command_line_evaluates_an_onnx_file(onnx, tmp_path, monkeypatch):
+    network(onnx, tmp_path / "actor.onnx", o=10, a=4)
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["evaluate", "actor.onnx", "Default", "--protocol", "quick-v1"])
+    assert done.exit_code == 0, done.output
+    assert "actor" in done.output

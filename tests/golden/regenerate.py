@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.files import write_atomically
-from sme_registry.spec import EnvFile, ProtocolFile, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
 
@@ -34,7 +34,7 @@ def digests() -> dict[str, dict[str, str]]:
     """The digest of every name in the catalogue, by kind."""
     return {
         kind.content: {file.versioned_name: file.digest for file in catalogue.entries(kind)}
-        for kind in (EnvFile, SuiteFile, ProtocolFile)
+        for kind in (EnvFile, SuiteFile, ProtocolFile, StudyFile)
     }
 
 

@@ -17,6 +17,8 @@ from sme_registry.spec import (
     EvaluationProtocol,
     ProtocolFile,
     SMESpec,
+    StudyFile,
+    StudyPlan,
     Suite,
     SuiteFile,
     catalogue,
@@ -27,9 +29,8 @@ from sme_registry.task import materialize
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
 PROTOCOLS = catalogue.entries(ProtocolFile)
 RELEASED = json.loads((Path(__file__).parents[1] / "golden" / "digests.json").read_text())
-EVERY_FILE = [
-    (kind, path) for kind in (EnvFile, SuiteFile, ProtocolFile) for path in catalogue.paths(kind)
-]
+KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
+EVERY_FILE = [(kind, path) for kind in KINDS for path in catalogue.paths(kind)]
 
 
 JSON_TYPES = {"object": dict, "array": list, "string": str, "integer": int, "null": type(None)}
@@ -67,6 +68,9 @@ def follow(schema, value, definitions):
                 follow(limit[name], entry, definitions)
         elif word == "items":
             for entry in value:
+                follow(limit, entry, definitions)
+        elif word == "additionalProperties" and limit is not False:
+            for entry in value.values():
                 follow(limit, entry, definitions)
         elif word not in NOTES:
             assert CHECKS[word](value, limit), (word, limit, value)
@@ -112,7 +116,7 @@ def test_a_file_follows_the_exported_json_schema(kind, path):
     follow(schema, json.loads(path.read_text()), schema.get("$defs", {}))
 
 
-@pytest.mark.parametrize("document", [SMESpec, Suite, EvaluationProtocol])
+@pytest.mark.parametrize("document", [SMESpec, Suite, EvaluationProtocol, StudyPlan])
 def test_the_exported_json_schema_states_fields_ranges_and_closes_the_object(document):
     schema = document.model_json_schema()
     assert set(schema["properties"]) == set(document.model_fields)
@@ -191,9 +195,9 @@ def test_core_uses_unit_variance_where_layers_widen():
 
 
 def test_a_released_name_never_changes_its_digest():
-    for file in (*ENVS, *SUITES, *PROTOCOLS):
-        assert RELEASED[file.content][file.versioned_name] == file.digest
-    for kind in (EnvFile, SuiteFile, ProtocolFile):
+    for kind in KINDS:
+        for file in catalogue.entries(kind):
+            assert RELEASED[file.content][file.versioned_name] == file.digest
         assert sorted(RELEASED[kind.content]) == sorted(catalogue.names(kind))
 
 

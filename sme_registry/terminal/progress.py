@@ -17,6 +17,7 @@ from rich.progress import (
 )
 
 SECONDS_BETWEEN_LINES = 5.0
+_SECONDS_BETWEEN_EQUAL_LINES = 60.0
 
 
 class Meter:
@@ -47,7 +48,7 @@ class Meter:
         self._start = self._last_line = time.monotonic()
         self._bar: Progress | None = None
         self._task: TaskID | None = None
-        self._line = ""
+        self._line = self._printed = ""
 
     def __enter__(self) -> Self:
         self._start = self._last_line = time.monotonic()
@@ -93,21 +94,39 @@ class Meter:
             self._bar.update(
                 self._task,
                 completed=min(done, self._total),
-                rate=f"{rate:,.0f} {self._unit}/s",
+                rate=self._rate(rate),
                 note=note,
             )
         elif now - self._last_line >= SECONDS_BETWEEN_LINES or done >= self._total:
             left = (self._total - done) / rate if rate > 0 else 0.0
             parts = [
                 f"{self._what}: {done:,} of {self._total:,} {self._unit}",
-                f"{rate:,.0f} {self._unit}/s",
-                f"{duration(left)} left" if done < self._total else "done",
+                *([self._rate(rate)] if rate > 0 else []),
+                "done" if done >= self._total else f"{duration(left)} left" if rate > 0 else "…",
             ]
             self._line = " · ".join([*parts, note] if note else parts)
             if done < self._total:  # the last line is printed once, at the end
                 self._print()
 
+    def of(self, done: int, total: int) -> None:
+        """As `update`, for work that learns on its way how much there is."""
+        if total != self._total:
+            self._total = total
+            if self._bar is not None and self._task is not None:
+                self._bar.update(self._task, total=total)
+        self.update(done)
+
+    def _rate(self, rate: float) -> str:
+        """`280 steps/s`; of what takes longer than a second each, `3 s a run`."""
+        if 0 < rate < 1 and self._unit.endswith("s"):
+            return f"{duration(1 / rate)} a {self._unit[:-1]}"
+        return f"{rate:,.0f} {self._unit}/s"
+
     def _print(self) -> None:
+        now = time.monotonic()
+        if self._line == self._printed and now - self._last_line < _SECONDS_BETWEEN_EQUAL_LINES:
+            return
+        self._printed = self._line
         self._console.print(self._line, highlight=False, soft_wrap=True)
         self._last_line, self._line = time.monotonic(), ""
 

@@ -1,0 +1,1 @@
+"""Artefacts: policies as ONNX files, from their bytes to their actions."""

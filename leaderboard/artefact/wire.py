@@ -1,0 +1,134 @@
+"""Protocol buffers from bytes: a message's fields, one after the other, and nothing built.
+
+    field  = tag value            tag = varint(number << 3 | type)
+    type 0 = varint               seven bits a byte, lowest first, the high bit set but in the last
+    type 1 = 8 bytes, type 5 = 4 bytes
+    type 2 = varint(length) and as many bytes: text, bytes, a message, or packed numbers
+
+Stricter than the format, so that no other reader can see something else in the same bytes: numbers
+are in their shortest form, and the groups of old (types 3 and 4) are refused. Values are views of
+the bytes, messages are entered only where the caller does so, and every field and every packed
+number costs one of a `Budget`: neither memory nor time grows beyond it.
+
+Source: Protocol Buffers, "Encoding".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5
+
+_FIXED_BYTES = {FIXED64: 8, FIXED32: 4}
+_MAX_FIELD = 2**29 - 1
+
+
+class WireError(ValueError):
+    """The bytes are no message."""
+
+
+class BudgetError(ValueError):
+    """The message has more fields than the budget allows."""
+
+
+class Field(NamedTuple):
+    """One field of a message.
+
+    Attributes:
+      number: which field.
+      type: `VARINT`, `FIXED64`, `LENGTH` or `FIXED32`.
+      value: the number of a varint, in [0, 2⁶⁴); else a view of the bytes.
+    """
+
+    number: int
+    type: int
+    value: int | memoryview
+
+
+class Budget:
+    """How many fields and packed numbers may still be read.
+
+    Args:
+      left: in all.
+    """
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    def spend(self) -> None:
+        """Take one.
+
+        Raises:
+          BudgetError: none is left.
+        """
+        self.left -= 1
+        if self.left < 0:
+            raise BudgetError("more fields than the limit")
+
+
+def fields(message: memoryview, budget: Budget) -> Iterator[Field]:
+    """The fields of a message, in their order.
+
+    Args:
+      message: its bytes.
+      budget: shared by all messages of one file.
+
+    Raises:
+      WireError: truncated, a number not in its shortest form or beyond 64 bits, or a type or field
+        number that there is not.
+      BudgetError: more fields than allowed.
+    """
+    at, end = 0, len(message)
+    while at < end:
+        budget.spend()
+        tag, at = _varint(message, at)
+        number, type = tag >> 3, tag & 7
+        if not 1 <= number <= _MAX_FIELD:
+            raise WireError(f"field number {number}")
+        if type == VARINT:
+            value, at = _varint(message, at)
+            yield Field(number, type, value)
+            continue
+        if type == LENGTH:
+            length, at = _varint(message, at)
+        elif type in _FIXED_BYTES:
+            length = _FIXED_BYTES[type]
+        else:
+            raise WireError(f"wire type {type} in field {number}")
+        if length > end - at:
+            raise WireError(f"field {number} ends {length - (end - at)} bytes after its message")
+        yield Field(number, type, message[at : at + length])
+        at += length
+
+
+def varints(packed: memoryview, budget: Budget) -> Iterator[int]:
+    """Packed varints, each in [0, 2⁶⁴).
+
+    Raises:
+      WireError, BudgetError: as `fields`.
+    """
+    at = 0
+    while at < len(packed):
+        budget.spend()
+        value, at = _varint(packed, at)
+        yield value
+
+
+def signed(value: int) -> int:
+    """A varint as the int64 that it stands for."""
+    return value - 2**64 if value >= 2**63 else value
+
+
+def _varint(view: memoryview, at: int) -> tuple[int, int]:
+    """The varint at a place, and the place after it."""
+    if at < len(view) and view[at] < 0x80:  # most of them
+        return view[at], at + 1
+    value = 0
+    for shift, byte in zip(range(0, 70, 7), view[at : at + 10], strict=False):
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            if value >= 2**64 or (byte == 0 and shift > 0):
+                raise WireError("a number that is beyond 64 bits, or longer than it need be")
+            return value, at + shift // 7 + 1
+    raise WireError("a number that does not end")

@@ -1,0 +1,202 @@
+"""`check_submission`: whether a signed submission is one for this board.
+
+What the schema cannot know. In this order, the first that fails is told:
+
+    unsafe_name      names, texts and links hold only characters that are safe to show
+    unknown_suite    it is of this board's suite and track
+    schema           its time is a time
+    stale_time       and near the board's
+    unknown_spec     every run is on an instance of the suite
+    duplicate_run    no run, and no artefact within one instance, is listed twice
+    missing_run      every instance has a run, and every class a count of the runs started
+    too_large        no artefact is above this board's limit
+
+Reference submissions, signed by the board itself, are checked like any other.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import unicodedata
+from collections import Counter
+
+from leaderboard.board import BoardDocument
+from leaderboard.errors import Rejection
+from leaderboard.submission import Submission
+from sme_registry.spec import Suite
+
+MINUTES_AHEAD = 10
+
+# ASCII only: a letter of another script that looks alike would let one method pass for another.
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
+_LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
+# Control and format characters (those that turn the direction of writing are among the latter),
+# surrogates, and separators of lines and paragraphs.
+_UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
+    """Refuse a submission that is not one for this board.
+
+    Args:
+      board: the board.
+      submission: whose signature is verified already.
+      at: the board's time, with a time zone.
+
+    Raises:
+      Rejection: the first of this module's codes that fits, in its order.
+    """
+    check_names(submission)
+    _check_suite(board, submission)
+    _check_time(submission.created, at, board.limits.age_days)
+    check_runs(board.suite, submission)
+    for index, run in enumerate(submission.runs):
+        if run.artefact is not None and run.artefact.size > board.limits.artefact_bytes:
+            raise Rejection(
+                "too_large",
+                f"runs.{index}.artefact.size={run.artefact.size:,}: must be at most "
+                f"{board.limits.artefact_bytes:,} bytes on this board. Submit a smaller network.",
+            )
+
+
+def check_names(submission: Submission) -> None:
+    """Refuse what would be unsafe to show: markup, formulas, control characters.
+
+    Raises:
+      Rejection: `unsafe_name`.
+    """
+    method, training = submission.method, submission.training
+    for field, name in (
+        ("method.name", method.name),
+        ("method.version", method.version),
+        ("method.family", method.family),
+        ("submitter.name", submission.submitter.name),
+    ):
+        if not _NAME.fullmatch(name):
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: must begin with a letter or digit, and hold letters "
+                "a–z, digits, single spaces and '._+-()' only. Rename it.",
+            )
+    if submission.code is not None and not _LINK.fullmatch(submission.code):
+        raise Rejection(
+            "unsafe_name",
+            f"code={submission.code!a}: must be a link of the characters that links have. "
+            "Write others as %XX.",
+        )
+    for field, text in (
+        ("training.library", training.library),
+        ("training.hyperparameters", training.hyperparameters),
+        ("training.hardware", training.hardware),
+        ("statement", submission.statement),
+    ):
+        for letter in text:
+            if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
+                raise Rejection(
+                    "unsafe_name",
+                    f"{field}: holds {letter!a}: must hold no control characters but line "
+                    "breaks. Remove it.",
+                )
+
+
+def check_runs(suite: Suite, submission: Submission) -> None:
+    """Refuse runs that are not on the suite's instances, listed twice, missing or uncounted.
+
+    Raises:
+      Rejection: `unknown_spec`, `duplicate_run` or `missing_run`.
+    """
+    class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
+    for index, run in enumerate(submission.runs):
+        if run.spec not in class_of:
+            raise Rejection(
+                "unknown_spec",
+                f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
+                f"{len(class_of)} instances. Train on those, or submit to the board of its suite.",
+            )
+    _check_duplicates(submission)
+    ran = {run.spec for run in submission.runs}
+    for digest, name in class_of.items():
+        if digest not in ran:
+            raise Rejection(
+                "missing_run",
+                f"runs: none on {digest} of class {name}: every instance must have one. "
+                "Train on it, or list a failed run with artefact null, which scores 1.",
+            )
+    _check_started(submission, Counter(class_of[run.spec] for run in submission.runs))
+
+
+def _check_suite(board: BoardDocument, submission: Submission) -> None:
+    expected = board.suite_reference
+    if submission.suite.digest != expected.digest:
+        raise Rejection(
+            "unknown_suite",
+            f"suite={submission.suite.name}, {submission.suite.digest}: must be "
+            f"{expected.name}, {expected.digest}. Make the bundle for this board's suite.",
+        )
+    if submission.track != board.track:
+        raise Rejection(
+            "unknown_suite",
+            f"track={submission.track!r}: must be {board.track!r} on this board. Submit to a board "
+            "of this track.",
+        )
+
+
+def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
+    try:
+        moment = datetime.datetime.fromisoformat(created)
+    except ValueError:
+        raise Rejection(
+            "schema", f"created={created!r}: must be a time that exists. Correct it."
+        ) from None
+    if moment - at > datetime.timedelta(minutes=MINUTES_AHEAD):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {MINUTES_AHEAD} minutes ahead of the board's "
+            "clock. Set your clock, and sign it again.",
+        )
+    if at - moment > datetime.timedelta(days=age_days):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {age_days} days old. Sign it again.",
+        )
+
+
+def _check_duplicates(submission: Submission) -> None:
+    seeds: dict[tuple[str, int], int] = {}
+    artefacts: dict[tuple[str, str], int] = {}
+    for index, run in enumerate(submission.runs):
+        before = seeds.setdefault((run.spec, run.seed), index)
+        if before != index:
+            raise Rejection(
+                "duplicate_run",
+                f"runs.{index}.seed={run.seed}: runs.{before} has the same spec and seed: must be "
+                "another run. Remove one of them.",
+            )
+        if run.artefact is None:
+            continue
+        before = artefacts.setdefault((run.spec, run.artefact.sha256), index)
+        if before != index:
+            raise Rejection(
+                "duplicate_run",
+                f"runs.{index}.artefact.sha256={run.artefact.sha256}: runs.{before} of the same "
+                "spec has the same policy: must be another run's. Remove one of them.",
+            )
+
+
+def _check_started(submission: Submission, listed: Counter[str]) -> None:
+    started = submission.runs_started
+    for name in started:
+        if name not in listed:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}: must be a class of the suite: {', '.join(listed)}. "
+                "Rename or remove it.",
+            )
+    for name, count in listed.items():
+        if started.get(name, 0) < count:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}={started.get(name)}: must be at least {count}, the runs "
+                "listed. Count every run that was ever started with this method.",
+            )

@@ -1,0 +1,5 @@
+"""The command `sme-leaderboard`."""
+
+from leaderboard.cli.app import app, main
+
+__all__ = ["app", "main"]

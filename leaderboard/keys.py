@@ -1,0 +1,111 @@
+"""Ed25519 keys: who submitted, and which board said so.
+
+A key is 32 random bytes; its public half, 64 hex digits, is the identity. A signature is of the
+SHA-256 digest text of a document under a purpose, so that none can be used for another.
+
+    signature = Ed25519(key, "sme-leaderboard/" purpose "/" digest)
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import (
+    Ed25519PrivateKey,
+    Ed25519PublicKey,
+)
+from pydantic import Field
+
+from leaderboard.errors import BoardError
+
+Purpose = Literal["submission", "withdrawal", "log", "upload"]
+PublicKey = Annotated[
+    str, Field(pattern=r"^[0-9a-f]{64}$", description="an ed25519 public key, 64 hex digits")
+]
+Signature = Annotated[
+    str, Field(pattern=r"^[0-9a-f]{128}$", description="an ed25519 signature, 128 hex digits")
+]
+
+
+@dataclass(frozen=True)
+class SigningKey:
+    """A private key; its text is never shown by `repr`.
+
+    Attributes:
+      public: the public half, 64 hex digits.
+    """
+
+    _private: Ed25519PrivateKey
+
+    @classmethod
+    def generate(cls) -> SigningKey:
+        """A new key from the operating system's randomness."""
+        return cls(Ed25519PrivateKey.generate())
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> SigningKey:
+        """The key of a file.
+
+        Raises:
+          BoardError: the file is missing, or holds no key.
+        """
+        try:
+            text = Path(path).read_text("ascii").strip()
+            return cls(Ed25519PrivateKey.from_private_bytes(bytes.fromhex(text)))
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or "not 64 hex digits"
+            raise BoardError(
+                f"{path}: no signing key: {reason}. Make one with `sme-leaderboard keygen`."
+            ) from None
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the key into a new file that only its owner can read.
+
+        Raises:
+          BoardError: the file exists (a lost key cannot be had back) or cannot be written.
+        """
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        except FileExistsError:
+            raise BoardError(
+                f"{path}: exists already, and is left as it is. Give another path with --key."
+            ) from None
+        except OSError as error:
+            raise BoardError(f"{path}: cannot be written: {error.strerror}.") from None
+        with os.fdopen(handle, "w") as stream:
+            stream.write(self._private.private_bytes_raw().hex() + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        return path
+
+    @property
+    def public(self) -> str:
+        """The public half, 64 hex digits."""
+        return self._private.public_key().public_bytes_raw().hex()
+
+    def sign(self, purpose: Purpose, digest: str) -> str:
+        """The signature of a digest (or other short text) for a purpose, 128 hex digits."""
+        return self._private.sign(_message(purpose, digest)).hex()
+
+    def __repr__(self) -> str:
+        return f"SigningKey(public={self.public!r})"
+
+
+def verifies(public: str, signature: str, purpose: Purpose, digest: str) -> bool:
+    """Whether this signature of this digest is by the key with this public half."""
+    try:
+        key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
+        key.verify(bytes.fromhex(signature), _message(purpose, digest))
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+def _message(purpose: Purpose, digest: str) -> bytes:
+    return f"sme-leaderboard/{purpose}/{digest}".encode()

@@ -1,0 +1,137 @@
+"""`Result`: what scoring a submission found. A function of submission, artefacts and protocol.
+
+Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the constant ½ on the same states:
+
+    N_m = ρ_m / ρ⁰_m         normalised regret: 0 the optimum, 1 the constant policy
+    N₀                       WD regret
+    A = mean N₁ … N_M        OOD regret
+    D = A − N₀               OOD decay
+    slope                    of N_m on ε_m, least squares over m = 0 … M
+    points                   100 (r̃_WD − mean r̃_OOD), the paper's form
+
+A run that failed, or was started and not listed, scores 1 in every region.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from leaderboard.errors import CODES
+from sme_registry.spec import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    Real,
+    SchemaVersion,
+    StrictModel,
+    explained,
+)
+
+METRICS = ("wd", "ood", "decay", "slope", "points")
+_Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
+
+
+class RunScore(StrictModel):
+    """One run.
+
+    Attributes:
+      spec: digest of the instance; of a run that was started and not listed, null.
+      class_name: the suite's class that the instance belongs to.
+      artefact: digest of the policy; null where the run failed.
+      evaluation_seed: of the states, derived from protocol, spec and artefact; null likewise.
+      regret: N_m of each region, WD first.
+      similarity: mean r̃ of each region; null where there is no policy.
+      wd, ood, decay, slope, points: as this module's head says.
+    """
+
+    spec: Digest | None
+    class_name: Name
+    artefact: Digest | None
+    evaluation_seed: Integer | None
+    regret: _Regions
+    similarity: _Regions | None
+    wd: Real
+    ood: Real
+    decay: Real
+    slope: Real
+    points: Real
+
+
+class Estimate(StrictModel):
+    """A score over runs, with its 95 % stratified bootstrap interval."""
+
+    value: Real
+    low: Real
+    high: Real
+
+
+class ClassScore(StrictModel):
+    """One class of the suite: interquartile means over its runs.
+
+    Attributes:
+      runs: how many were counted, failed and missing ones included.
+      submitted: how many had a policy.
+    """
+
+    name: Name
+    runs: Integer
+    submitted: Integer
+    wd: Real
+    ood: Real
+    profile: _Regions
+
+
+class Scores(StrictModel):
+    """θ of each metric: the mean over classes of the interquartile mean within a class.
+
+    Attributes:
+      profile: θ of N_m of each region, WD first.
+    """
+
+    wd: Estimate
+    ood: Estimate
+    decay: Estimate
+    slope: Estimate
+    points: Estimate
+    profile: Annotated[tuple[Estimate, ...], Field(strict=False, min_length=2)]
+
+
+class Result(Document):
+    """What became of a submission: scored, or rejected with a code.
+
+    Attributes:
+      submission: its id.
+      suite, protocol: digests of what it was scored on.
+      status: "scored" or "rejected".
+      code, message: why it was rejected; empty where it was scored.
+      scores, classes, runs: null and empty where it was rejected.
+      enough_runs: whether each class has the runs that ranking needs.
+      oracle_like: OOD regret ≤ 0.01, or WD regret ≤ 0.02 with a flat profile: the page asks for
+        code.
+      versions: of the packages that the numbers depend on.
+    """
+
+    schema_version: SchemaVersion = 1
+    submission: Digest
+    suite: Digest
+    protocol: Digest
+    status: Literal["scored", "rejected"]
+    code: str = ""
+    message: str = ""
+    scores: Scores | None = None
+    classes: Annotated[tuple[ClassScore, ...], Field(strict=False)] = ()
+    runs: Annotated[tuple[RunScore, ...], Field(strict=False)] = ()
+    enough_runs: bool = False
+    oracle_like: bool = False
+    versions: dict[str, str] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _status_fits(self) -> Self:
+        if (self.status == "scored") != (self.scores is not None):
+            raise explained("scores: must be there exactly where status is 'scored'. Correct it.")
+        if (self.status == "rejected") != (self.code in CODES):
+            raise explained("code: must be there exactly where status is 'rejected'. Correct it.")
+        return self

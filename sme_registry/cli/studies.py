@@ -1,0 +1,568 @@
+"""`sme study`: plans of runs, what they will take, running them, and where they stand."""
+
+from __future__ import annotations
+
+import enum
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.cli import names, study_report
+from sme_registry.errors import OptionError
+from sme_registry.spec import (
+    PlannedCell,
+    StudyFile,
+    StudyPlan,
+    SuiteClass,
+    SuiteFile,
+    catalogue,
+)
+from sme_registry.spec.resolve import resolve
+from sme_registry.terminal.output import err, out, print_json
+from sme_registry.terminal.progress import duration
+
+if TYPE_CHECKING:
+    from sme_registry.studies.estimate import Span
+    from sme_registry.studies.runner import StudyStatus
+
+_SECONDS_PER_DAY = 86_400
+_LINES_OF_FAILURES = 20
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="""Studies: algorithms × kinds of tasks × seeds, resumable, on a laptop or a cluster.
+
+    Examples:
+
+      sme study run smoke --folder runs/smoke
+
+      sme study plan paper-ablations --cores 64
+
+      sme study status runs/smoke
+
+      sme study report runs/smoke
+    """,
+)
+
+PlanName = Annotated[
+    str, typer.Argument(metavar="PLAN", help="A name of `sme study plan`, or a plan's path.")
+]
+Steps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--steps",
+        "-n",
+        metavar="N|ALGORITHM=N",
+        help="Steps of each run that trains, or of one algorithm's; repeatable.",
+    ),
+]
+Seeds = Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")]
+Evaluations = Annotated[int | None, typer.Option(help="Evaluations during each training.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND=GLOB",
+        help="class=GLOB or algorithm=GLOB; repeatable: any of a kind, and both kinds.",
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", "-j", min=1, help="Cells at once; by default one a core."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
+
+
+class ExecutorName(enum.StrEnum):
+    """Where cells run."""
+
+    processes = "processes"
+    in_process = "in-process"
+    ray = "ray"
+
+
+@app.command("new")
+def new(
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    suite: Annotated[
+        str | None, typer.Option(help="Its classes: a suite's name, or its path.")
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option("--task", "-t", help="A class of this one task: name or path; repeatable."),
+    ] = None,
+    algorithm: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--algorithm",
+            "-a",
+            metavar="[NAME=]USES",
+            help="PPO, TD3, SAC, … of Stable-Baselines3, module:function, reference:linear, "
+            "reference:constant, …; repeatable.",
+        ),
+    ] = None,
+    steps: Annotated[
+        list[str] | None,
+        typer.Option("--steps", "-n", metavar="N|ALGORITHM=N", help="Of each run; repeatable."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Runs of each algorithm on each class.")] = 10,
+    evaluations: Annotated[int, typer.Option(help="During each training.")] = 100,
+    evaluation_episodes: Annotated[int, typer.Option(help="In each evaluation.")] = 5,
+    action_range: Annotated[
+        list[str] | None,
+        typer.Option(help="symmetric, unit, or both of them in turn; repeatable."),
+    ] = None,
+    protocol: Annotated[
+        str, typer.Option(help="Of the evaluation within and out of distribution at the end.")
+    ] = "paper-v1",
+    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
+    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Write a plan: which algorithms on which tasks, how often, and how long.
+
+    A plan is a file that a colleague can run. References learn nothing and take no steps.
+
+    Examples:
+
+      sme study new mine.json --suite smoke -a PPO -a TD3 -a reference:linear --seeds 5 -n 20000
+
+      sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC -n 10000
+
+      sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
+    """
+    from sme_registry.evaluation import resolve_protocol
+    from sme_registry.studies.scaling import scaled
+
+    if path.suffix != ".json":
+        raise OptionError(f"{path}: must end in .json, by which every command knows a path.")
+    if path.exists() and not force:
+        raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
+    classes = [*(_suite_classes(suite) if suite is not None else ()), *map(_class, task or ())]
+    if not classes:
+        raise OptionError(
+            "--suite: missing: on which tasks? Give --suite smoke, or --task Default."
+        )
+    if not algorithm:
+        raise OptionError("--algorithm: missing: what is run? Give for example --algorithm PPO.")
+    ranges = action_range or ["symmetric"]
+    algorithms = [_algorithm(text, each, len(ranges) > 1) for text in algorithm for each in ranges]
+    plan = StudyPlan.parse(
+        {
+            "classes": [member.plain() for member in classes],
+            "algorithms": algorithms,
+            "seeds": seeds,
+            "evaluations": evaluations,
+            "evaluation_episodes": evaluation_episodes,
+            "protocol": resolve_protocol(protocol).plain(),
+        },
+        str(path),
+    )
+    every, single = _budgets(steps)
+    # Scaled as a plan of the catalogue would be, so that the options mean the same.
+    draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
+    plan = scaled(draft, steps=every, steps_of=single).plan
+    file = StudyFile.parse(
+        {
+            "name": path.stem if name is None else name,
+            "description": description,
+            "digest": plan.digest,
+            "plan": plan.plain(),
+        }
+    )
+    file.write(path)
+    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    err().print(f"[dim]sme study plan {escape(str(path))}  says what it takes[/]", soft_wrap=True)
+
+
+def _suite_classes(name: str) -> Sequence[SuiteClass]:
+    file = SuiteFile.read(name) if names.is_path(name) else catalogue.find(SuiteFile, name)
+    return file.suite.classes
+
+
+def _class(task: str) -> SuiteClass:
+    spec = resolve(task)
+    fields = spec.plain()
+    seed = fields.pop("seed")
+    title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
+    return SuiteClass.parse({"name": title, "setting": fields, "seeds": [seed]})
+
+
+def _algorithm(text: str, action_range: str, several_ranges: bool) -> dict[str, Any]:
+    name, equals, uses = text.partition("=")
+    if not equals:
+        uses = text
+        name = text.rsplit(":", 1)[-1]
+    if several_ranges:
+        name = f"{name} ({action_range})"
+    trains = not uses.startswith("reference:")
+    fields = {"name": name, "uses": uses, "action_range": action_range}
+    return fields if trains else {**fields, "steps": 0}
+
+
+@app.command("plan")
+def plan(
+    plan: Annotated[
+        str | None,
+        typer.Argument(metavar="PLAN", help="A name or a path; none lists those of the catalogue."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--folder", "-f", help="Learn from what has finished there, and count it."),
+    ] = None,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Also estimate for a cluster of so many cores.")
+    ] = None,
+    jobs: Jobs = None,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    only: Only = None,
+    json: Json = False,
+) -> None:
+    """What a study would run, and how long it would take, before anything runs.
+
+    Times are from what has finished in --folder, where there is something of the algorithm; else
+    between a quick core's and a slow one's.
+
+    Examples:
+
+      sme study plan
+
+      sme study plan paper-ablations --cores 64
+
+      sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
+
+      sme study plan smoke --folder runs/smoke --json
+    """
+    from sme_registry.studies.estimate import Estimator, Span, makespan
+    from sme_registry.studies.executors import available_cores
+    from sme_registry.studies.ledger import Ledger
+    from sme_registry.studies.scaling import selected
+
+    if plan is None:
+        _list_plans(json)
+        return
+    file = _scaled(_find(plan), steps, seeds, evaluations)
+    planned = selected(file.plan.cells, only or ())
+    cells = {cell.cell.digest: cell.cell for cell in planned}
+    results = {} if folder is None else Ledger(folder).results()
+    estimator = Estimator(results.values())
+    waiting = [cell for key, cell in cells.items() if key not in results]
+    spans = [estimator.seconds(cell) for cell in waiting]
+
+    def takes(workers: int) -> Span:
+        return Span(*(makespan([span[i] for span in spans], workers) for i in (0, 1)))
+
+    here = available_cores() if jobs is None else jobs
+    times = {"one core": takes(1), f"this machine, {here} at once": takes(here)}
+    if cores is not None:
+        times[f"a cluster, {cores} cores"] = takes(cores)
+    if json:
+        print_json(
+            {
+                "study": file.versioned_name,
+                "digest": file.digest,
+                "cells": len(cells),
+                "done": len(cells) - len(waiting),
+                "classes": _unique(cell.class_name for cell in planned),
+                "algorithms": _unique(cell.algorithm for cell in planned),
+                "seeds": file.plan.seeds,
+                "estimated_from_results": sorted(
+                    {cell.uses for cell in waiting if estimator.knows(cell)}
+                ),
+                "seconds": [
+                    {"cores": n, **takes(n)._asdict()}
+                    for n in dict.fromkeys([1, here, *([] if cores is None else [cores])])
+                ],
+            }
+        )
+        return
+    out().print(_plan_table(file, planned, estimator.seconds))
+    done = f", of which {len(cells) - len(waiting):,} have finished" if results else ""
+    out().print(f"{len(cells):,} cells{done}. To run them takes about")
+    for where, span in times.items():
+        out().print(f"  {where + ':':32}{_span(span)}")
+    guessed = sorted({cell.uses for cell in waiting if not estimator.knows(cell)})
+    if guessed:
+        out().print(
+            f"[dim]From a table of costs, not from results: {escape(', '.join(guessed))}.[/]",
+            soft_wrap=True,
+        )
+
+
+def _list_plans(json: bool) -> None:
+    files = catalogue.entries(StudyFile)
+    if json:
+        print_json(
+            [
+                {
+                    "name": file.versioned_name,
+                    "digest": file.digest,
+                    "cells": len(file.plan.cells),
+                    "description": file.description,
+                }
+                for file in files
+            ]
+        )
+        return
+    table = Table(title="Studies", title_justify="left")
+    for column in ("name", "classes × algorithms × seeds", "description"):
+        table.add_column(column, no_wrap=column == "name")
+    for file in files:
+        plan = file.plan
+        size = f"{len(plan.classes)} × {len(plan.algorithms)} × {plan.seeds}"
+        table.add_row(file.versioned_name, size, escape(file.description))
+    out().print(table)
+
+
+def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:
+    table = Table(
+        title=f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
+        caption=f"{file.digest}\n{len(_unique(cell.class_name for cell in planned))} classes: "
+        f"{escape(', '.join(_unique(cell.class_name for cell in planned)))}",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("algorithm", no_wrap=True)
+    for column in ("classes", "runs each", "steps", "evaluations", "cells", "a run"):
+        table.add_column(column, justify="right")
+    for name in _unique(cell.algorithm for cell in planned):
+        cells = [cell for cell in planned if cell.algorithm == name]
+        cell = cells[0].cell
+        spans = [seconds(each.cell) for each in cells]
+        low, high = min(span.low for span in spans), max(span.high for span in spans)
+        table.add_row(
+            escape(name),
+            str(len({each.class_name for each in cells})),
+            str(len({each.run for each in cells})),
+            f"{cell.steps:,}",
+            f"{cell.evaluations:,} × {cell.evaluation_episodes}",
+            f"{len(cells):,}",
+            _span((low, high)),
+        )
+    return table
+
+
+@app.command("run")
+def run(
+    plan: PlanName,
+    folder: Annotated[Path, typer.Option("--folder", "-f", help="Of the study; made if missing.")],
+    executor: Annotated[
+        ExecutorName | None,
+        typer.Option(help="By default processes; with --ray, ray."),
+    ] = None,
+    jobs: Jobs = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="local|ADDRESS", help="Run on Ray, started here or at host:port."),
+    ] = None,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Also run the cells that failed before.")
+    ] = False,
+    keep_models: Annotated[
+        bool, typer.Option("--keep-models", help="Keep the trained models, in FOLDER/models.")
+    ] = False,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    only: Only = None,
+    json: Annotated[bool, typer.Option("--json", help="Where it stands at the end, as JSON.")] = (
+        False
+    ),
+) -> None:
+    """Run the cells of a plan that the folder has no result of.
+
+    Stop it as you like, also with kill -9: the same command goes on, and only the cells that were
+    running begin again. Run it twice on one folder, also from two machines that share it, and they
+    share the cells. With other --steps, --seeds, --evaluations or another plan, what is the same is
+    reused. A cell that fails is listed, and run again with --retry.
+
+    On a cluster, this package and Ray in the same versions on every node are all that is needed:
+    results come back here.
+
+    Examples:
+
+      sme study run smoke --folder runs/smoke
+
+      sme study run paper-ablations -f runs/k --only "class=k-*" --only class=default --seeds 3
+
+      sme study run paper-ablations -f runs/short --steps 20000 --steps PPO=100000 --jobs 8
+
+      sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
+    """
+    from sme_registry.studies.runner import run_study
+
+    if ray is not None and executor not in (None, ExecutorName.ray):
+        raise OptionError(f"--ray {ray}: --executor {executor} is another. Leave out one of them.")
+    chosen = executor or (ExecutorName.processes if ray is None else ExecutorName.ray)
+    file = _scaled(_find(plan), steps, seeds, evaluations)
+    status = run_study(
+        file,
+        folder,
+        executor=chosen.value,
+        jobs=jobs,
+        ray=ray or "local",
+        retry_failed=retry,
+        keep_models=keep_models,
+        only=only or (),
+        console=err(),
+    )
+    if json:
+        print_json(status.plain())
+    else:
+        _print_status(status)
+    if status.failed:
+        err().print(
+            f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] The same "
+            "command with --retry runs them again.",
+            soft_wrap=True,
+        )
+        raise typer.Exit(1)
+
+
+@app.command("status")
+def status(
+    folder: Annotated[Path, typer.Argument(help="Of the study.")],
+    only: Only = None,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    json: Json = False,
+) -> None:
+    """Where a study stands: cells done, running, failed and waiting, and the time left.
+
+    Changes nothing, also while it runs. With --steps, --seeds or --evaluations: where the plan so
+    scaled would stand.
+
+    Examples:
+
+      sme study status runs/smoke
+
+      sme study status runs/all --only "class=k-*" --json
+    """
+    from sme_registry.studies.runner import study_status
+
+    found = study_status(folder, only or (), lambda file: _scaled(file, steps, seeds, evaluations))
+    if json:
+        print_json(found.plain())
+    else:
+        _print_status(found)
+
+
+app.command("report")(study_report.report)
+
+
+def _print_status(status: StudyStatus) -> None:
+    from sme_registry.studies.executors import available_cores
+    from sme_registry.studies.runner import STATES
+
+    file = status.file
+    table = Table(
+        title=f"[bold]{file.versioned_name}[/] in {escape(str(status.folder))}",
+        title_justify="left",
+    )
+    algorithms = _unique(cell.planned.algorithm for cell in status.cells)
+    table.add_column("class", no_wrap=True)
+    for name in algorithms:
+        table.add_column(escape(name), justify="right", no_wrap=True)
+    counts = status.counts
+    for class_name in _unique(cell.planned.class_name for cell in status.cells):
+        row = [counts.get((class_name, name)) for name in algorithms]
+        table.add_row(class_name, *("" if one is None else _counted(one) for one in row))
+    out().print(table)
+    out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ of all[/]")
+    parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
+    out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
+    if status.left.high > 0:
+        here = available_cores()
+        shared = type(status.left)(status.left.low / here, status.left.high / here)
+        out().print(f"left: {_span(status.left)} of one core, {_span(shared)} of the {here} here")
+    if status.others:
+        out().print(f"[dim]{status.others:,} results in the folder are of no cell of this plan[/]")
+    for cell in status.failed[:_LINES_OF_FAILURES]:
+        failure, planned = cell.failure, cell.planned
+        if failure is None:
+            continue
+        times = f" ({failure.attempts} times)" if failure.attempts > 1 else ""
+        out().print(
+            f"[red]failed{times}[/] {escape(planned.algorithm)} on {planned.class_name}, run "
+            f"{planned.run}: {escape(failure.error)}\n  "
+            f"[dim]{_failure_path(status, failure.key)}[/]",
+            soft_wrap=True,
+        )
+    if len(status.failed) > _LINES_OF_FAILURES:
+        out().print(f"… and {len(status.failed) - _LINES_OF_FAILURES} more: --json lists them all")
+
+
+def _failure_path(status: StudyStatus, key: str) -> str:
+    path = status.folder / "failed" / f"{key.removeprefix('sha256:')}.json"
+    return escape(str(path).replace(os.sep, "/"))
+
+
+def _counted(counts: Any) -> str:
+    """`7 +2 !1 / 10`: done, running, failed, of all."""
+    text = f"{counts['done']}"
+    if counts["running"]:
+        text += f" [cyan]+{counts['running']}[/]"
+    if counts["failed"]:
+        text += f" [red]!{counts['failed']}[/]"
+    return f"{text} [dim]/ {counts.total()}[/]"
+
+
+def _find(name: str) -> StudyFile:
+    """A plan by its name or path.
+
+    Raises:
+      UnknownNameError, SpecError: there is none, or it is no plan.
+    """
+    return StudyFile.read(name) if names.is_path(name) else catalogue.find(StudyFile, name)
+
+
+def _scaled(
+    file: StudyFile, steps: list[str] | None, seeds: int | None, evaluations: int | None
+) -> StudyFile:
+    from sme_registry.studies.scaling import scaled
+
+    every, single = _budgets(steps)
+    return scaled(file, steps=every, steps_of=single, seeds=seeds, evaluations=evaluations)
+
+
+def _budgets(texts: list[str] | None) -> tuple[int | None, dict[str, int]]:
+    """`--steps 20000 --steps PPO=100000` as the budget of all, and those of single algorithms.
+
+    Raises:
+      OptionError: not a number, or given twice.
+    """
+    found: dict[str, int] = {}
+    for text in texts or ():
+        name, _, number = text.rpartition("=")
+        if not number.replace("_", "").isdigit():
+            raise OptionError(
+                f"--steps {text!r}: must be a number or ALGORITHM=number, as in --steps PPO=100000."
+            )
+        if name in found:
+            raise OptionError(f"--steps {text!r}: {name or 'all'} is given twice. Remove one.")
+        found[name] = int(number)
+    return found.pop("", None), found
+
+
+def _span(span: Span | tuple[float, float]) -> str:
+    """`3 min 10 s`, or `2 h 0 min to 4 h 5 min`."""
+    low, high = map(_days, span)
+    return low if low == high else f"{low} to {high}"
+
+
+def _days(seconds: float) -> str:
+    if seconds < 2 * _SECONDS_PER_DAY:
+        return duration(seconds)
+    return f"{seconds / _SECONDS_PER_DAY:.1f} days"
+
+
+def _unique(values: Any) -> list[str]:
+    return list(dict.fromkeys(values))

@@ -1,0 +1,140 @@
+"""`Transitions`: a data set as aligned NumPy arrays, one row for each transition.
+
+Row i is (s, a, R, s'): what was observed, what was done, what was paid, and what was observed next,
+beside what only an SME knows of it: π*(s), r̃, r and the regret 1 − r. `N` transitions, `S`
+state_dim, `A` action_dim, `n` agents of a team (1 where there is none), `O` = S + 1 + n entries of
+an observation.
+
+Rows of one trajectory stand together, in order. An off-by-one between observations and actions
+cannot be made with these: no array here has a row more than another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.spec import SMESpec
+from sme_registry.task.draw import Array
+
+Observations = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """Aligned arrays of a data set; every first axis is N.
+
+    A trajectory is an episode, or a part of one: a set that is kept to a sub-cube of the states, or
+    cut to its length, holds parts. `terminations | timeouts` marks the last row of each.
+
+    Attributes:
+      observations: `[N, O]` float32 in [0, 1]: s, t/T, and each agent's r_cum/k, acted in.
+      actions: `[N, A]` float32 in [0, 1], as the environment took them.
+      rewards: `[N]` float64 in [0, k], R; of a team the mean over its agents.
+      next_observations: `[N, O]` float32, after the step; also at the end of a trajectory.
+      terminations: `[N]` bool: the episode ended by D. Nothing follows: do not bootstrap.
+      timeouts: `[N]` bool: the trajectory stops here and the task does not. Bootstrap from
+        `next_observations`. Never together with a termination.
+      optimal_actions: `[N, A]` float64 in [0, 1], π* of the states acted in.
+      regrets: `[N]` float64 in [0, 1], 1 − r; of a team `[N, n]`, each agent's own.
+      similarities: `[N]` float64 in [0, 1], r̃; of a team `[N, n]`.
+      step_rewards: `[N]` float64 in [0, 1], r; of a team `[N, n]`.
+      states: `[N, S]` float64 in [0, 1], acted in, to the bit.
+      next_states: `[N, S]` float64, to the bit.
+      episodes: `[N]` int64 from 0, which trajectory of the set a row is of; increasing.
+      components: `[N]` int64, which behaviour policy of the recipe acted.
+      agent_rewards: `[N, n]` float64, R of each agent of a team; None where there is no team.
+    """
+
+    observations: Observations
+    actions: Observations
+    rewards: Array
+    next_observations: Observations
+    terminations: Mask
+    timeouts: Mask
+    optimal_actions: Array
+    regrets: Array
+    similarities: Array
+    step_rewards: Array
+    states: Array
+    next_states: Array
+    episodes: Indices
+    components: Indices
+    agent_rewards: Array | None = None
+
+    def __len__(self) -> int:
+        """N, the transitions."""
+        return len(self.rewards)
+
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays by name, in the order of this class; without `agent_rewards` where None."""
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: array for name, array in named.items() if array is not None}
+
+    @property
+    def ends(self) -> Indices:
+        """`[E]` the row after the last of each trajectory; `E` trajectories."""
+        return np.flatnonzero(self.terminations | self.timeouts) + 1
+
+    @property
+    def digest(self) -> str:
+        """`sha256:` and 64 hex digits over the names, types, shapes and bytes of all arrays."""
+        content = hashlib.sha256()
+        for name, array in self.columns().items():
+            little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+            content.update(f"{name}/{little.dtype.str}/{little.shape}\n".encode())
+            content.update(little.data)
+        return "sha256:" + content.hexdigest()
+
+
+def to_d3rlpy(
+    transitions: Transitions, *, final_observations: bool = False
+) -> dict[str, npt.NDArray[Any]]:
+    """The arguments of d3rlpy's `MDPDataset`: `MDPDataset(**to_d3rlpy(transitions))`.
+
+    d3rlpy takes the observation after row i to be row i + 1. So the last row of a trajectory that
+    stopped without a termination has no successor, and d3rlpy leaves it out: one in T, and every
+    trajectory of a single step. With `final_observations` each of those gets a row more, its final
+    observation with an action and a reward of 0, which d3rlpy uses as a successor and not as a
+    transition: nothing is lost. Leave them out for what reads rows and not transitions, such as
+    return-conditioned sequence models.
+
+    Args:
+      transitions: of N rows.
+      final_observations: add the final observation of each trajectory that did not terminate.
+
+    Returns:
+      `observations` `[N, O]` float32, `actions` `[N, A]` float32, `rewards` `[N]` float32,
+      `terminals` `[N]` and `timeouts` `[N]` float32 of 0 and 1; with `final_observations` as many
+      rows more as there are timeouts. Fresh arrays.
+    """
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "observations": transitions.observations,
+        "actions": transitions.actions,
+        "rewards": transitions.rewards.astype(np.float32),
+        "terminals": transitions.terminations.astype(np.float32),
+        "timeouts": transitions.timeouts.astype(np.float32),
+    }
+    if not final_observations:
+        return {name: array.copy() for name, array in arrays.items()}
+    stopped = np.flatnonzero(transitions.timeouts)
+    added: dict[str, npt.NDArray[Any] | float] = {
+        "observations": transitions.next_observations[stopped],
+        "timeouts": 1.0,
+    }
+    arrays["timeouts"] = np.zeros_like(arrays["timeouts"])  # they move to the added rows
+    return {
+        name: np.insert(array, stopped + 1, added.get(name, 0.0), axis=0)
+        for name, array in arrays.items()
+    }
+
+
+def agents_of(spec: SMESpec) -> int:
+    """n, the agents of a task; 1 where there is no team."""
+    return 1 if spec.team is None else len(spec.team.agents)

@@ -1,0 +1,106 @@
+"""Implicit Q-learning: no action is ever asked about that the data set does not hold.
+
+    L(V) = mean of |τ − 1{d < 0}| d²,     d = min Q̄(o, u) − V(o)           expectile regression
+    L(Q) = sum over the critics of the mean of (R + γ c V(o') − Q(o, u))²
+    L(π) = mean of −min(exp(β d), w_max) log N(u; tanh μ(o), σ² I)          weighted cloning
+    Q̄ ← (1 − ρ) Q̄ + ρ Q                                                    after each step
+
+c is 0 after a termination and 1 else, also after a timeout; σ is one number for each channel, in
+[e⁻⁵, e²]. Source: Kostrikov, Nair, Levine, 2021, arXiv 2110.06169.
+
+The three losses touch disjoint parameters, so that they are taken at the same weights and in one
+backward pass, with V(o) and Q̄ asked once. Implementations that update V first weigh the actions by
+the V of one step later.
+
+Imports PyTorch; import it inside functions only.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from sme_registry.offline.hyperparameters import IQLHyperparameters
+from sme_registry.offline.networks import Batch, mlp
+
+CRITICS = 2
+_LOW, _HIGH = -5.0, 2.0  # of log σ
+_HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class IQL:
+    """A policy, two critics with their targets, a value function, and their optimiser.
+
+    Attributes:
+      critics, targets: from `[B, O + A]` to `[B, 1]` each.
+      value: from `[B, O]` to `[B, 1]`.
+      spread: `[A]`, of which the sigmoid is log σ's place between −5 and 2.
+
+    Args:
+      observation_dim: O.
+      action_dim: A.
+      hyperparameters: see there.
+    """
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, hyperparameters: IQLHyperparameters
+    ) -> None:
+        self._set = hyperparameters
+        hidden = hyperparameters.hidden
+        self._actor = mlp(observation_dim, hidden, action_dim)
+        self.spread = nn.Parameter(torch.zeros(action_dim))
+        self.critics = nn.ModuleList(
+            mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS)
+        )
+        self.targets = nn.ModuleList(
+            mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS)
+        )
+        self.targets.load_state_dict(self.critics.state_dict())
+        self.targets.requires_grad_(False)
+        self.value = mlp(observation_dim, hidden, 1)
+        trained = [self._actor, self.critics, self.value]
+        parameters = [parameter for network in trained for parameter in network.parameters()]
+        self._adam = torch.optim.Adam(
+            [*parameters, self.spread], lr=hyperparameters.learning_rate, fused=True
+        )
+        self._followed: list[Tensor] = list(self.critics.parameters())
+        self._following: list[Tensor] = list(self.targets.parameters())
+
+    @property
+    def actor(self) -> nn.Sequential:
+        """The network from observations to what tanh makes the policy's mean u."""
+        return self._actor
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The terms of the loss: `value`, `critic` and `actor`."""
+        given = torch.cat([batch.observations, batch.actions], dim=1)
+        with torch.no_grad():
+            q = torch.minimum(*(target(given) for target in self.targets))
+            ahead = self.value(batch.next_observations)
+            goal = batch.rewards + self._set.discount * batch.continues * ahead
+        advantage = q - self.value(batch.observations)
+        with torch.no_grad():
+            asymmetry = (self._set.expectile - (advantage < 0.0).float()).abs()
+            weight = (self._set.inverse_temperature * advantage).exp()
+            weight.clamp_(max=self._set.max_weight)
+        mean = torch.tanh(self._actor(batch.observations))
+        log_sigma = _LOW + (_HIGH - _LOW) * torch.sigmoid(self.spread)
+        standardised = (batch.actions - mean) * torch.exp(-log_sigma)
+        log_density = -0.5 * standardised.square() - log_sigma - _HALF_LOG_2_PI
+        return {
+            "value": (asymmetry * advantage.square()).mean(),
+            "critic": sum(nn.functional.mse_loss(critic(given), goal) for critic in self.critics),
+            "actor": -(weight * log_density.sum(dim=1, keepdim=True)).mean(),
+        }
+
+    def step(self, batch: Batch) -> dict[str, Tensor]:
+        """One gradient step of everything; the terms of the loss as they were before it."""
+        losses = self.losses(batch)
+        self._adam.zero_grad(set_to_none=False)
+        (losses["value"] + losses["critic"] + losses["actor"]).backward()  # type: ignore[no-untyped-call]
+        self._adam.step()
+        with torch.no_grad():  # or the targets' history would grow with each step
+            torch._foreach_lerp_(self._following, self._followed, self._set.target_rate)
+        return losses

@@ -1,0 +1,136 @@
+"""`StudyPlan`: algorithms × kinds of tasks × seeds, what each run may take and how it is judged.
+
+A plan holds everything that its numbers depend on, so a study is one file that a colleague can run.
+Its cells are its runs: the cell of an algorithm, a class and a number i trains with seed i on the
+class's instance i (beginning again where there are fewer instances), as the paper's seeds do both.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, JsonValue, model_validator
+
+from sme_registry.spec.document import (
+    Document,
+    Integer,
+    Name,
+    SchemaVersion,
+    StrictModel,
+    explained,
+)
+from sme_registry.spec.protocol import EvaluationProtocol
+from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.suite import SuiteClass
+
+Steps = Annotated[Integer, Field(ge=0, le=10**10)]
+
+
+class StudyAlgorithm(StrictModel):
+    """What is run in a study's cells.
+
+    Attributes:
+      name: how reports call it; each name once.
+      uses: an algorithm of Stable-Baselines3 ("PPO"), an installed entry point of the group
+        `sme_registry.algorithms`, `module:function`, or `reference:constant`, `reference:linear`,
+        `reference:random`, `reference:optimal`, which learn nothing.
+      hyperparameters: where they differ from the algorithm's defaults.
+      action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
+      steps: its own budget; null takes the plan's.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
+    uses: Annotated[str, Field(min_length=1, max_length=200)]
+    hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
+    action_range: Literal["symmetric", "unit"] = "symmetric"
+    steps: Steps | None = None
+
+
+class Cell(Document):
+    """One run of a study, by content: its digest is the key of its result.
+
+    Neither the plan nor the names in it are part of a cell, so a plan may be renamed, cut or
+    extended, and what was run stays valid.
+    """
+
+    schema_version: SchemaVersion = 1
+    spec: SMESpec
+    uses: str
+    hyperparameters: dict[str, JsonValue]
+    action_range: Literal["symmetric", "unit"]
+    seed: Annotated[Integer, Field(ge=0, lt=2**32)]
+    steps: Steps
+    evaluations: Integer
+    evaluation_episodes: Integer
+    protocol: EvaluationProtocol
+
+
+class PlannedCell(StrictModel):
+    """A cell and its place in the plan."""
+
+    class_name: Name
+    algorithm: str
+    run: Integer
+    cell: Cell
+
+
+class StudyPlan(Document):
+    """A study.
+
+    Attributes:
+      classes: kinds of tasks; the first is the one that others are contrasted with.
+      algorithms: what is run on each of them.
+      seeds: runs of each algorithm on each class.
+      steps: environment steps of a run.
+      evaluations: evenly spaced over training, the last at its end; 0 for none.
+      evaluation_episodes: in each of them.
+      protocol: of the evaluation within and out of distribution at the end.
+    """
+
+    schema_version: SchemaVersion = 1
+    classes: Annotated[tuple[SuiteClass, ...], Field(min_length=1, max_length=1000, strict=False)]
+    algorithms: Annotated[
+        tuple[StudyAlgorithm, ...], Field(min_length=1, max_length=100, strict=False)
+    ]
+    seeds: Annotated[Integer, Field(ge=1, le=10_000)] = 10
+    steps: Steps = 100_000
+    evaluations: Annotated[Integer, Field(ge=0, le=100_000)] = 400
+    evaluation_episodes: Annotated[Integer, Field(ge=1, le=10_000)] = 5
+    protocol: EvaluationProtocol = EvaluationProtocol()
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        for field in ("classes", "algorithms"):
+            names = [member.name for member in getattr(self, field)]
+            for name in names:
+                if names.count(name) > 1:
+                    raise explained(
+                        f"{field}: the name {name!r} is given twice. Rename one of them."
+                    )
+        return self
+
+    @property
+    def cells(self) -> tuple[PlannedCell, ...]:
+        """Every run: seeds outermost, so that a study that is cut short has whole comparisons."""
+        instances = {member.name: member.instances for member in self.classes}
+        return tuple(
+            PlannedCell(
+                class_name=member.name,
+                algorithm=algorithm.name,
+                run=run,
+                cell=Cell(
+                    spec=instances[member.name][run % len(instances[member.name])],
+                    uses=algorithm.uses,
+                    hyperparameters=algorithm.hyperparameters,
+                    action_range=algorithm.action_range,
+                    seed=run,
+                    steps=self.steps if algorithm.steps is None else algorithm.steps,
+                    evaluations=self.evaluations,
+                    evaluation_episodes=self.evaluation_episodes,
+                    protocol=self.protocol,
+                ),
+            )
+            for run in range(self.seeds)
+            for member in self.classes
+            for algorithm in self.algorithms
+        )

@@ -1,0 +1,288 @@
+"""Which property of the task breaks an algorithm, and how sure are we? The tables in words.
+
+What is said follows from the contrasts of normalised regret within distribution. A change is
+`shown` where its 95 % interval leaves out 0 and there are `ENOUGH_RUNS` pairs, an `indication`
+where there are fewer, and otherwise open: no sentence turns an open one into "has no effect".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from sme_registry.studies.analysis import ALL, AXES
+from sme_registry.studies.tables import ENOUGH_RUNS, Analysis, Contrast
+
+WD, OOD = "regret_wd", "regret_ood"
+_NOT_LEARNT = 0.9  # of the constant's regret: nothing to speak of was learnt
+_BROKEN, _HURT = 0.2, 0.05  # of the constant's regret: how much is called what
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is said of an algorithm.
+
+    Attributes:
+      algorithm: its name.
+      headline: the answer, one sentence or two.
+      points: what else there is to it, and how sure it is.
+    """
+
+    algorithm: str
+    headline: str
+    points: tuple[str, ...]
+
+
+def findings(analysis: Analysis) -> list[Finding]:
+    """The answer for each algorithm that learns."""
+    return [_finding(analysis, algorithm) for algorithm in analysis.learners]
+
+
+def caveats(analysis: Analysis) -> list[str]:
+    """What holds for everything that is said: how many runs, how many comparisons."""
+    done, missing = len(analysis.results), len(analysis.missing)
+    said = []
+    if missing:
+        failed = sum(bool(gap.error) for gap in analysis.missing)
+        why = f", of which {failed} failed" if failed else ""
+        said.append(
+            f"{missing} of the plan's {done + missing} runs are not there yet{why}. They are in no "
+            "number, and the table of runs names them."
+        )
+    pairs = [row.pairs for row in analysis.contrasts if row.algorithm in analysis.learners]
+    if pairs and min(pairs) < ENOUGH_RUNS:
+        said.append(
+            f"Some contrasts rest on as few as {min(pairs)} {_plural(min(pairs), 'pair')} of runs. "
+            "A 95 % bootstrap interval of 2 runs holds the truth in only 32–62 % of cases and of 3 "
+            "in 48–86 %, depending on how runs spread; from 4 on in 94–98 %. Under "
+            f"{ENOUGH_RUNS} pairs, this report calls a change an indication at most."
+        )
+    contrasts = [row for row in analysis.contrasts if row.metric == WD and row.low is not None]
+    contrasts = [row for row in contrasts if row.algorithm in analysis.learners]
+    if len(contrasts) > 1:
+        said.append(
+            f"There are {len(contrasts)} contrasts within distribution, each with an interval of "
+            f"its own: were there no effects at all, about {max(1, round(0.05 * len(contrasts)))} "
+            "of them would still leave out 0 by chance."
+        )
+    if any("policy_init" in _differing(analysis, name) for name in analysis.classes):
+        said.append(
+            "Some classes also have another policy_init than the first, which their depth asks "
+            "for; that is part of their contrasts."
+        )
+    return said
+
+
+def comparison(analysis: Analysis) -> str:
+    """Which algorithm does best over all classes, and whether that is settled."""
+    rows = [
+        row
+        for row in analysis.aggregates
+        if (row.group, row.metric, row.statistic) == (ALL, WD, "iqm")
+        and row.algorithm in analysis.learners
+    ]
+    if len(rows) < 2:
+        return ""
+    best = max(rows, key=lambda row: row.value)
+    text = (
+        f"Over the {best.classes} {_plural(best.classes, 'class', 'classes')} where all have runs, "
+        f"{best.algorithm} scores highest within distribution: {best.value:.2f}"
+        f"{_interval(best.low, best.high)}, where 1 is the optimum and 0 the constant ½."
+    )
+    for row in analysis.improvements:
+        pair = {row.first, row.second}
+        if (row.group, row.metric) != (ALL, WD) or best.algorithm not in pair:
+            continue
+        other = (pair - {best.algorithm}).pop()
+        if other not in analysis.learners:
+            continue
+        value, low, high = row.value, row.low, row.high
+        if row.first == other:
+            value = 1.0 - value
+            low, high = (None if end is None else 1.0 - end for end in (high, low))
+        if low is None or low <= 0.5:
+            sure = ", which leaves open which of the two is better"
+        else:
+            sure = "" if row.fewest >= ENOUGH_RUNS else ", an indication from few runs"
+        text += (
+            f" A run of it beats one of {other} with probability {value:.2f}"
+            f"{_interval(low, high)}{sure}."
+        )
+    return text
+
+
+def _finding(analysis: Analysis, algorithm: str) -> Finding:
+    rows = _rows(analysis, algorithm, WD)
+    if not rows:
+        return Finding(
+            algorithm,
+            f"Nothing can be said of {algorithm} yet: it has no runs of one number on the first "
+            f"class, {analysis.base}, and on another.",
+            (),
+        )
+    points = []
+    base = analysis.level(analysis.base, algorithm, WD)
+    if base is not None and base.value >= _NOT_LEARNT:
+        points.append(
+            f"It has learnt next to nothing on the first class itself: its normalised regret there "
+            f"is {base.value:.2f}, and the constant action's 1. What has not been learnt cannot "
+            "break, so the contrasts say little: they need a longer budget."
+        )
+    worse = [row for row in rows if row.verdict == "worse"]
+    if not worse:
+        better = [row for row in rows if row.verdict == "better"]
+        found = f"; {_listed(analysis, better)} lower it" if better else ""
+        headline = (
+            f"No class has been shown to make {algorithm} worse within distribution{found}. "
+            "That is no proof of the contrary: the intervals say what is still possible."
+        )
+        points.append(f"The largest upper end is {_signed(max(map(_upper, rows)))}.")
+        return Finding(algorithm, headline, tuple(points))
+    top = max(worse, key=lambda row: row.change)
+    headline = (
+        f"{algorithm} is {_verb(top.change)} by {_property(analysis, top)}: on {top.class_name} "
+        f"its normalised regret within distribution goes from {top.base:.2f} to {top.level:.2f}, a "
+        f"change of {_signed(top.change)} (95 % interval {_signed(top.low)} to "
+        f"{_signed(top.high)}, {top.pairs} pairs of runs)."
+    )
+    points += [_certainty(analysis, top, rows), _severity(analysis, top)]
+    others = [row for row in _worst_of_each_axis(worse) if row.axis != top.axis]
+    settled = [row for row in others if row.settled]
+    if settled:
+        points.append(f"It is also made worse by {_listed(analysis, settled)}.")
+    if len(settled) < len(others):
+        few = [row for row in others if not row.settled]
+        points.append(
+            f"There are indications, no more, that it is made worse by {_listed(analysis, few)}."
+        )
+    shown = {row.axis for row in worse}
+    still_open = [row for row in _worst_of_each_axis(rows) if row.axis not in shown]
+    if still_open:
+        points.append(
+            f"Not shown to make it worse: {_listed(analysis, still_open)}. Where an interval is "
+            "wide, that is for want of runs."
+        )
+    outside = [row for row in _rows(analysis, algorithm, OOD) if row.verdict == "worse"]
+    if outside:
+        far = max(outside, key=lambda row: row.change)
+        if far.axis == top.axis:
+            text = "Out of distribution the same property costs it most"
+        else:
+            text = f"Out of distribution it is {_property(analysis, far)} that costs it most"
+        points.append(f"{text}: {_listed(analysis, [far])}.")
+    return Finding(algorithm, headline, tuple(filter(None, points)))
+
+
+def _severity(analysis: Analysis, top: Contrast) -> str:
+    """Where the policies end up, between the references."""
+    level = analysis.level(top.class_name, top.algorithm, WD)
+    linear = level.linear if level is not None else None
+    if top.level >= _NOT_LEARNT:
+        return f"At {top.level:.2f} it is about where the constant action ½ is, which scores 1."
+    if linear is None:
+        return ""
+    relation = "worse" if top.level > linear else "still better"
+    text = (
+        f"At {top.level:.2f} it is {relation} than the linear policy fitted to the optimum, which "
+        f"has {linear:.2f} there, and better than the constant ½, which has 1."
+    )
+    before = analysis.level(analysis.base, top.algorithm, WD)
+    if before is not None and before.linear is not None and linear - before.linear > _HURT:
+        text += (
+            f" The linear policy's own regret rises from {before.linear:.2f}: the optimum itself "
+            "is harder to fit there."
+        )
+    return text
+
+
+def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> str:
+    """How sure it is that this is the worst."""
+    if not top.settled:
+        return (
+            f"How sure? Not very: {top.pairs} pairs of runs are few, and this is an indication, "
+            f"not a finding. {ENOUGH_RUNS} or more would settle more."
+        )
+    rivals = [
+        row
+        for row in _worst_of_each_axis(rows, by_upper=True)
+        if row.axis != top.axis and _upper(row) >= (top.low or 0.0)
+    ]
+    if rivals:
+        return (
+            "How sure? That it hurts, its interval shows. That nothing else hurts more is not "
+            f"settled: the intervals of {_listed(analysis, rivals)} reach as far."
+        )
+    if len({row.axis for row in rows}) == 1:
+        return "How sure? That it hurts, its interval shows; no other axis was varied."
+    return (
+        f"How sure? Its interval begins at {_signed(top.low)}, above where every other axis' "
+        "ends, so that among the axes varied here it is the worst."
+    )
+
+
+def _rows(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
+    return [row for row in analysis.contrasts if (row.algorithm, row.metric) == (algorithm, metric)]
+
+
+def _worst_of_each_axis(rows: Iterable[Contrast], *, by_upper: bool = False) -> list[Contrast]:
+    """For each axis the class that costs most, dearest axis first."""
+    found: dict[str, Contrast] = {}
+    for row in sorted(rows, key=_upper if by_upper else lambda row: row.change, reverse=True):
+        found.setdefault(row.axis or row.class_name, row)
+    return list(found.values())
+
+
+def _upper(row: Contrast) -> float:
+    return row.change if row.high is None else row.high
+
+
+def _listed(analysis: Analysis, rows: Sequence[Contrast]) -> str:
+    """`complexity L (complexity-10: +0.13, interval +0.12 to +0.15)`, …"""
+    parts = []
+    for row in rows:
+        interval = (
+            "a single pair, no interval"
+            if row.low is None
+            else f"interval {_signed(row.low)} to {_signed(row.high)}"
+        )
+        few = "" if row.settled or row.low is None else f", only {row.pairs} pairs"
+        parts.append(
+            f"{_property(analysis, row)} ({row.class_name}: {_signed(row.change)}, {interval}{few})"
+        )
+    return ", ".join(parts)
+
+
+def _property(analysis: Analysis, row: Contrast) -> str:
+    """What the class changes, as a reader calls it."""
+    if row.axis in AXES:
+        return AXES[row.axis][1]
+    label = analysis.classes[row.class_name].label
+    return f"several axes at once ({label})" if label else f"the class {row.class_name}"
+
+
+def _differing(analysis: Analysis, class_name: str) -> list[str]:
+    """Fields in which a class differs from the first, besides the one it is contrasted by."""
+    info, base = analysis.classes[class_name], analysis.classes[analysis.base]
+    return [name for name in AXES if info.setting[name] != base.setting[name] and name != info.axis]
+
+
+def _verb(change: float) -> str:
+    if change >= _BROKEN:
+        return "broken most"
+    return "hurt most" if change >= _HURT else "hurt most, though little,"
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    return "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+
+
+def _signed(value: float | None) -> str:
+    """`+0.44`, `−0.02`, `0.00`."""
+    if value is None:
+        return "?"
+    text = f"{value:+.2f}"
+    return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
+
+
+def _plural(count: int, one: str, many: str = "") -> str:
+    return one if count == 1 else many or f"{one}s"

@@ -1,0 +1,90 @@
+"""`write_report`: a study's folder to its report.
+
+    REPORT/index.html           the page: words, figures and tables, nothing outside it
+    REPORT/figures/*.png .pdf   the figures, at the width of a printed page
+    REPORT/tables/*.csv         every number
+    REPORT/tables/*.tex         what a paper prints
+
+The same results give the same files. Files of an earlier report that this one does not write stay.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from sme_registry.errors import OptionError
+from sme_registry.files import write_atomically
+from sme_registry.studies.analysis import analyse
+from sme_registry.studies.ledger import REPORT, Ledger
+from sme_registry.studies.report.exports import data, printed
+from sme_registry.studies.report.figures import pictures
+from sme_registry.studies.report.offline import offline_data, offline_pictures, offline_printed
+from sme_registry.studies.report.page import page
+
+FORMATS = ("html", "png", "pdf", "csv", "latex")
+_DRAWN = {"html": "svg", "png": "png", "pdf": "pdf"}
+
+
+def write_report(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    formats: Sequence[str] = FORMATS,
+) -> list[Path]:
+    """Write the report of a study from whatever of its runs has finished.
+
+    Models that the study kept are loaded for the maps of the plane, and loading one can run code of
+    whoever made it. Nothing else of the folder is more than data.
+
+    Args:
+      folder: of the study.
+      out: the folder to write; None for FOLDER/report.
+      formats: of `FORMATS`.
+
+    Returns:
+      The files written, the page first.
+
+    Raises:
+      OptionError: an unknown format, no study in the folder, none of its runs has finished, or the
+        report cannot be written.
+      SpecError: the folder's plan is no plan.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise OptionError(f"format={','.join(unknown)!r}: must be of {', '.join(FORMATS)}.")
+    ledger = Ledger(folder)
+    file = ledger.plan_file()
+    if file is None:
+        raise OptionError(
+            f"folder={str(folder)!r}: holds no study. Give the folder of `sme study run`."
+        )
+    keys = [planned.cell.digest for planned in file.plan.cells]
+    results = ledger.results(keys)
+    if not results:
+        raise OptionError(
+            f"folder={str(folder)!r}: none of its {len(keys)} runs has finished. Run them with "
+            "`sme study run`, and look at them with `sme study status`."
+        )
+    failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
+    analysis = analyse(file, results, failures)
+    tables = [*offline_printed(analysis), *printed(analysis)]
+    numbers = [*data(analysis), *offline_data(analysis)]
+    models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
+    drawn = [ending for name, ending in _DRAWN.items() if name in formats]
+    figures, absent = pictures(analysis, drawn, models) if drawn else ([], [])
+    figures += offline_pictures(analysis, drawn) if drawn else []
+
+    target = Path(folder) / REPORT if out is None else Path(out)
+    contents: dict[str, str | bytes] = {}
+    if "html" in formats:
+        contents["index.html"] = page(analysis, figures, absent, tables)
+    for ending in ("png", "pdf"):
+        if ending in formats:
+            contents |= {f"figures/{x.name}.{ending}": x.files[ending] for x in figures}
+    if "csv" in formats:
+        contents |= {f"tables/{table.name}.csv": table.csv() for table in numbers}
+    if "latex" in formats:
+        contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
+    return [write_atomically(target / name, content) for name, content in contents.items()]

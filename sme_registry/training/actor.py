@@ -1,0 +1,151 @@
+"""`actor`: what a trained model would do, as matrix products in NumPy; for evaluating it often.
+
+A model of Stable-Baselines3 spends most of a short batch outside its network: in checks, in
+conversions, in PyTorch's dispatch. Its deterministic actions are a multilayer perceptron's,
+
+    x ← f(x W + b)  for each layer,  f one of identity, ReLU, tanh
+
+and are computed here as just that, in float32 as the model does. The sums run in another order, so
+the last bits of an action may differ from the model's, as they do between batch sizes of the model
+itself. A network that is none of these, or answers otherwise on a few probes, is asked itself.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.envs.shared import Observation
+from sme_registry.errors import SpecError
+from sme_registry.evaluation import Policy, as_policy
+from sme_registry.spec import SMESpec
+from sme_registry.task import streams
+
+Weights = npt.NDArray[np.float32]
+Activation = Callable[..., Any]
+
+_PROBES = 16
+_TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e-6
+
+
+@dataclass(frozen=True)
+class Perceptron:
+    """A multilayer perceptron with the weights that a model had when it was copied.
+
+    Attributes:
+      layers: for each its `W [in, out]`, its `b [out]`, and the function of its outputs.
+      low: `[A]` of the action space; None where the outputs are actions as they are.
+      high: `[A]`, as `low`. Outputs in [−1, 1] are then spread over the action space.
+    """
+
+    layers: tuple[tuple[Weights, Weights, Activation | None], ...]
+    low: Weights | None = None
+    high: Weights | None = None
+
+    def __call__(self, observations: Observation) -> Weights:
+        """Actions `[B, A]` float32 of observations `[B, obs]`, not clipped."""
+        x: Weights = np.asarray(observations, np.float32)
+        for W, b, activation in self.layers:
+            x = x @ W
+            x += b
+            if activation is not None:
+                activation(x, out=x)
+        if self.low is None or self.high is None:
+            return x
+        return self.low + 0.5 * (x + 1.0) * (self.high - self.low)
+
+
+def actor(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Policy:
+    """The deterministic policy of a model as it now is; later training does not change it.
+
+    Args:
+      model: a Stable-Baselines3 model, or whatever else `evaluate` takes. Only a model's network
+        of the known kind is copied; anything else is asked itself, as it is when it is asked.
+      spec: the task, of a single agent.
+      action_range: of its actions; None takes the model's own action space.
+
+    Returns:
+      A callable from observations `[B, S + 2]` to actions `[B, A]` in units of the unit range,
+      which the environment clips to it.
+
+    Raises:
+      SpecError: the task is a team's.
+      PolicyError, OptionError: see `as_policy`.
+    """
+    policy = as_policy(model, spec, action_range=action_range)
+    if not isinstance(policy, Policy):
+        raise SpecError("team: an actor is one agent's. Evaluate a team with `evaluate`.")
+    network = getattr(model, "policy", model)
+    copied = _perceptron(network)
+    if copied is None:
+        return policy
+    width = spec.state_dim + 2
+    probes = streams.uniform(0, "actor/probes", _PROBES * width).reshape(_PROBES, width)
+    observations = probes.astype(np.float32)
+    # A subclass may do more than its layers say. NaN counts as a difference.
+    own, ours = policy.act(observations), copied(observations)
+    same = own.shape == ours.shape and np.allclose(ours, own, rtol=_TOLERANCE, atol=_TOLERANCE)
+    return replace(policy, act=copied) if same else policy
+
+
+def _perceptron(network: Any) -> Perceptron | None:
+    """The network's layers, copied; None where it is not a multilayer perceptron."""
+    if "stable_baselines3.common.policies" not in sys.modules:  # then it is no model of theirs
+        return None
+    from stable_baselines3.common.policies import BasePolicy
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+    from torch import nn
+
+    if not isinstance(network, BasePolicy):
+        return None
+    try:
+        extractor, parts = _parts(network)
+    except AttributeError:  # a policy of another make
+        return None
+    if type(extractor) is not FlattenExtractor:
+        return None
+    functions: dict[type, Activation] = {nn.Tanh: np.tanh, nn.ReLU: _relu}
+    layers: list[tuple[Weights, Weights, Activation | None]] = []
+    for module in _flat(parts):
+        if type(module) is nn.Linear and module.bias is not None:
+            W, b = (part.detach().cpu().numpy() for part in (module.weight, module.bias))
+            layers.append((np.ascontiguousarray(W.T), b.copy(), None))
+        elif type(module) in functions and layers and layers[-1][2] is None:
+            layers[-1] = (*layers[-1][:2], functions[type(module)])
+        else:
+            return None
+    if not network.squash_output:
+        return Perceptron(tuple(layers))
+    space: Any = network.action_space
+    return Perceptron(tuple(layers), space.low, space.high)
+
+
+def _parts(network: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Whence the features come, and the modules from there to the action, in order."""
+    from torch import nn
+
+    own = getattr(network, "actor", None)
+    if own is None:  # PPO, A2C, TRPO: the mean of a Gaussian
+        return network.pi_features_extractor, (network.mlp_extractor.policy_net, network.action_net)
+    if hasattr(own, "latent_pi"):  # SAC, TQC: the mean of a Gaussian, squashed
+        return own.features_extractor, (own.latent_pi, own.mu, nn.Tanh())
+    return own.features_extractor, (own.mu,)  # TD3, DDPG
+
+
+def _flat(modules: Iterable[Any]) -> Iterator[Any]:
+    from torch import nn
+
+    for module in modules:
+        if type(module) is nn.Sequential:
+            yield from _flat(module)
+        else:
+            yield module
+
+
+def _relu(x: Weights, out: Weights) -> Weights:
+    return np.maximum(x, 0.0, out=out)

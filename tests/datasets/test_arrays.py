@@ -1,0 +1,138 @@
+"""`Transitions` and what d3rlpy is given: aligned from the first row to the last."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.datasets import DatasetRecipe, to_d3rlpy
+from sme_registry.datasets.collect import collect
+from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
+
+# An interpreter that has d3rlpy, whose legacy gym would warn in this one at every import.
+D3RLPY = os.environ.get("SME_D3RLPY_PYTHON") or (
+    sys.executable if importlib.util.find_spec("d3rlpy") else None
+)
+
+
+def made(**fields):
+    spec = SMESpec(horizon=20, **fields)
+    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(0.8),), transitions=250)
+    return collect(recipe, materialize(spec))
+
+
+@pytest.fixture(scope="module")
+def fragile():
+    """Trajectories that terminate, that time out, and one that is cut."""
+    found = made(D=0.05)
+    assert found.terminations.any()
+    assert found.timeouts.any()
+    return found
+
+
+def test_the_digest_is_of_every_array_its_name_type_and_shape(fragile):
+    digests = {fragile.digest}
+    for name, array in fragile.columns().items():
+        changed = array.copy()
+        changed.reshape(-1).view(np.uint8)[0] ^= 1
+        digests.add(dataclasses.replace(fragile, **{name: changed}).digest)
+    assert len(digests) == 1 + len(fragile.columns())
+    swapped = dataclasses.replace(
+        fragile, rewards=fragile.similarities, similarities=fragile.rewards
+    )
+    wider = dataclasses.replace(fragile, rewards=fragile.rewards.astype(np.float32))
+    assert len({fragile.digest, swapped.digest, wider.digest}) == 3
+
+
+def test_the_ends_cut_the_rows_into_the_trajectories(fragile):
+    lengths = np.diff([0, *fragile.ends])
+    np.testing.assert_array_equal(np.bincount(fragile.episodes), lengths)
+    assert fragile.ends[-1] == len(fragile) == 250
+
+
+def test_d3rlpy_is_given_aligned_rows(fragile):
+    given = to_d3rlpy(fragile)
+    assert {len(array) for array in given.values()} == {250}
+    np.testing.assert_array_equal(given["observations"], fragile.observations)
+    np.testing.assert_array_equal(given["actions"], fragile.actions)
+    np.testing.assert_array_equal(given["terminals"] > 0, fragile.terminations)
+    np.testing.assert_array_equal(given["timeouts"] > 0, fragile.timeouts)
+    assert not (given["terminals"] * given["timeouts"]).any()
+
+
+def test_with_final_observations_each_timeout_has_its_successor(fragile):
+    given = to_d3rlpy(fragile, final_observations=True)
+    added = given["timeouts"] > 0
+    assert added.sum() == fragile.timeouts.sum()
+    assert {len(array) for array in given.values()} == {250 + int(added.sum())}
+    np.testing.assert_array_equal(given["observations"][~added], fragile.observations)
+    np.testing.assert_array_equal(given["actions"][~added], fragile.actions)
+    np.testing.assert_array_equal(given["terminals"][~added] > 0, fragile.terminations)
+    successors = np.roll(given["observations"], -1, axis=0)[~added]
+    going_on = ~fragile.terminations
+    np.testing.assert_array_equal(successors[going_on], fragile.next_observations[going_on])
+    assert not given["rewards"][added].any()
+
+
+def test_what_d3rlpy_is_given_is_a_copy(fragile):
+    for final_observations in (False, True):
+        given = to_d3rlpy(fragile, final_observations=final_observations)
+        before = fragile.digest
+        for array in given.values():
+            array[:] = -1.0
+        assert fragile.digest == before
+
+
+SCRIPT = """
+    import json, sys, warnings
+    warnings.simplefilter("ignore")
+    import numpy as np
+    from d3rlpy.dataset import MDPDataset
+    stored = np.load(sys.argv[1])
+    dataset = MDPDataset(**{name: stored[name] for name in stored.files})
+    picker = dataset.transition_picker
+    rows = []
+    for episode in dataset.episodes:
+        for index in range(episode.transition_count):
+            one = picker(episode, index)
+            rows.append([one.observation, one.action, one.reward, one.next_observation,
+                         [float(one.terminal)]])
+    np.savez(sys.argv[2], **{str(i): np.array(column) for i, column in enumerate(zip(*rows))})
+    print(json.dumps([len(dataset.episodes), len(rows)]))
+"""
+
+
+@pytest.mark.skipif(D3RLPY is None, reason="d3rlpy is not installed (SME_D3RLPY_PYTHON names one)")
+@pytest.mark.parametrize("final_observations", [False, True])
+def test_d3rlpy_itself_sees_the_transitions_of_the_task(fragile, final_observations, tmp_path):
+    given = to_d3rlpy(fragile, final_observations=final_observations)
+    np.savez(tmp_path / "given.npz", **given)
+    done = subprocess.run(
+        [D3RLPY, "-c", textwrap.dedent(SCRIPT), tmp_path / "given.npz", tmp_path / "seen.npz"],
+        capture_output=True, text=True, timeout=300, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(sme_registry.__file__).parents[1])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    episodes, count = json.loads(done.stdout.splitlines()[-1])
+    assert episodes == len(fragile.ends)
+    kept = np.ones(250, bool) if final_observations else ~fragile.timeouts
+    assert count == kept.sum()
+    seen = np.load(tmp_path / "seen.npz")
+    np.testing.assert_array_equal(seen["0"], fragile.observations[kept])
+    np.testing.assert_array_equal(seen["1"], fragile.actions[kept])
+    np.testing.assert_allclose(seen["2"][:, 0], fragile.rewards[kept], atol=1e-7)
+    np.testing.assert_array_equal(seen["4"][:, 0] > 0, fragile.terminations[kept])
+    going_on = ~fragile.terminations[kept]
+    np.testing.assert_array_equal(seen["3"][going_on], fragile.next_observations[kept][going_on])

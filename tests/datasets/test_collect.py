@@ -1,0 +1,318 @@
+"""Collecting: exactly what was asked for, whatever runs beside what, and true to the task."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gymnasium
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.datasets import DatasetRecipe, replay
+from sme_registry.datasets.behaviour import EpisodeStream, Oracle, noise_task
+from sme_registry.datasets.collect import collect
+from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.errors import (
+    FingerprintMismatchError,
+    OptionError,
+    PolicyError,
+    ResourceLimitError,
+)
+from sme_registry.evaluation.regions import expansion
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
+from sme_registry.task.streams import uniform
+
+TEAM = {"agents": [{"action_dim": 1, "observes": [0, 2]}, {"action_dim": 3}]}
+TASKS = {
+    "the default": {},
+    "sparse": {"k": 7, "horizon": 31},
+    "fragile": {"D": 0.4, "r_min": 0.2, "k": 3},
+    "deep": {"complexity": 10, "hidden_width": 16},
+    "one step": {"horizon": 1},
+    "a team": {"team": TEAM, "k": 4, "horizon": 9},
+    "a fragile team": {"team": {**TEAM, "reward": "team"}, "D": 0.3},
+}
+HALVES = [(0.6, 0.5), ("random", 0.5)]
+
+
+def recipe(spec=None, acting=((0.5, 1.0),), **fields):
+    behaviours = [behaviour_of(what, weight) for what, weight in acting]
+    plain = {"spec": SMESpec.parse(spec or {}), "behaviours": behaviours, "transitions": 700}
+    return DatasetRecipe.parse({**plain, **fields})
+
+
+def made(of, lanes=None, policies=None):
+    return collect(of, materialize(of.spec), policies, lanes=lanes)
+
+
+@pytest.mark.parametrize("coverage", [None, -0.15])
+@pytest.mark.parametrize("task", TASKS)
+def test_the_number_of_lanes_changes_no_bit(task, coverage):
+    of = recipe(TASKS[task], HALVES, coverage=coverage, seed=3)
+    digests = {made(of, lanes).digest for lanes in (None, 1, 7, 64)}
+    assert len(digests) == 1
+
+
+@pytest.mark.parametrize("coverage", [None, -0.15])
+@pytest.mark.parametrize("task", TASKS)
+def test_every_transition_is_that_of_the_task(task, coverage):
+    of = recipe(TASKS[task], HALVES, coverage=coverage, seed=3)
+    replay(made(of), of, materialize(of.spec))
+
+
+def test_a_set_is_what_a_single_environment_gives_for_its_actions():
+    of = recipe({"k": 3, "D": 0.2}, transitions=400)
+    found = made(of)
+    env = sme_registry.make(of.spec)
+    start = 0
+    for end in found.ends:
+        observation, _ = env.reset(options={"state": found.states[start]})
+        for row in range(start, end):
+            np.testing.assert_array_equal(observation, found.observations[row])
+            observation, reward, terminated, truncated, info = env.step(found.actions[row])
+            np.testing.assert_array_equal(observation, found.next_observations[row])
+            assert terminated == found.terminations[row]
+            assert (truncated and not terminated) == found.timeouts[row] or row == len(found) - 1
+            assert reward == found.rewards[row]
+            assert info["regret"] == found.regrets[row]
+            assert info["similarity"] == found.similarities[row]
+            np.testing.assert_array_equal(info["optimal_action"], found.optimal_actions[row])
+        start = end
+
+
+@pytest.mark.parametrize("count", [1, 99, 100, 101, 250])
+def test_a_set_has_exactly_the_transitions_asked_for_and_a_cut_is_a_timeout(count):
+    found = made(recipe(transitions=count))
+    assert {len(array) for array in found.columns().values()} == {count}
+    assert found.timeouts[-1]
+    assert not found.terminations.any()
+    assert len(found.ends) == -(-count // 100)
+
+
+def test_more_transitions_begin_with_the_same_ones():
+    few, many = made(recipe(transitions=150)), made(recipe(transitions=600))
+    np.testing.assert_array_equal(few.states, many.states[:150])
+    np.testing.assert_array_equal(few.actions, many.actions[:150])
+
+
+def test_the_seed_is_the_datas_and_moves_starts_and_noise_and_not_the_task():
+    one, other = made(recipe(seed=1)), made(recipe(seed=2))
+    assert one.digest == made(recipe(seed=1)).digest
+    assert not np.isin(one.states[::100, 0], other.states[:, 0]).any()
+
+
+def test_starts_alpha_and_noise_are_streams_of_their_own():
+    of = recipe(seed=5, transitions=300)
+    found, task = made(of), materialize(of.spec)
+    np.testing.assert_array_equal(found.states[0], uniform(5, "dataset/0/start", 8))
+    alpha = 0.5 * uniform(5, "dataset/0/alpha", 100)[:, None]
+    noise = noise_task(task, 5).optimal_action(found.states[:100])
+    blended = (1 - alpha) * found.optimal_actions[:100] + alpha * noise
+    np.testing.assert_allclose(found.actions[:100], blended, atol=1e-7)
+
+
+def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
+    for fields in TASKS.values():
+        task = materialize(SMESpec.parse(fields))
+        noise = noise_task(task, 0)  # the task's own seed, too, is 0
+        for own, other in zip(task.policies, noise.policies, strict=True):
+            for layer, drawn in zip(own, other, strict=True):
+                assert layer.W.shape == drawn.W.shape
+                assert np.abs(layer.W - drawn.W).max() > 0.1
+        np.testing.assert_array_equal(task.W, noise.W)
+
+
+def test_alpha_is_drawn_at_every_step_and_uniform_up_to_nu():
+    of = recipe(acting=[(0.4, 1.0)], transitions=5_000, seed=2)
+    found = made(of)
+    noise = noise_task(materialize(of.spec), 2).optimal_action(found.states)
+    gap = noise - found.optimal_actions
+    widest = np.abs(gap).argmax(axis=1)[:, None]
+    moved = np.take_along_axis(found.actions - found.optimal_actions, widest, 1)
+    alpha = (moved / np.take_along_axis(gap, widest, 1)).ravel()
+    assert alpha.min() > -1e-5
+    assert alpha.max() < 0.4 + 1e-5
+    deciles = np.histogram(alpha, bins=10, range=(0, 0.4))[0]
+    assert abs(deciles - 500).max() < 5 * np.sqrt(500 * 0.9)
+    assert abs(np.corrcoef(alpha[1:], alpha[:-1])[0, 1]) < 5 / np.sqrt(5_000)
+
+
+def test_nu_zero_is_the_optimum_to_the_rounding_of_its_actions():
+    found = made(recipe(acting=[(0.0, 1.0)]))
+    np.testing.assert_array_equal(found.actions, found.optimal_actions.astype(np.float32))
+    assert found.regrets.max() < 1e-6
+
+
+def test_the_mean_similarity_is_one_minus_a_sixth_of_nu_over_the_draws_of_the_noise_policy():
+    """One draw of ã is off by a SD of about 0.015 at ν = 1: it is correlated with a* as it falls.
+
+    Deep networks whose layers do not widen keep 1 − ν/6; a semi-orthogonal layer that widens
+    bunches actions around ½, so that ã is nearer to a* than two uniform numbers are.
+    """
+    means = [
+        made(recipe(acting=[(1.0, 1.0)], seed=seed, transitions=1_000)).similarities.mean()
+        for seed in range(24)
+    ]
+    assert abs(np.mean(means) - (1 - 1 / 6)) < 4 * 0.015 / np.sqrt(24)
+    bunched = made(recipe({"complexity": 2}, acting=[(1.0, 1.0)])).similarities.mean()
+    assert bunched > 0.87
+
+
+def test_given_its_noise_policy_the_mean_similarity_is_exact():
+    of = recipe(acting=[(0.8, 1.0)], transitions=20_000, seed=4)
+    found = made(of)
+    noise = noise_task(materialize(of.spec), 4).optimal_action(found.states)
+    missed = np.abs(noise - found.optimal_actions).mean(axis=1)
+    error = (found.similarities - (1 - 0.4 * missed)).std() / np.sqrt(len(found))
+    assert abs(found.similarities.mean() - (1 - 0.4 * missed.mean())) < 4 * error
+
+
+def test_random_actions_are_uniform_and_new_at_every_step():
+    found = made(recipe(acting=[("random", 1.0)], transitions=5_000))
+    assert len(np.unique(found.actions)) > 19_000
+    assert abs(found.actions.mean(axis=0) - 0.5).max() < 5 / np.sqrt(12 * 5_000)
+
+
+def test_behaviours_have_their_shares_of_the_transitions_in_whole_episodes():
+    found = made(recipe(acting=[(0.0, 0.25), (1.0, 0.5), ("random", 0.25)], transitions=2_000))
+    assert np.bincount(found.components).tolist() == [500, 1000, 500]
+    means = [found.similarities[found.components == part].mean() for part in range(3)]
+    assert means[0] > means[1] > means[2]
+    for number in range(found.episodes[-1] + 1):
+        assert len(np.unique(found.components[found.episodes == number])) == 1
+
+
+def test_a_sub_cube_keeps_its_states_alone_and_ends_a_trajectory_where_one_leaves_it():
+    of = recipe({"state_dim": 2}, coverage=-0.4, transitions=2_000)
+    found, whole = made(of), made(recipe({"state_dim": 2}, transitions=20_000))
+    assert expansion(found.states).max() <= -0.4
+    assert expansion(found.states).max() > -0.41
+    inside = expansion(whole.states) <= -0.4
+    np.testing.assert_array_equal(found.states, whole.states[inside][:2_000])
+    left = expansion(found.next_states) > -0.4
+    assert (found.timeouts | ~left).all()
+    assert left.any()
+
+
+def test_coverage_zero_keeps_everything():
+    assert made(recipe(coverage=0.0)).digest == made(recipe()).digest
+
+
+def test_a_sub_cube_that_hardly_any_state_lies_in_is_refused_before_the_work():
+    with pytest.raises(OptionError, match=r"coverage=-0\.99: of 700 transitions, about"):
+        made(recipe(coverage=-0.99))
+
+
+def test_a_set_larger_than_memory_is_refused():
+    with pytest.raises(ResourceLimitError, match="transitions=1000000000"):
+        made(recipe(transitions=10**9))
+
+
+def test_a_policy_of_the_users_acts_and_its_bits_do_not_depend_on_the_lanes():
+    torch = pytest.importorskip("torch")
+    torch.manual_seed(0)
+    net = torch.nn.Sequential(torch.nn.Linear(10, 64), torch.nn.Tanh(), torch.nn.Linear(64, 4))
+
+    def act(observations):
+        with torch.no_grad():
+            return net(torch.as_tensor(observations)).numpy()
+
+    of = recipe({"horizon": 10}, acting=[(act, 1.0)], transitions=150)
+    found = made(of, policies={0: act})
+    for lanes in (1, 100):
+        assert made(of, lanes, {0: act}).digest == found.digest
+    replay(found, of, materialize(of.spec))
+    np.testing.assert_allclose(found.actions, np.clip(act(found.observations), 0, 1), atol=1e-6)
+
+
+def test_a_teams_agents_act_on_what_each_is_shown():
+    spec = {"team": TEAM, "k": 4, "horizon": 9}
+    seen = {}
+
+    def one(observations):
+        seen["one"] = observations.shape[1]
+        return observations[:, :1]
+
+    def two(observations):
+        seen["two"] = observations.shape[1]
+        return observations[:, -3:]
+
+    policies = {0: {"agent_0": one, "agent_1": two}}
+    of = DatasetRecipe.parse(
+        {
+            "spec": SMESpec.parse(spec),
+            "behaviours": [{"kind": "policy", "policy": "team"}],
+            "transitions": 90,
+        }
+    )
+    found = made(of, policies=policies)
+    assert seen == {"one": 4, "two": 10}
+    np.testing.assert_array_equal(found.actions[:, 0], found.observations[:, 0])
+    # The last thing that agent 1 sees is its own r_cum/k, not its colleague's.
+    np.testing.assert_array_equal(found.actions[:, -1], found.observations[:, 10])
+    assert (found.observations[:, 9] != found.observations[:, 10]).any()
+    replay(found, of, materialize(of.spec))
+
+
+def test_a_policy_that_fails_is_refused_by_name():
+    def broken(observations):
+        return np.full((len(observations), 4), np.nan)
+
+    of = recipe(acting=[(broken, 1.0)])
+    with pytest.raises(PolicyError, match="'broken'"):
+        made(of, policies={0: broken})
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        "observations", "actions", "rewards", "next_observations", "terminations", "timeouts",
+        "optimal_actions", "regrets", "similarities", "step_rewards", "states", "next_states",
+        "episodes",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("row", [0, 150, 299])
+def test_replay_sees_a_fault_in_any_array_and_row(array, row):
+    of = recipe(transitions=300)
+    found = made(of)
+    changed = getattr(found, array).copy()
+    one = changed[row : row + 1]
+    one[...] = ~one if changed.dtype == bool else one + (1 if changed.dtype == int else 1e-4)
+    faulty = dataclasses.replace(found, **{array: changed})
+    with pytest.raises(FingerprintMismatchError, match=r"row \d+"):
+        replay(faulty, of, materialize(of.spec))
+
+
+def test_replay_sees_observations_and_actions_that_are_off_by_one():
+    of = recipe(transitions=300)
+    found = made(of)
+    shifted = dataclasses.replace(found, actions=np.roll(found.actions, 1, axis=0))
+    with pytest.raises(FingerprintMismatchError, match="next_states, row 0"):
+        replay(shifted, of, materialize(of.spec))
+
+
+def test_an_episodes_numbers_are_its_own():
+    alone, beside = EpisodeStream(1, "x", 1, 3, ahead=2), EpisodeStream(1, "x", 5, 3, ahead=7)
+    alone.begin(0, 4)
+    for lane in range(5):
+        beside.begin(lane, lane)
+    numbers = np.array([beside.next() for _ in range(9)])
+    np.testing.assert_array_equal(numbers[:, 4], np.array([alone.next()[0] for _ in range(9)]))
+    assert len(np.unique(numbers)) == numbers.size
+
+
+def test_the_oracle_is_the_optimal_policy_whatever_stands_beside_a_state():
+    task = materialize(SMESpec(complexity=10))
+    s = np.random.default_rng(0).random((50, 8))
+    together = Oracle(task, 50)(s).copy()
+    np.testing.assert_allclose(together, task.optimal_action(s), atol=1e-12)
+    for lane in (0, 17, 49):
+        np.testing.assert_array_equal(Oracle(task, 1)(s[lane : lane + 1])[0], together[lane])
+
+
+def test_the_environment_takes_the_actions_of_a_set_as_they_are():
+    found = made(recipe())
+    space = gymnasium.spaces.Box(0.0, 1.0, (4,), np.float32)
+    assert all(space.contains(action) for action in found.actions[:50])

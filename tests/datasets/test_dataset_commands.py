@@ -1,0 +1,153 @@
+"""`sme dataset`, as it is typed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from sme_registry.cli import app
+from sme_registry.datasets import open_dataset
+
+NAME = "sme/Default-v1-nu50-seed7-v0"
+
+
+def sme(*arguments):
+    return CliRunner().invoke(app, ["dataset", *map(str, arguments)])
+
+
+def good(*arguments):
+    result = sme(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def refused(*arguments):
+    result = sme(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert "Traceback" not in result.output
+    return " ".join(result.stderr.split())
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+@pytest.mark.parametrize("command", ["make", "list", "show", "validate"])
+def test_the_help_of_each_command_has_examples(command):
+    text = good(command, "--help").stdout
+    assert "Examples:" in text
+    assert text.count(f"sme dataset {command}") >= 3
+
+
+def test_a_set_is_made_listed_shown_and_validated():
+    made = good("make", "Default", "--nu", "0.5", "-n", "300", "--seed", "7")
+    assert "300 of 300 transitions" in made.stderr
+    assert "constant ½" in made.stdout
+    listed = good("list").stdout
+    assert NAME in listed
+    assert "300" in listed
+    shown = good("show", NAME).stdout
+    assert "300 in 3 trajectories" in shown
+    assert open_dataset(NAME).record.arrays_digest in shown
+    assert "valid" in good("validate", NAME).stdout
+
+
+def test_json_is_the_record_and_nothing_else():
+    made = json.loads(good("make", "Default", "-n", "50", "--seed", "7", "--json").stdout)
+    assert made["id"] == NAME
+    assert made["nu"] == 0.5
+    assert made["seeds"] == {"task": 0, "data": 7}
+    assert made["scores"]["optimum"]["rollouts"]["mean_return"] == 100.0
+    assert json.loads(good("show", NAME, "--json").stdout) == made
+    assert json.loads(good("list", "--json").stdout) == [made]
+    assert json.loads(good("validate", NAME, "--json").stdout)[0]["valid"] is True
+
+
+def test_a_mix_a_field_a_name_and_a_folder_are_taken():
+    good("make", "Default", "--mix", "nu=0.5:0.7", "--mix", "random:0.3", "-n", "40",
+         "--set", "complexity=2", "--coverage", "-0.05", "--name", "me/mixed-v1", "--out", "sets",
+         "--protocol", "quick-v1")  # fmt: skip
+    recipe = open_dataset("me/mixed-v1", "sets").recipe
+    assert recipe.shares == (28, 12)
+    assert recipe.spec.complexity == 2
+    assert recipe.coverage == -0.05
+    assert "sets/me/mixed-v1" in good("validate", "sets/me/mixed-v1").stdout
+    assert "no data sets" in good("list").stderr
+
+
+def test_a_trained_policys_zip_acts_and_is_recorded_by_its_digest(tmp_path):
+    from stable_baselines3 import PPO
+
+    import sme_registry
+    from sme_registry.datasets.recipe import sha256_of
+
+    env = sme_registry.make("Default", action_range="symmetric")
+    PPO("MlpPolicy", env, seed=0, n_steps=8, batch_size=8, device="cpu").save(tmp_path / "mine.zip")
+    good("make", "Default", "--mix", "policy=mine.zip:1", "-n", "60", "--name", "sme/ppo-v0")
+    (behaviour,) = open_dataset("sme/ppo-v0").recipe.behaviours
+    assert behaviour.policy == "mine"
+    assert behaviour.sha256 == sha256_of(tmp_path / "mine.zip")
+    assert "valid" in good("validate", "sme/ppo-v0").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--nu", "1.5"], "nu=1.5: must be a finite number or null in [0, 1]"),
+        (["--nu", "nan"], "nu=nan: must be"),
+        (["--mix", "nu=0.5:0.7", "--mix", "random:0.2"], "0.7 + 0.2 = 0.9: must add up to 1"),
+        (["--mix", "half:1"], "--mix 'half:1': must be nu=NU:WEIGHT"),
+        (["--mix", "nu=x:1"], "must be nu=NU:WEIGHT"),
+        (["--mix", "random"], "must be nu=NU:WEIGHT"),
+        (["--mix", "policy=no.zip:1"], "no.zip: cannot be read: No such file"),
+        (["--nu", "0.5", "--mix", "random:1"], "give one of the two"),
+        (["--name", "a.b-v0"], "name='a.b-v0': must be [namespace/]name-v<number>"),
+        (["--coverage", "0.2"], "coverage=0.2: must be"),
+        (["--coverage", "-0.99"], "coverage=-0.99: of 50 transitions"),
+        (["-n", "0"], "transitions=0: must be an integer in [1, "),
+        (["--seed", "-1"], "seed=-1: must be an integer in [0, "),
+        (["--protocol", "paper-v9"], "'paper-v9': no protocol"),
+        (["--action-range", "wide"], "action_range='wide': must be 'unit' or 'symmetric'"),
+        (["--set", "complexity=0"], "complexity=0: must be"),
+    ],
+)
+def test_bad_input_is_one_line_and_makes_nothing(arguments, message, tmp_path):
+    counted = [] if "-n" in arguments else ["-n", "50"]
+    assert message in refused("make", "Default", *counted, *arguments)
+    assert not (tmp_path / "minari").exists()
+
+
+def test_a_set_that_is_there_is_kept_unless_told():
+    good("make", "Default", "-n", "50")
+    assert "is there already" in refused("make", "Default", "-n", "60")
+    good("make", "Default", "-n", "60", "--force")
+    assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
+
+
+def test_validate_says_which_set_is_wrong_and_still_checks_the_others(tmp_path):
+    import h5py
+
+    for name in ("sme/good-v0", "sme/bad-v0"):
+        good("make", "Default", "-n", "50", "--name", name)
+    with h5py.File(tmp_path / "minari/sme/bad-v0/data/main_data.hdf5", "r+") as file:
+        file["episode_0/rewards"][0] = 1.0
+    result = sme("validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json")
+    assert result.exit_code == 2
+    assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
+
+
+def test_a_broken_set_is_told_of_beside_the_list(tmp_path):
+    good("make", "Default", "-n", "50", "--name", "sme/one-v0")
+    good("make", "Default", "-n", "50", "--name", "sme/two-v0")
+    (tmp_path / "minari/sme/two-v0/data/metadata.json").write_text("{")
+    result = good("list")
+    assert "sme/one-v0" in result.stdout
+    assert "two-v0" not in result.stdout
+    assert "not listed:" in result.stderr
+    assert "two-v0" in result.stderr

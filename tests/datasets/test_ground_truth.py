@@ -1,0 +1,200 @@
+"""Exact returns: against the environment itself, from any state, time and amount owed."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, make, materialize
+from sme_registry.datasets import DatasetRecipe
+from sme_registry.datasets.collect import collect
+from sme_registry.datasets.ground_truth import exact_return, positions
+from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError, StateError
+from sme_registry.task.draw import Array
+
+SPEC = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=4)
+STATES = np.random.default_rng(0).random((5, 3))
+
+
+def policy(observations: Any) -> Array:
+    """Near the optimum, row by row, so that no batch changes a bit; it reads the clock, too."""
+    task = materialize(SPEC)
+    optimal = task.optimal_action(observations[:, None, :3].astype(np.float64).reshape(-1, 3))
+    return 0.8 * optimal + 0.1 * observations[:, 3:4] + 0.05 * observations[:, 4:5]
+
+
+def by_environment(spec: SMESpec, state: Array, gamma: float, skip: int = 0) -> tuple[float, float]:
+    """An episode of the single environment: what it pays after its first `skip` steps."""
+    env = make(spec)
+    observation, _ = env.reset(options={"state": state})
+    rewards, ended = [], False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(policy(observation[None])[0])
+        rewards.append(reward)
+        ended = terminated or truncated
+    later = np.array(rewards[skip:], dtype=np.float64)
+    return float(later.sum()), float((later * gamma ** np.arange(len(later))).sum())
+
+
+VARIANTS = [
+    {},
+    {"k": 7},
+    {"r_min": 0.6},
+    {"D": 0.55},
+    {"k": 4, "D": 0.55, "r_min": 0.3},
+    {"horizon": 1},
+]
+
+
+@pytest.mark.parametrize("changes", VARIANTS, ids=str)
+def test_from_the_start_it_is_what_the_environment_pays(changes: dict[str, Any]) -> None:
+    spec = SPEC.derive(**changes)
+    found = exact_return(policy, spec, states=STATES, gamma=0.9)
+    for row, state in enumerate(STATES):
+        plain, discounted = by_environment(spec, state, 0.9)
+        assert found.undiscounted.mean[row] == pytest.approx(plain, abs=1e-9)
+        assert found.discounted.mean[row] == pytest.approx(discounted, abs=1e-9)
+    np.testing.assert_array_equal(found.undiscounted.low, found.undiscounted.high)
+
+
+@pytest.mark.parametrize("changes", VARIANTS[:-1], ids=str)
+def test_from_the_middle_of_an_episode_it_is_what_remains(changes: dict[str, Any]) -> None:
+    spec, state = SPEC.derive(**changes), STATES[0]
+    env = make(spec)
+    observation, _ = env.reset(options={"state": state})
+    for step in range(1, 12):
+        observation, _, terminated, _, info = env.step(policy(observation[None])[0])
+        if terminated:
+            break
+        here = env.unwrapped.state  # type: ignore[attr-defined]
+        owed = float(info["accumulated_reward"])
+        found = exact_return(policy, spec, states=here[None], t=step, r_cum=owed, gamma=0.9)
+        plain, discounted = by_environment(spec, state, 0.9, skip=step)
+        assert found.undiscounted.mean[0] == pytest.approx(plain, abs=1e-9)
+        assert found.discounted.mean[0] == pytest.approx(discounted, abs=1e-9)
+    assert step > 1
+
+
+def test_rows_of_a_set_are_rolled_out_from_where_they_were_acted_in() -> None:
+    spec = SPEC.derive(k=4)
+    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(0.6),), transitions=90, seed=1)
+    transitions = collect(recipe, materialize(spec))
+    rows = np.array([2, 31, 45, 88])
+    where = positions(transitions, spec, rows)
+    np.testing.assert_array_equal(where["t"], rows % 30)
+    owed = [transitions.step_rewards[row - row % 30 % 4 : row].sum() for row in rows]
+    np.testing.assert_allclose(where["r_cum"], owed, atol=1e-6)
+
+    # With the set's own action first, the next state is the set's, and what is left is its value.
+    first = exact_return(
+        policy, spec, **where, actions=transitions.actions[rows].astype(np.float64)
+    )
+    after = {
+        "states": transitions.next_states[rows],
+        "t": where["t"] + 1,
+        "r_cum": transitions.next_observations[rows, 4].astype(np.float64) * 4,
+    }
+    rest = exact_return(policy, spec, **after)
+    np.testing.assert_allclose(
+        first.undiscounted.mean, transitions.rewards[rows] + rest.undiscounted.mean, atol=1e-5
+    )
+
+
+def test_the_optimum_earns_every_step_that_is_left() -> None:
+    spec = SPEC.derive(k=5, D=0.9)
+    task = materialize(spec)
+
+    def optimal(observations: Any) -> Array:
+        # What a policy is shown is rounded to float32, of which D = 0.9 takes no notice.
+        return task.optimal_action(observations[:, :3])
+
+    found = exact_return(optimal, spec, states=STATES, t=[0, 1, 7, 28, 29], r_cum=[0, 1, 2, 3, 4])
+    np.testing.assert_allclose(found.undiscounted.mean, [30, 30, 25, 5, 5], atol=1e-4)
+    np.testing.assert_array_equal(found.lengths, [30, 29, 23, 2, 1])
+    np.testing.assert_allclose(found.similarity, 1.0, atol=1e-6)
+
+
+def test_many_states_at_different_times_keep_their_order() -> None:
+    spec = SPEC.derive(state_dim=2, action_dim=1, horizon=4)
+    states = np.random.default_rng(1).random((5000, 2))
+    t = np.arange(5000) % 4
+    found = exact_return(lambda o: np.full((len(o), 1), 0.5), spec, states=states, t=t)
+    np.testing.assert_array_equal(found.lengths, 4 - t)
+    last = t == 3
+    expected = materialize(spec).step_reward(states[last], np.full((last.sum(), 1), 0.5))
+    np.testing.assert_allclose(found.undiscounted.mean[last], expected, atol=1e-12)
+
+
+def test_the_interval_of_a_policy_that_draws_holds_its_mean() -> None:
+    # One step: the return of a uniform action is known by quadrature.
+    spec = SPEC.derive(state_dim=1, action_dim=1, horizon=1)
+    states = np.random.default_rng(2).random((400, 1))
+    optimal = materialize(spec).optimal_action(states)
+    grid = (np.arange(20_000) + 0.5) / 20_000
+    truth = np.maximum(0.0, 1.0 - 4.0 * np.abs(grid - optimal)).mean(axis=1)
+    random = np.random.default_rng(3)
+    found = exact_return(
+        lambda o: random.random((len(o), 1)), spec, states=states, rollouts=60
+    ).undiscounted
+    held = ((found.low <= truth) & (truth <= found.high)).mean()
+    assert 0.91 < held < 0.985  # 95 % of 400, and Student's t of so skewed a draw is not exact
+    over = exact_return(
+        lambda o: random.random((len(o), 1)), spec, states=states, rollouts=60
+    ).over_states()[0]
+    assert over.low < truth.mean() < over.high
+
+
+def test_a_policy_that_draws_is_no_exact_return() -> None:
+    random = np.random.default_rng(0)
+    with pytest.raises(OptionError, match="rollouts=1: the policy draws"):
+        exact_return(lambda o: random.random((len(o), 2)), SPEC, states=STATES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"states": STATES[:, :2]}, StateError, r"must be of shape \(5, 3\)"),
+        ({"states": STATES + 1}, StateError, "outside"),
+        ({"states": []}, StateError, r"must be \[M, 3\]"),
+        ({"states": 3.0}, StateError, r"must be \[M, 3\]"),
+        ({"t": 30}, StateError, r"t=30: must be whole steps in \[0, 30\)"),
+        ({"t": 0.5}, StateError, "t=0.5"),
+        ({"t": [1, 2]}, StateError, "t of shape"),
+        ({"t": "x"}, StateError, "t='x'"),
+        ({"t": np.nan}, StateError, "t: has NaN"),
+        ({"r_cum": 0.1}, StateError, r"r_cum=0.1: must be in \[0, 0\] at t=0"),
+        ({"r_cum": -0.1, "t": 1}, StateError, "r_cum=-0.1"),
+        ({"actions": STATES}, OptionError, r"must be \(5, 2\)"),
+        ({"actions": np.full((5, 2), 1.5)}, OptionError, "each in"),
+        ({"gamma": 1.1}, OptionError, "gamma=1.1"),
+        ({"rollouts": 0}, OptionError, "rollouts=0"),
+        ({"spec": "Team2"}, SpecError, "team"),
+        ({"policy": lambda o: o}, PolicyError, "policy"),
+    ],
+)
+def test_bad_input_is_refused(changes: dict[str, Any], error: type[SMEError], said: str) -> None:
+    arguments = {"policy": policy, "spec": SPEC, "states": STATES, **changes}
+    with pytest.raises(error, match=said):
+        exact_return(arguments.pop("policy"), arguments.pop("spec"), **arguments)
+
+
+def test_an_interval_over_states_needs_more_than_one() -> None:
+    with pytest.raises(OptionError, match="at least 2"):
+        exact_return(policy, SPEC, states=STATES[:1]).over_states()
+
+
+def test_fitted_q_orders_policies_as_their_exact_returns_do() -> None:
+    example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "ope.py"))
+    found = example["judge"](SMESpec(), nu=1.0, seed=0, rows=4000)
+    estimates, truths = ({name: row[i] for name, row in found.items()} for i in (0, 1))
+    assert sorted(estimates, key=estimates.__getitem__) == sorted(truths, key=truths.__getitem__)
+    # Near the data it is right to a tenth; of the optimum, off them, it knows far too little.
+    near, far = "half optimal, half ½", "optimal"
+    assert estimates[near] == pytest.approx(truths[near], rel=0.1)
+    assert truths[far] == pytest.approx(10.0, abs=1e-3)  # Σ 0.9^i over 100 steps
+    assert estimates[far] < 0.85 * truths[far]

@@ -1,0 +1,427 @@
+"""The file: Minari reads it as its own, it is whole or absent, and what was changed is noticed."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import h5py
+import minari
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry.datasets import list_datasets, make_dataset, minari_file, open_dataset, replay
+from sme_registry.errors import (
+    DigestMismatchError,
+    MalformedDocumentError,
+    NameTakenError,
+    OptionError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.task import materialize
+
+NAME = "sme/tests-v0"
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory):
+    """A folder with one set; tests that change anything copy it."""
+    folder = tmp_path_factory.mktemp("shelf")
+    make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=7,
+                 name=NAME, folder=folder)  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def copied(shelf, tmp_path):
+    shutil.copytree(shelf, tmp_path / "shelf")
+    return tmp_path / "shelf"
+
+
+@pytest.fixture
+def minaris(shelf, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(shelf))
+
+
+def run(script, *arguments, **options):
+    """A script in a fresh process."""
+    env = {**os.environ, "PYTHONPATH": str(Path(sme_registry.__file__).parents[1])}
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), *map(str, arguments)],
+        env=env, capture_output=True, text=True, timeout=300, check=False, **options,
+    )  # fmt: skip
+
+
+def visible(folder):
+    """What Minari and we list there, and whether anything is left that neither does."""
+    os.environ["MINARI_DATASETS_PATH"], before = str(folder), os.environ.get("MINARI_DATASETS_PATH")
+    try:
+        theirs = set(minari.list_local_datasets())
+    finally:
+        del os.environ["MINARI_DATASETS_PATH"]
+        if before is not None:
+            os.environ["MINARI_DATASETS_PATH"] = before
+    ours, broken = list_datasets(folder)
+    assert theirs == {dataset.id for dataset in ours}
+    assert not broken
+    return theirs
+
+
+def edited(folder, change):
+    path = folder / NAME / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    change(metadata)
+    path.write_text(json.dumps(metadata))
+
+
+class TestReading:
+    def test_what_is_read_is_what_was_made_to_the_bit(self, shelf):
+        from sme_registry.datasets.collect import collect
+
+        dataset = open_dataset(NAME, shelf)
+        task = materialize(dataset.recipe.spec)
+        found, made = dataset.transitions(), collect(dataset.recipe, task)
+        for name, array in made.columns().items():
+            np.testing.assert_array_equal(getattr(found, name), array, strict=True)
+        assert found.digest == dataset.record.arrays_digest
+        replay(found, dataset.recipe, task)
+
+    def test_the_record_says_everything(self, shelf):
+        record = open_dataset(NAME, shelf).record
+        assert record.recipe.transitions == 250
+        assert record.spec_digest == sme_registry.load("Default").digest
+        assert record.protocol_digest == record.recipe.protocol.digest
+        assert record.seeds.data == 7
+        assert record.seeds.task == 0
+        assert record.nu is None
+        assert record.trajectories == 4
+        assert {"sme_registry", "numpy", "h5py", "minari"} <= set(record.versions)
+
+    def test_a_set_is_opened_by_its_id_and_by_any_of_its_paths(self, shelf, minaris):
+        opened = [
+            open_dataset(NAME),
+            open_dataset(NAME, shelf),
+            open_dataset(shelf / NAME),
+            open_dataset(str(shelf / NAME / "data")),
+        ]
+        assert {dataset.id for dataset in opened} == {NAME}
+
+    def test_minari_loads_it_by_its_id_and_aligns_it(self, shelf, minaris):
+        found = open_dataset(NAME, shelf).transitions()
+        loaded = minari.load_dataset(NAME)
+        assert (loaded.total_steps, loaded.total_episodes) == (250, 4)
+        first = 0
+        for episode in loaded:
+            rows = slice(first, first + len(episode))
+            assert len(episode.observations) == len(episode) + 1
+            assert {len(info) for info in episode.infos.values()} == {len(episode) + 1}
+            np.testing.assert_array_equal(episode.observations[:-1], found.observations[rows])
+            np.testing.assert_array_equal(episode.observations[1:], found.next_observations[rows])
+            np.testing.assert_array_equal(episode.actions, found.actions[rows])
+            np.testing.assert_array_equal(episode.infos["regret"][:-1], found.regrets[rows])
+            np.testing.assert_array_equal(episode.infos["state"][1:], found.next_states[rows])
+            np.testing.assert_array_equal(episode.truncations, found.timeouts[rows])
+            first += len(episode)
+        assert first == 250
+
+    def test_what_else_minari_does_with_a_set_works(self, copied, monkeypatch):
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
+        loaded = minari.load_dataset(NAME)
+        assert len(loaded.sample_episodes(2)) == 2
+        short = loaded.filter_episodes(lambda episode: len(episode) < 100)
+        assert short.total_steps == 50
+        parts = minari.split_dataset(loaded, [1, 3])
+        assert sum(part.total_episodes for part in parts) == 4
+        assert minari.combine_datasets([loaded, loaded], "tests-both-v0").total_steps == 500
+        score = minari.get_normalized_score(loaded, np.array([loaded[0].rewards.sum()]))
+        assert 0.3 < float(score[0]) < 1.0
+
+    def test_the_environment_is_recovered_in_a_fresh_process_that_knows_no_id(self, shelf):
+        script = """
+            import json, sys
+            import gymnasium, minari
+            assert "sme_registry" not in sys.modules
+            assert not any(name.startswith("SME/") for name in gymnasium.registry)
+            dataset = minari.MinariDataset(sys.argv[1])
+            env = dataset.recover_environment()
+            episode = dataset[0]
+            env.reset(options={"state": episode.infos["state"][0]})
+            total = 0.0
+            for t, action in enumerate(episode.actions):
+                observation, reward, *_, info = env.step(action)
+                assert (observation == episode.observations[t + 1]).all()
+                assert reward == episode.rewards[t] and info["regret"] == episode.infos["regret"][t]
+            print(env.unwrapped.sme_spec.digest)
+        """
+        done = run(script, shelf / NAME / "data", cwd="/")
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == sme_registry.load("Default").digest
+
+    def test_a_spec_without_a_name_is_recovered_too(self, tmp_path):
+        made = make_dataset({"state_dim": 3, "seed": "0xfeed"}, 0.5, transitions=20,
+                            folder=tmp_path)  # fmt: skip
+        env = made.minari().recover_environment()
+        assert env.unwrapped.sme_spec == made.recipe.spec
+
+    def test_a_team_has_joint_actions_and_one_reward_and_no_gymnasium_environment(self, tmp_path):
+        made = make_dataset("Team2", 0.5, transitions=150, folder=tmp_path)
+        spec, found = made.recipe.spec, made.transitions()
+        assert found.actions.shape == (150, spec.action_dim)
+        assert found.observations.shape == (150, spec.state_dim + 1 + 2)
+        assert found.regrets.shape == (150, 2)
+        np.testing.assert_allclose(found.rewards, found.agent_rewards.mean(axis=1), atol=1e-12)
+        replay(found, made.recipe, materialize(spec))
+        loaded = made.minari()
+        assert loaded.action_space.shape == (spec.action_dim,)
+        assert loaded[0].infos["agent_reward"].shape == (101, 2)
+        with pytest.raises(ValueError, match="cannot be recovered"):
+            loaded.recover_environment()
+        assert sme_registry.make_parallel(open_dataset(made.path).recipe.spec).sme_spec == spec
+
+
+class TestTheSameCommand:
+    def test_gives_the_same_bytes_in_two_processes(self, shelf, tmp_path):
+        script = """
+            import sys
+            from sme_registry.datasets import make_dataset
+            make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=7,
+                         name="sme/tests-v0", folder=sys.argv[1])
+        """
+        done = run(script, tmp_path)
+        assert done.returncode == 0, done.stderr
+        for file in ("main_data.hdf5", "metadata.json"):
+            own, other = (folder / NAME / "data" / file for folder in (shelf, tmp_path))
+            assert own.read_bytes() == other.read_bytes()
+
+    def test_with_another_seed_gives_other_ones(self, shelf, tmp_path):
+        make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=8,
+                     name=NAME, folder=tmp_path)  # fmt: skip
+        digests = {open_dataset(NAME, folder).record.arrays_digest for folder in (shelf, tmp_path)}
+        assert len(digests) == 2
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        "name",
+        ["", "x", "x-v", "a b-v0", "a.b-v0", "s/x-v0", "/x-v0", "../x-v0", "a//b-v0", "ä-v0",
+         "data/x-v0", "sme/data/x-v0", "x-v0\n", "a:b-v0", "x-v-1"],
+    )  # fmt: skip
+    def test_one_that_minari_refuses_is_refused_before_anything_is_made(self, name, tmp_path):
+        with pytest.raises(OptionError, match="name="):
+            make_dataset("Default", transitions=10, name=name, folder=tmp_path)
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("name", ["x-v0", "my/x-v3", "a/-b/x_Y-v12", "ns/deep/er/x-v0"])
+    def test_what_is_taken_minari_lists(self, name, tmp_path):
+        try:
+            minari_file.checked_id(name)
+        except OptionError:
+            with pytest.raises(ValueError, match="Malformed"):
+                minari.dataset.minari_dataset.parse_dataset_id(name)
+            return
+        make_dataset("Default", transitions=10, name=name, folder=tmp_path)
+        assert visible(tmp_path) == {name}
+
+    def test_a_set_inside_another_would_never_be_listed_and_is_refused(self, shelf):
+        with pytest.raises(OptionError, match="Minari lists none inside another"):
+            make_dataset("Default", transitions=10, name=f"{NAME}/x-v0", folder=shelf)
+
+    @pytest.mark.parametrize(
+        ("arguments", "name"),
+        [
+            ({"nu": 0.5, "seed": 7}, "sme/Default-v1-nu50-seed7-v0"),
+            ({"nu": 0.125, "coverage": -0.2}, "sme/Default-v1-nu12_5-side80-seed0-v0"),
+            ({"mix": [("random", 1.0)]}, "sme/Default-v1-random-seed0-v0"),
+        ],
+    )
+    def test_the_default_one_says_what_the_set_is(self, arguments, name, tmp_path):
+        assert make_dataset("Default", transitions=10, folder=tmp_path, **arguments).id == name
+
+
+class TestAnExistingSet:
+    def test_is_refused_and_left_as_it_is(self, copied):
+        before = (copied / NAME / "data" / "main_data.hdf5").read_bytes()
+        with pytest.raises(NameTakenError, match=r"is there already. Give another --name"):
+            make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
+        assert (copied / NAME / "data" / "main_data.hdf5").read_bytes() == before
+
+    def test_is_replaced_when_told_so(self, copied):
+        make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied, force=True)
+        assert open_dataset(NAME, copied).recipe.transitions == 10
+        assert [child.name for child in (copied / "sme").iterdir() if child.is_dir()] == [
+            "tests-v0"
+        ]
+
+    @pytest.mark.parametrize("foreign", ["empty", "minari's", "a file"])
+    def test_that_is_not_ours_is_never_replaced(self, foreign, tmp_path):
+        place = tmp_path / NAME
+        if foreign == "a file":
+            place.parent.mkdir(parents=True)
+            place.write_text("mine")
+        else:
+            (place / "data").mkdir(parents=True)
+        if foreign == "minari's":
+            (place / "data" / "metadata.json").write_text('{"dataset_id": "sme/tests-v0"}')
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(NameTakenError, match="no data set of this package"):
+            make_dataset("Default", transitions=10, name=NAME, folder=tmp_path, force=True)
+        assert sorted(tmp_path.rglob("*")) == before
+
+
+KILLED = """
+    import os, signal, sys
+    from sme_registry.datasets import make_dataset, minari_file
+    step = sys.argv[2]
+    calls = []
+    def die(*_):
+        calls.append(1)
+        if step == f"fsync {len(calls)}":
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.fsync = die
+    if step == "rename":
+        os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    make_dataset("Default", 0.5, transitions=300, name="sme/tests-v0", folder=sys.argv[1],
+                 force=len(sys.argv) > 3)
+"""
+
+
+class TestAWriterThatFails:
+    @pytest.mark.parametrize("step", ["fsync 1", "fsync 2", "rename"])
+    def test_killed_in_mid_write_leaves_nothing_that_is_listed(self, step, tmp_path):
+        killed = run(KILLED, tmp_path, step)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        assert any(path.name == "main_data.hdf5" for path in tmp_path.rglob("*"))  # in mid-write
+        assert visible(tmp_path) == set()
+        make_dataset("Default", 0.5, transitions=300, name=NAME, folder=tmp_path)
+        assert visible(tmp_path) == {NAME}
+
+    @pytest.mark.parametrize("step", ["fsync 1", "rename"])
+    def test_killed_while_it_replaces_a_set_leaves_the_old_one(self, step, copied):
+        killed = run(KILLED, copied, step, "force")
+        assert killed.returncode == -signal.SIGKILL, killed.stderr
+        assert visible(copied) == {NAME}
+        assert open_dataset(NAME, copied).transitions().digest
+
+    @pytest.mark.parametrize("kibibytes", [4, 60])
+    def test_a_full_disk_is_one_line_and_leaves_nothing(self, kibibytes, tmp_path):
+        def limit():
+            resource.setrlimit(resource.RLIMIT_FSIZE, (kibibytes * 1024, kibibytes * 1024))
+
+        script = (
+            "from sme_registry.cli import main; import sys; "
+            "sys.argv[1:] = ['dataset', 'make', 'Default', '-n', '300', '--out', sys.argv[1]]; "
+            "main()"
+        )
+        done = run(script, tmp_path, preexec_fn=limit)
+        assert done.returncode == 2, done.stderr
+        assert "cannot be written: File too large" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert visible(tmp_path) == set()
+        assert not [path for path in tmp_path.rglob("*") if path.suffix == ".hdf5"]
+
+    def test_a_folder_that_cannot_be_made_is_an_error_of_ours(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(OptionError, match="cannot be written"):
+            make_dataset("Default", transitions=10, folder=tmp_path / "file" / "sets")
+
+
+class TestAChangedSet:
+    def test_of_which_a_number_changed_is_noticed(self, copied):
+        with h5py.File(copied / NAME / "data" / "main_data.hdf5", "r+") as file:
+            file["episode_1/infos/regret"][3] += 1e-9
+        with pytest.raises(DigestMismatchError, match=r"its arrays have sha256:.* as made"):
+            open_dataset(NAME, copied).transitions()
+
+    def test_to_which_minari_added_is_noticed_and_stays_readable_for_minari(self, copied):
+        loaded = open_dataset(NAME, copied).minari()
+        episode = loaded[0]
+        loaded.update_dataset_from_buffer(
+            [
+                minari.data_collector.EpisodeBuffer(
+                    observations=episode.observations, actions=episode.actions,
+                    rewards=episode.rewards, terminations=episode.terminations,
+                    truncations=episode.truncations, infos=episode.infos,
+                )
+            ]
+        )  # fmt: skip
+        assert minari.MinariDataset(copied / NAME / "data").total_steps == 350
+        with pytest.raises(DigestMismatchError, match="total_steps=350: must be 250"):
+            open_dataset(NAME, copied)
+
+    def test_whose_spec_was_changed_is_refused(self, copied):
+        edited(copied, lambda data: data["sme"]["recipe"]["spec"].update(complexity=10))
+        with pytest.raises(DigestMismatchError, match="recipe_digest"):
+            open_dataset(NAME, copied)
+
+    @pytest.mark.parametrize("field", ["spec_digest", "recipe_digest", "protocol_digest"])
+    def test_with_a_digest_of_something_else_is_refused(self, field, copied):
+        edited(copied, lambda data: data["sme"].update({field: "sha256:" + "0" * 64}))
+        with pytest.raises(DigestMismatchError, match=field):
+            open_dataset(NAME, copied)
+
+    @pytest.mark.parametrize(("version", "age"), [(0, "an older"), (2, "a newer")])
+    def test_of_another_schema_is_refused_and_left_as_it_is(self, version, age, copied):
+        edited(copied, lambda data: data["sme"].update(schema_version=version, other_fields=1))
+        before = sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*"))
+        with pytest.raises(SpecError, match=f"schema_version={version}: must be 1.*{age} version"):
+            open_dataset(NAME, copied)
+        found, broken = list_datasets(copied)
+        assert found == []
+        assert list(broken) == [copied / NAME]
+        assert sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*")) == before
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda record: record.clear(),
+            lambda record: record.pop("scores"),
+            lambda record: record.update(unknown=1),
+            lambda record: record.update(trajectories="4"),
+            lambda record: record["recipe"]["behaviours"][0].update(nu=2.0),
+        ],
+    )
+    def test_whose_record_is_broken_is_refused(self, change, copied):
+        edited(copied, lambda data: change(data["sme"]))
+        with pytest.raises(SMEError, match="sme"):
+            open_dataset(NAME, copied)
+
+    @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"no HDF5 at all" * 100])
+    def test_whose_data_are_no_hdf5_cannot_be_read(self, content, copied):
+        (copied / NAME / "data" / "main_data.hdf5").write_bytes(content)
+        with pytest.raises(MalformedDocumentError, match="cannot be read"):
+            open_dataset(NAME, copied).transitions()
+
+    def test_whose_data_are_cut_or_lack_a_part_cannot_be_read(self, copied):
+        path = copied / NAME / "data" / "main_data.hdf5"
+        with h5py.File(path, "r+") as file:
+            del file["episode_2/infos/regret"]
+        with pytest.raises(MalformedDocumentError, match="cannot be read"):
+            open_dataset(NAME, copied).transitions()
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(MalformedDocumentError, match="cannot be read"):
+            open_dataset(NAME, copied).transitions()
+
+    def test_of_minari_alone_is_named_as_such_and_not_listed(self, copied):
+        edited(copied, lambda data: data.pop("sme"))
+        with pytest.raises(MalformedDocumentError, match="Minari can open it"):
+            open_dataset(NAME, copied)
+        assert list_datasets(copied) == ([], {})
+
+
+def test_a_set_that_is_not_there_names_the_nearest(shelf):
+    with pytest.raises(UnknownNameError, match=r"Did you mean 'sme/tests-v0'"):
+        open_dataset("sme/test-v0", shelf)
+
+
+def test_no_folder_is_no_sets(tmp_path):
+    assert list_datasets(tmp_path / "none") == ([], {})

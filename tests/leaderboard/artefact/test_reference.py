@@ -1,0 +1,110 @@
+"""The reference policies: 0 and 1 by construction, as files that any board would take."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from leaderboard.artefact.gate import inspect
+from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from sme_registry import SMESpec, evaluate, materialize
+from sme_registry.errors import SpecError
+
+SPECS = {
+    "default": SMESpec(),
+    "more actions than states": SMESpec(state_dim=2, action_dim=5, policy_init="unit_variance"),
+    "one channel, one unit": SMESpec(state_dim=1, action_dim=1, complexity=3, hidden_width=1),
+    "narrow and deep": SMESpec(state_dim=2, action_dim=16, complexity=20, hidden_width=8),
+    "complexity 50": SMESpec(complexity=50, seed=3),
+    "complexity 50, unit variance": SMESpec(complexity=50, policy_init="unit_variance"),
+}
+any_spec = pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)
+
+
+def asked(data):
+    """An ONNX file as a function of observations, on one thread."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    return lambda observations: session.run(["actions"], {"observations": observations})[0]
+
+
+def observations(spec, rows=64, scale=2.0):
+    s = np.random.default_rng(0).random((rows, spec.state_dim + 2)) * scale - (scale - 1.0) / 2.0
+    return s.astype(np.float32)
+
+
+@any_spec
+def test_the_optimum_has_no_regret_in_any_region(spec):
+    report = evaluate(asked(optimal_onnx(spec)), spec, {"states_per_region": 300})
+    assert max(region.normalised_regret for region in report.regions) <= 3e-7
+
+
+@any_spec
+def test_the_optimum_is_the_nearest_float32_action(spec):
+    seen = observations(spec)
+    exact = materialize(spec).optimal_action(seen[:, : spec.state_dim].astype(np.float64))
+    acted = asked(optimal_onnx(spec))(seen)
+    assert acted.dtype == np.float32
+    assert np.abs(acted - exact).max() <= 2**-25 + 1e-10
+
+
+def test_the_optimum_depends_on_the_state_alone():
+    spec = SPECS["default"]
+    act, seen = asked(optimal_onnx(spec)), observations(spec)
+    other = seen.copy()
+    other[:, -2:] += 7.0
+    assert (act(seen) == act(other)).all()
+
+
+@pytest.mark.parametrize("scale", [100.0, 1e30])
+def test_the_optimum_stays_in_the_unit_cube_however_far_the_state(scale):
+    spec = SPECS["default"]
+    acted = asked(optimal_onnx(spec))(observations(spec, scale=scale))
+    assert np.isfinite(acted).all()
+    assert acted.min() >= 0.0
+    assert acted.max() <= 1.0
+    assert acted.min() < 1e-9  # it does saturate there
+    assert acted.max() == 1.0
+
+
+def test_a_row_alone_is_acted_on_as_in_a_batch():
+    spec = SPECS["complexity 50"]
+    act, seen = asked(optimal_onnx(spec)), observations(spec)
+    alone = np.concatenate([act(row[None]) for row in seen])
+    assert np.abs(alone - act(seen)).max() <= 2**-24
+
+
+@any_spec
+def test_the_constant_is_exactly_one_half_everywhere(spec):
+    act = asked(constant_onnx(spec))
+    for scale in (1.0, 1e30):
+        acted = act(observations(spec, scale=scale))
+        assert acted.shape == (64, spec.action_dim)
+        assert (acted == 0.5).all()
+
+
+def test_the_constant_has_a_normalised_regret_of_one():
+    report = evaluate(asked(constant_onnx(SMESpec())), SMESpec(), {"states_per_region": 300})
+    assert [region.normalised_regret for region in report.regions] == [1.0] * 6
+
+
+@any_spec
+@pytest.mark.parametrize("made", [optimal_onnx, constant_onnx])
+def test_any_board_takes_the_files(made, spec):
+    facts = inspect(made(spec), spec.state_dim + 2, spec.action_dim)
+    assert facts.nodes <= 13 * spec.complexity + 2
+
+
+@pytest.mark.parametrize("made", [optimal_onnx, constant_onnx])
+def test_the_same_spec_gives_the_same_bytes(made):
+    assert made(SMESpec(complexity=3)) == made(SMESpec(complexity=3))
+
+
+@pytest.mark.parametrize("made", [optimal_onnx, constant_onnx])
+def test_a_team_has_no_reference_policy(made):
+    team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
+    with pytest.raises(SpecError, match=r"team: a board is of single agents.*a team of 2"):
+        made(team)

@@ -1,0 +1,488 @@
+"""The sandbox: what a model may do, and that nothing it does hurts the process that asks it."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import os
+import random
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from leaderboard.artefact import sandbox
+from leaderboard.artefact.gate import inspect
+from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.artefact.sandbox import ROWS, Sandbox, SandboxLimits
+from leaderboard.errors import CODES, BoardError, Rejection
+from sme_registry import SMESpec, materialize
+from sme_registry.errors import MissingDependencyError, StateError
+from tests.leaderboard.artefact import models
+from tests.leaderboard.artefact.models import (
+    ACTION,
+    OBSERVATION,
+    linear,
+    model,
+    network,
+    node,
+    squashed,
+    tensor,
+    value,
+    weights,
+)
+
+LIMITS = SandboxLimits()
+SHORT = SandboxLimits(cpu_seconds=1, call_seconds=20.0)
+
+
+@pytest.fixture(params=["bwrap", "process"])
+def isolation(request, monkeypatch):
+    """Each test that takes it runs under bwrap, where that works, and without."""
+    if request.param == "process":
+        monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    elif not sandbox._bwrap():
+        pytest.skip("bwrap is missing or does not work here")
+    return request.param
+
+
+@pytest.fixture
+def ungated(monkeypatch):
+    """No gate, as if it had a hole: the sandbox stands alone."""
+    monkeypatch.setattr(sandbox, "inspect", lambda *arguments: None)
+
+
+def opened(found, limits=LIMITS, dims=(OBSERVATION, ACTION)):
+    data = found if isinstance(found, bytes) else found.SerializeToString()
+    return Sandbox(data, *dims, limits)
+
+
+def observations(rows, width=OBSERVATION):
+    return np.random.default_rng(0).random((rows, width), np.float32)
+
+
+def run(found, limits, rows):
+    with opened(found, limits) as policy:
+        policy(observations(rows))
+        policy.check_rows(observations(rows))
+
+
+def code_of(found, limits=LIMITS, rows=8):
+    """The code with which a model is rejected when it is loaded, run and checked."""
+    with pytest.raises(Rejection) as caught:
+        run(found, limits, rows)
+    assert caught.value.message.endswith(".")
+    return caught.value.code
+
+
+def test_actions_are_those_of_the_network(isolation):
+    o = observations(100)
+    with opened(linear()) as policy:
+        assert policy.isolation == isolation
+        a = policy(o)
+    W = np.random.default_rng(0).normal(size=(OBSERVATION, ACTION)).astype(np.float32)
+    assert a.dtype == np.float32
+    np.testing.assert_allclose(a, o @ W, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [0, 1, ROWS, ROWS + 1, 3 * ROWS])
+def test_batches_of_every_size_are_answered_in_order(rows):
+    o = observations(rows)
+    with opened(squashed([node("Identity", "y", "a")])) as policy:
+        a = policy(o)
+        assert a.shape == (rows, ACTION)
+        if rows:
+            np.testing.assert_allclose(a[-1:], policy(o[-1:]), atol=1e-6)
+
+
+@pytest.mark.parametrize("complexity", [1, 50])
+def test_reference_policies_run_and_pass_the_check_of_rows(complexity):
+    spec = SMESpec(state_dim=3, action_dim=2, complexity=complexity)
+    o = observations(200, 5)
+    with opened(optimal_onnx(spec), dims=(5, 2)) as optimal:
+        best = materialize(spec).optimal_action(o[:, :3].astype(np.float64))
+        np.testing.assert_allclose(optimal(o), best, atol=1e-6)
+        optimal.check_rows(o)
+    with opened(constant_onnx(spec), dims=(5, 2)) as constant:
+        assert (constant(o) == 0.5).all()
+        constant.check_rows(o)
+
+
+def test_observations_of_another_shape_are_refused():
+    with opened(linear()) as policy:
+        for shape in ((3, 5), (4,), (1, 3, 4)):
+            with pytest.raises(StateError, match=r"must be \[B, 4\]"):
+                policy(np.zeros(shape, np.float32))
+        assert policy(observations(2)).shape == (2, ACTION)
+
+
+UNLOADABLE = {
+    "an undefined name": model([node("MatMul", "o Q", "a")], [weights()]),
+    "a cycle": squashed([node("Add", "y q", "z"), node("Tanh", "z", "q"), node("Tanh", "q", "a")]),
+    "shapes that do not fit": model([node("MatMul", "o W", "a")], [weights(rows=5)]),
+    "an input too few": squashed([node("Add", "y", "a")]),
+    "types that do not fit": squashed([node("Add", "y i", "a")], [tensor("i", np.int64([1, 2]))]),
+    "an attribute that there is not": squashed([node("Tanh", "y", "a", alpha=1.0)]),
+    "an operator newer than its opset": squashed([node("Gelu", "y", "a")]),
+}
+
+
+@pytest.mark.parametrize("kind", UNLOADABLE)
+def test_what_onnxruntime_cannot_load_is_refused(kind):
+    assert code_of(UNLOADABLE[kind]) == "onnx_refused"
+
+
+FAILING = {
+    "a failing run": (
+        squashed(
+            [node("Reshape", "y shape", "a")],
+            [tensor("shape", np.int64([7, 2]))],
+            outputs=[value("a", "batch", "width")],
+        ),
+        "run_failed",
+    ),
+    "an index out of range": (
+        squashed([node("Gather", "y far", "a", axis=1)], [tensor("far", np.int64([0, 99]))]),
+        ("run_failed", "onnx_refused"),
+    ),
+    "actions too wide": (
+        model([node("Identity", "o", "a")], outputs=[value("a", "batch", "width")]),
+        "run_output",
+    ),
+    "actions of one axis": (
+        squashed(
+            [node("Reshape", "y shape", "a")],
+            [tensor("shape", np.int64([-1]))],
+            outputs=[value("a", "batch", "width")],
+        ),
+        ("run_output", "onnx_refused"),
+    ),
+    "NaN": (squashed([node("Sub", "y y", "z"), node("Div", "z z", "a")]), "run_not_finite"),
+    "infinity": (
+        squashed(
+            [node("Exp", "y", "e"), node("Mul", "e big", "b"), node("Mul", "b big", "a")],
+            [tensor("big", np.float32(1e30))],
+        ),
+        "run_not_finite",
+    ),
+    "NaN in its weights": (
+        model([node("MatMul", "o W", "a")], [tensor("W", np.full((4, 2), np.nan, np.float32))]),
+        "run_not_finite",
+    ),
+    "the mean over the batch": (
+        squashed([node("ReduceMean", "y", "m", axes=[0]), node("Sub", "y m", "a")]),
+        "run_batch_dependent",
+    ),
+    "the row before": (
+        squashed(
+            [
+                node("Split", "y", "left right", axis=1),
+                node("Slice", "left start end rows", "rest"),
+                node("Slice", "left zero start rows", "first"),
+                node("Concat", "rest first", "moved", axis=0),
+                node("Concat", "moved right", "a", axis=1),
+            ],
+            [
+                tensor("zero", np.int64([0])),
+                tensor("start", np.int64([1])),
+                tensor("end", np.int64([2**31])),
+                tensor("rows", np.int64([0])),
+            ],
+        ),
+        "run_batch_dependent",
+    ),
+    "a softmax over the batch": (
+        squashed([node("Softmax", "y", "a", axis=0)]),
+        "run_batch_dependent",
+    ),
+    "a memory bomb of operators that are allowed": (models.doubling(40), "run_memory"),
+}
+
+
+@pytest.mark.parametrize("kind", FAILING)
+def test_what_goes_wrong_in_a_run_has_its_code(kind, isolation):
+    found, expected = FAILING[kind]
+    inspect(found.SerializeToString(), OBSERVATION, ACTION)  # the gate cannot see it
+    assert code_of(found) in ((expected,) if isinstance(expected, str) else expected)
+
+
+def test_an_order_of_summation_is_no_dependence_on_the_batch():
+    wide = models.network(hidden=2000)
+    with opened(wide) as policy:
+        policy.check_rows(observations(1000))
+
+
+def test_a_single_row_that_peeks_is_found_by_another_order():
+    # Row 1 has the action of row 0, in any batch that has one; it is not among those asked alone.
+    found = squashed(
+        [
+            node("Slice", "y zero one", "first"),
+            node("Slice", "y zero last", "but_last"),
+            node("Slice", "but_last zero one", "copied"),
+            node("Slice", "y two end", "rest"),
+            node("Concat", "first copied rest", "a", axis=0),
+        ],
+        [
+            tensor("zero", np.int64([0])),
+            tensor("one", np.int64([1])),
+            tensor("two", np.int64([2])),
+            tensor("last", np.int64([-1])),
+            tensor("end", np.int64([2**31])),
+        ],
+    )
+    assert code_of(found, rows=100) == "run_batch_dependent"
+
+
+def test_random_actions_are_no_function_of_the_state(ungated):
+    found = squashed([node("RandomUniformLike", "y", "a")])
+    assert code_of(found) == "run_batch_dependent"
+
+
+def test_a_small_file_that_takes_gigabytes_is_stopped_without_the_gate(isolation, ungated):
+    bomb = models.memory_bomb()
+    assert len(bomb.SerializeToString()) < 250
+    begun = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    assert code_of(bomb) == "run_memory"
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    assert peak <= max(begun, 3 * 2**20)  # KiB
+
+
+def test_an_endless_loop_is_stopped_without_the_gate(isolation, ungated):
+    begun = time.monotonic()
+    assert code_of(models.looping(), SHORT) == "run_time"
+    assert time.monotonic() - begun < 60.0  # it ends; how soon is the machine's business
+
+
+def test_waiting_for_an_answer_has_an_end(ungated):
+    limits = SandboxLimits(cpu_seconds=60, call_seconds=0.5)
+    assert code_of(models.looping(), limits) == "run_time"
+
+
+def test_external_data_cannot_be_read_without_the_gate(isolation, ungated, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_bytes(np.ones((OBSERVATION, ACTION), np.float32).tobytes())
+    found = linear()
+    W = found.graph.initializer[0]
+    W.ClearField("raw_data")
+    W.data_location = W.EXTERNAL
+    W.external_data.add(key="location", value=os.path.relpath(secret, "/"))
+    assert code_of(found) == "onnx_refused"
+
+
+@pytest.mark.parametrize("data", [b"", b"no model", b"\x08\x08" * 1000], ids=repr)
+def test_bytes_that_are_no_model_hurt_nobody_without_the_gate(isolation, ungated, data):
+    assert code_of(data) in ("onnx_refused", "run_failed")
+
+
+def test_the_gate_is_asked_before_any_process_is_started(monkeypatch):
+    monkeypatch.setattr(sandbox, "_start", lambda *arguments: pytest.fail("a process was started"))
+    with pytest.raises(Rejection, match="onnx_malformed"):
+        opened(b"no model")
+
+
+def children():
+    """Processes started by this one that are not waited for."""
+    listed = Path(f"/proc/{os.getpid()}/task").glob("*/children")
+    return {int(pid) for path in listed for pid in path.read_text().split()}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_no_process_outlives_its_sandbox(isolation, ungated):
+    before = children()
+    for found in (linear(), models.looping()):
+        try:
+            with opened(found, SandboxLimits(call_seconds=0.3)) as policy:
+                policy(observations(3))
+                assert children() - before
+        except Rejection:
+            pass
+        assert children() == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_child_learns_nothing_and_can_do_nothing(monkeypatch):
+    monkeypatch.setenv("SECRET", "do not tell")
+    monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    with open(__file__) as kept_open, opened(linear()) as policy:
+        os.set_inheritable(kept_open.fileno(), True)
+        proc = Path(f"/proc/{policy._process.pid}")
+        assert b"do not tell" not in (proc / "environ").read_bytes()
+        files = {os.readlink(entry) for entry in (proc / "fd").iterdir()}
+        assert all(re.match(r"pipe:|/dev/null", file) for file in files), files
+        limits = {line[:26].strip(): line[26:].split()[0]
+                  for line in (proc / "limits").read_text().splitlines()[1:]}  # fmt: skip
+        for none in ("open files", "file size", "core file size", "processes"):
+            assert limits[f"Max {none}"] == "0"
+        assert int(limits["Max cpu time"]) <= SandboxLimits().cpu_seconds + 10
+        assert 2**31 < int(limits["Max address space"]) < 2**31 + 2**30
+        status = (proc / "status").read_text()
+        assert re.search(r"^NoNewPrivs:\s1$", status, re.M)
+
+
+def test_under_bwrap_there_is_neither_a_network_nor_a_home(isolation, monkeypatch, tmp_path):
+    if isolation != "bwrap":
+        pytest.skip("without bwrap there is a network")
+    (tmp_path / "board.key").write_text("secret")
+    script = (
+        "import os, socket, struct\n"
+        f"seen = os.path.exists({str(tmp_path)!r})\n"
+        "seen += len(open('/proc/net/dev').readlines()) > 3\n"  # two lines of heading, and lo
+        "seen += any(pid.isdigit() and int(pid) > 5 for pid in os.listdir('/proc'))\n"
+        "os.write(1, struct.pack('<BI', 0 if not seen else 9, 0)); os.read(0, 1)\n"
+    )
+    acting_as(script, monkeypatch)
+    with pytest.raises(Rejection, match="ended with status 0"):  # no model, but content
+        opened(linear())
+
+
+def acting_as(script, monkeypatch):
+    """In place of the child that serves a model, another program: one that was taken over."""
+    monkeypatch.setattr(sandbox, "_script", lambda: [sys.executable, "-I", "-S", "-c", script])
+
+
+STARTED = (
+    "import os, signal, struct, time; say = lambda s, n: os.write(1, struct.pack('<BI', s, n))\n"
+)
+LOADED = STARTED + "say(0, 0); say(0, 0); "
+LIES = {
+    "answers with another length": ("say(0, 2**32 - 1); time.sleep(60)", "run_failed"),
+    "answers with a status that there is not": ("say(77, 0); time.sleep(60)", "run_failed"),
+    "tells a story without end": (
+        "say(2, 2**31)\nwhile True: os.write(1, bytes(2**16))", "run_failed"
+    ),
+    "answers half and hangs": ("say(0, 64); os.write(1, b'xx'); time.sleep(60)", "run_time"),
+    "answers half and ends": ("say(0, 64); os.write(1, b'xx')", "run_failed"),
+    "reads nothing": ("time.sleep(60)", "run_time"),
+    "ends": ("", "run_failed"),
+    "closes its pipes and hangs": ("os.close(0); os.close(1); time.sleep(60)", "run_failed"),
+    "crashes": ("os.kill(os.getpid(), signal.SIGSEGV)", "run_failed"),
+    "answers NaN": ("say(0, 64); os.write(1, b'\\xff' * 64); time.sleep(60)", "run_not_finite"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", LIES)
+def test_a_child_that_was_taken_over_cannot_hurt_its_parent(kind, monkeypatch):
+    script, expected = LIES[kind]
+    monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    acting_as(LOADED + script, monkeypatch)
+    limits = SandboxLimits(call_seconds=2.0, start_seconds=3.0)
+    rows = ROWS if kind == "reads nothing" else 8  # 128 KiB, more than a pipe holds
+    assert code_of(linear(), limits, rows) == expected
+
+
+def test_a_child_that_writes_without_end_is_read_no_further(monkeypatch):
+    monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    acting_as(LOADED + "\nwhile True: os.write(1, bytes(2**16))", monkeypatch)
+    with pytest.raises(Rejection, match="is none"), opened(linear()) as policy:
+        policy(observations(8))
+
+
+def test_a_child_that_cannot_start_is_no_fault_of_the_model(monkeypatch):
+    monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    limits = SandboxLimits(start_seconds=0.5)
+    for script in ("raise SystemExit(3)", "import time; time.sleep(60)"):
+        acting_as(script, monkeypatch)
+        with pytest.raises(BoardError, match=r"did not start|through no fault of the model"):
+            opened(linear(), limits)
+
+
+def test_a_child_killed_from_outside_is_no_fault_of_the_model(isolation):
+    with opened(linear()) as policy:
+        os.killpg(policy._process.pid, signal.SIGKILL)
+        with pytest.raises(BoardError, match="through no fault of the model"):
+            policy(observations(3))
+
+
+def test_a_closed_sandbox_says_so_and_closes_twice():
+    policy = opened(linear())
+    policy.close()
+    policy.close()
+    with pytest.raises(BoardError, match="closed"):
+        policy(observations(3))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG")
+def test_a_killed_parent_leaves_no_child_behind(isolation, tmp_path):
+    script = (
+        "import os, sys, numpy\n"
+        "from leaderboard.artefact import sandbox\n"
+        "sandbox.inspect = lambda *arguments: None\n"
+        f"sandbox._bwrap = {'tuple' if isolation == 'process' else 'sandbox._bwrap'}\n"
+        f"policy = sandbox.Sandbox({models.looping().SerializeToString()!r}, 4, 2)\n"
+        "print(policy._process.pid, flush=True)\n"
+        "policy(numpy.ones((4, 4), numpy.float32))\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    deadline = time.monotonic() + 10.0
+    while alive(child) and time.monotonic() < deadline:
+        pass
+    assert not alive(child)
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_without_onnxruntime_the_remedy_is_said(monkeypatch):
+    sandbox._library_folders.cache_clear()
+    monkeypatch.setattr(sandbox.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(sandbox, "_bwrap", tuple)
+    try:
+        with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[leader"):
+            opened(linear())
+    finally:
+        sandbox._library_folders.cache_clear()
+
+
+def mutant(seed):
+    """A network's file with a few of its bytes changed, lost, added, or copied from elsewhere."""
+    chance = random.Random(seed)
+    data = bytearray(network(hidden=4).SerializeToString())
+    for _ in range(chance.choice((1, 1, 2, 4))):
+        at, source = chance.randrange(len(data)), chance.randrange(len(data))
+        match chance.randrange(6):
+            case 0:
+                data[at] ^= 1 << chance.randrange(8)
+            case 1:
+                data[at] = chance.choice((0x00, 0x01, 0x7F, 0x80, 0xFF))
+            case 2:
+                del data[at : at + chance.randrange(1, 9)]
+            case 3:
+                data[at:at] = chance.randbytes(chance.randrange(1, 9))
+            case 4:
+                data[at:at] = data[source : source + chance.randrange(1, 33)]
+            case _:
+                data[at : at + 8] = data[source : source + 8]
+    return bytes(data)
+
+
+def outcome(seed):
+    try:
+        with opened(mutant(seed), SHORT) as policy:
+            policy.check_rows(observations(4))
+    except Rejection as rejection:
+        return rejection.code
+    return "ran"
+
+
+def test_mutated_files_run_or_are_rejected():
+    """500 mutants; as many as SME_ONNX_MUTANTS says where it is set (nightly: 10,000)."""
+    count = int(os.environ.get("SME_ONNX_MUTANTS", "500"))
+    with concurrent.futures.ThreadPoolExecutor(2) as threads:
+        outcomes = list(threads.map(outcome, range(count)))
+    found = {code: outcomes.count(code) for code in sorted(set(outcomes))}
+    print(found)
+    assert set(found) <= {"ran", *CODES}
+    assert found["ran"] >= count / 50
+    assert found["onnx_malformed"] >= count / 50

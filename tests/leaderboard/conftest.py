@@ -1,0 +1,152 @@
+"""A board so small that scoring takes a moment, and policies that are real ONNX files."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from leaderboard.keys import SigningKey
+from leaderboard.store import Store
+from leaderboard.submission import (
+    SignedSubmission,
+    SignedWithdrawal,
+    Submission,
+    Withdrawal,
+    now,
+)
+from sme_registry import EvaluationProtocol
+from sme_registry.spec import Suite
+
+Submit = Callable[..., SignedSubmission]
+
+
+def tiny_suite(instances: int = 1) -> Suite:
+    """One class of the smallest tasks, S = 2 and A = 1."""
+    setting = {"state_dim": 2, "action_dim": 1}
+    return Suite.parse(
+        {"classes": [{"name": "Tiny", "setting": setting, "seeds": list(range(instances))}]}
+    )
+
+
+def tiny_board(path: Path, *, instances: int = 1, **fields: Any) -> Store:
+    """A new board of 200 states in each region; the caller closes it."""
+    settings = {"runs_to_rank": 1, "draws": 100, **fields}
+    return Store.create(
+        path,
+        title="Tiny",
+        suite_name="tiny-v1",
+        suite=tiny_suite(instances),
+        protocol_name="quick-v1",
+        protocol=EvaluationProtocol(states_per_region=200),
+        **settings,
+    )
+
+
+@functools.cache
+def linear_onnx(number: int, observation_dim: int = 4, action_dim: int = 1) -> bytes:
+    """A policy a = clip(s W + number/1000, 0, 1), one of its own for each number."""
+    import numpy as np
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    weights = np.full((observation_dim, action_dim), 0.1, np.float32)
+    bias = np.full(action_dim, number / 1000, np.float32)
+    graph = helper.make_graph(
+        [
+            helper.make_node("Gemm", ["observations", "W", "b"], ["raw"]),
+            helper.make_node("Clip", ["raw", "low", "high"], ["actions"]),
+        ],
+        "policy",
+        [helper.make_tensor_value_info("observations", TensorProto.FLOAT, ["B", observation_dim])],
+        [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["B", action_dim])],
+        [
+            numpy_helper.from_array(weights, "W"),
+            numpy_helper.from_array(bias, "b"),
+            numpy_helper.from_array(np.float32(0), "low"),
+            numpy_helper.from_array(np.float32(1), "high"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def tiny_submission(
+    store: Store, key: SigningKey, number: int = 0, **fields: Any
+) -> tuple[SignedSubmission, dict[str, bytes]]:
+    """A signed submission, valid on a tiny board, and its artefacts by their digests.
+
+    Args:
+      store: the board's.
+      key: the submitter's.
+      number: another number is another policy.
+      fields: of the submission, instead of those here.
+    """
+    data = linear_onnx(number)
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    plain = {
+        "suite": store.document.suite_reference,
+        "method": {
+            "name": f"Linear {number}",
+            "version": "1",
+            "family": "linear",
+            "knowledge": "generic",
+        },
+        "submitter": {"name": "A tester", "key": key.public},
+        "created": now(),
+        "runs": [
+            {
+                "spec": spec.digest,
+                "seed": number,
+                "steps": 1000,
+                "artefact": {"sha256": digest, "size": len(data)},
+            }
+            for spec in store.document.suite.instances
+        ],
+        "runs_started": {
+            member.name: len(member.instances) for member in store.document.suite.classes
+        },
+        **fields,
+    }
+    return Submission.parse(plain).signed(key), {digest: data}
+
+
+def put_submission(
+    store: Store, key: SigningKey, number: int = 0, **fields: Any
+) -> SignedSubmission:
+    """`tiny_submission`, with its artefacts on the board and waiting to be scored."""
+    signed, artefacts = tiny_submission(store, key, number, **fields)
+    for digest, data in artefacts.items():
+        store.put_object(digest, [data], by=key.public)
+    assert store.receive(signed)
+    return signed
+
+
+def signed_withdrawal(id: str, key: SigningKey) -> SignedWithdrawal:
+    """A withdrawal of a submission, signed by this key."""
+    withdrawal = Withdrawal(submission=id, created=now(), reason="a test")
+    return SignedWithdrawal(
+        withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest)
+    )
+
+
+@pytest.fixture
+def key() -> SigningKey:
+    return SigningKey.generate()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with tiny_board(tmp_path / "board") as made:
+        yield made
+
+
+@pytest.fixture
+def submit(store: Store, key: SigningKey) -> Submit:
+    """Puts the tiny submission of a number on the board of `store`, signed by `key`."""
+    return functools.partial(put_submission, store, key)

@@ -1,0 +1,63 @@
+"""A real server on the loopback, in a thread or a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from leaderboard.server import _listening, _url, create_app
+
+_SERVE = """
+import sys
+from leaderboard.server import serve
+serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
+"""
+
+
+@contextlib.contextmanager
+def serving(path: Path, **options: Any) -> Iterator[str]:
+    """A server in a thread; yields its URL."""
+    with _listening("127.0.0.1", 0) as listener:
+        config = uvicorn.Config(
+            create_app(path, **options), http="h11", ws="none", log_level="critical"
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        try:
+            yield _url(listener)
+        finally:
+            server.should_exit = True
+            thread.join(10)
+            assert not thread.is_alive()
+
+
+@contextlib.contextmanager
+def serving_process(path: Path, workers: int = 0) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """A server in a process, as `serve` runs it; yields its URL and the process."""
+    root = Path(__file__).parents[2]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _SERVE, str(path), str(workers)],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+        assert url, process.stderr.read() if process.stderr else ""
+        yield url, process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()

@@ -1,0 +1,77 @@
+"""Processes that die, and disks that fill, at a point of one's choice."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+CALLS = ("fsync", "link", "replace", "rename", "unlink", "fchmod")
+_CRASHED = 77
+
+
+def crashes_before(call: int, work: Callable[[], object]) -> bool:
+    """Do some work in a copy of this process, which is gone before its n-th call that matters.
+
+    Returns:
+      Whether there were so many calls; False means that the work was done.
+    """
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            _exit_before(call)
+            work()
+            status = 0
+        except BaseException as error:
+            sys.stderr.write(f"{error!r}\n")
+        finally:
+            os._exit(status)  # no exit handlers of pytest's
+    _, status = os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(status)
+    assert code in (0, _CRASHED), code
+    return code == _CRASHED
+
+
+def _exit_before(call: int) -> None:
+    left = call
+
+    def counted(real: Callable[..., Any]) -> Callable[..., Any]:
+        def before(*arguments: Any, **named: Any) -> Any:
+            nonlocal left
+            if left == 0:
+                os._exit(_CRASHED)
+            left -= 1
+            return real(*arguments, **named)
+
+        return before
+
+    for name in CALLS:
+        setattr(os, name, counted(getattr(os, name)))
+
+
+@contextlib.contextmanager
+def small_disk(path: Path, size: str = "1m") -> Iterator[Path | None]:
+    """A file system of its own, in memory; None where none may be mounted."""
+    path.mkdir()
+    mount = shutil.which("mount")
+    made = mount is not None and _succeeds(mount, "-t", "tmpfs", "-o", f"size={size}", "none", path)
+    try:
+        yield path if made else None
+    finally:
+        if made:
+            subprocess.run(["umount", "-l", path], check=True)
+
+
+def make_read_only(path: Path) -> None:
+    """Of a `small_disk`: nobody writes to it from now on, root included."""
+    subprocess.run(["mount", "-o", "remount,ro", path], check=True)
+
+
+def _succeeds(*command: str | Path) -> bool:
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0

@@ -1,0 +1,50 @@
+"""Results of made-up runs, for tests of how results are kept and not of how they come about."""
+
+from __future__ import annotations
+
+from leaderboard.result import Result, RunScore
+from leaderboard.scoring import evaluation_seed, result_of
+from leaderboard.statistics import run_metrics
+from leaderboard.store import Store
+
+
+def made_up_result(store: Store, id: str, *, code: str = "", level: float = 0.5) -> Result:
+    """A result that fits a submission: rejected with `code`, or of regret `level` or so.
+
+    Args:
+      store: the board's.
+      id: the submission's.
+      code: empty for one that is scored.
+      level: of the regret within the distribution; a little more outside.
+    """
+    document = store.document
+    if code:
+        return Result(
+            submission=id,
+            suite=document.suite.digest,
+            protocol=document.protocol.digest,
+            status="rejected",
+            code=code,
+            message="made up",
+        )
+    levels = [high for _, high in document.protocol.edges]
+    instances = document.instances
+    runs = []
+    for number, run in enumerate(store.submission(id).submission.runs):
+        assert run.artefact is not None
+        regret = tuple(level + 0.01 * number + 0.1 * epsilon for epsilon in levels)
+        similarity = tuple(1 - 0.25 * each for each in regret)
+        runs.append(
+            RunScore(
+                spec=run.spec,
+                class_name=instances[run.spec][0],
+                artefact=run.artefact.sha256,
+                evaluation_seed=evaluation_seed(
+                    document.protocol.digest, run.spec, run.artefact.sha256
+                ),
+                regret=regret,
+                similarity=similarity,
+                **run_metrics(regret, similarity, levels),
+            )
+        )
+    return result_of(document, id, runs, {"made": "up"})

@@ -1,0 +1,159 @@
+"""A process that dies before any one call that matters leaves a state the next one goes on from."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from leaderboard.errors import BoardError
+from leaderboard.keys import SigningKey
+from leaderboard.store import Store
+from leaderboard.verify import verify
+from tests.leaderboard.conftest import (
+    linear_onnx,
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
+from tests.leaderboard.store.crashing import crashes_before, small_disk
+from tests.leaderboard.store.made_up import made_up_result
+
+Work = Callable[[Path, SigningKey], object]
+
+
+def put(board: Path, key: SigningKey) -> object:
+    data = linear_onnx(1)
+    with Store.open(board) as store:
+        digest = "sha256:" + hashlib.sha256(data).hexdigest()
+        return store.put_object(digest, [data], by=key.public)
+
+
+def receive(board: Path, key: SigningKey) -> object:
+    with Store.open(board) as store:
+        signed, artefacts = tiny_submission(store, key, 0, created="2026-01-01T00:00:00Z")
+        assert set(artefacts) == {run.artefact.sha256 for run in signed.submission.runs}
+        return store.receive(signed)
+
+
+def finish(board: Path, key: SigningKey) -> object:
+    with Store.open(board) as store:
+        while (claim := store.claim("worker", seconds=0)) is not None:
+            store.finish(claim, made_up_result(store, claim.id))
+        return True
+
+
+def withdraw(board: Path, key: SigningKey) -> object:
+    with Store.open(board) as store:
+        return store.withdraw(signed_withdrawal(store.entries()[0].id, key))
+
+
+def reindex(board: Path, key: SigningKey) -> object:
+    with Store.open(board) as store:
+        return store.reindex()
+
+
+def prepared(path: Path, key: SigningKey, work: Work) -> None:
+    with tiny_board(path) as store:
+        if work is receive:
+            _, artefacts = tiny_submission(store, key, 0)
+            for digest, data in artefacts.items():
+                store.put_object(digest, [data], by=key.public)
+        elif work is not put:
+            put_submission(store, key, 0)
+
+
+def state(board: Path) -> tuple[object, ...]:
+    """What a reader of the board is shown."""
+    with Store.open(board) as store:
+        objects = tuple(path.name for path in store.folder.objects.glob("*/[!.]*"))
+        statuses = tuple(row.status for row in store.entries())
+        return objects, statuses, store.head.sequence
+
+
+@pytest.mark.parametrize("work", [put, receive, finish, withdraw, reindex])
+def test_a_write_is_whole_or_absent_and_can_be_done_again(tmp_path, key, work: Work):
+    prepared(tmp_path / "start", key, work)
+    before = state(tmp_path / "start")
+    shutil.copytree(tmp_path / "start", tmp_path / "end")
+    work(tmp_path / "end", key)
+    after = state(tmp_path / "end")
+    assert (before == after) == (work is reindex)
+    board, seen = tmp_path / "board", set()
+    for call in range(100):
+        shutil.copytree(tmp_path / "start", board)
+        crashed = crashes_before(call, lambda: work(board, key))
+        found = state(board)
+        assert found in (before, after), call
+        seen.add(found)
+        verify(board)
+        work(board, key)
+        assert state(board) == after, call
+        verify(board)
+        with Store.open(board) as store:
+            store.gc(temporary_older_than=0, objects_older_than=1e9)
+        assert [path.name for path in board.rglob(".*")] == []
+        shutil.rmtree(board)
+        if not crashed:
+            break
+    assert not crashed
+    assert call >= 4
+    assert seen == {before, after}
+
+
+def test_a_board_is_made_whole_or_not_at_all(tmp_path):
+    board, made = tmp_path / "board", []
+    for call in range(100):
+        crashed = crashes_before(call, lambda: tiny_board(board).close())
+        made.append(board.exists())
+        if board.exists():
+            verify(board)
+            Store.open(board).close()
+            shutil.rmtree(board)
+        if not crashed:
+            break
+    assert not crashed
+    assert made == sorted(made)
+    assert {False, True} == set(made)
+
+
+def test_a_full_disk_is_said_and_leaves_nothing_half_written(tmp_path, key):
+    with small_disk(tmp_path / "disk", "1500k") as disk:
+        if disk is None:
+            pytest.skip("no file system may be mounted here")
+        complaints = []
+        with tiny_board(disk / "board") as store:
+            for number in range(28):
+                _, _, before = state(disk / "board")
+                _fill(disk / "filler", free=4096 * number)
+                try:
+                    put_submission(store, key, number)
+                except BoardError as error:
+                    complaints.append(str(error))
+                (disk / "filler").unlink()
+                # An entry of the log that the index had no room for counts all the same.
+                _, statuses, after = state(disk / "board")
+                assert after == len(statuses)
+                assert after - before in (0, 1)
+                assert [path.name for path in (disk / "board").rglob(".*")] == []
+                verify(disk / "board")
+        assert 0 < len(complaints) < 28
+        assert all("No space left" in line or "is full" in line for line in complaints), complaints
+        with Store.open(disk / "board") as store:
+            put_submission(store, key, 999)
+        verify(disk / "board")
+
+
+def _fill(path: Path, free: int) -> None:
+    """Fill a disk but for so many bytes."""
+    with open(path, "wb", buffering=0) as stream:
+        for size in (4096, 1):
+            with contextlib.suppress(OSError):
+                while True:
+                    stream.write(bytes(size))
+        stream.truncate(max(0, stream.tell() - free))

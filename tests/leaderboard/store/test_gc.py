@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+
+import pytest
+
+HOUR, DAY = 3600.0, 86400.0
+
+
+def put(store, key, data: bytes) -> str:
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    store.put_object(digest, [data], by=key.public)
+    return digest
+
+
+def age(path, seconds: float) -> None:
+    then = time.time() - seconds
+    os.utime(path, (then, then))
+
+
+@pytest.fixture
+def litter(store, key, submit):
+    """Old and young files of each kind; the objects of a submission are old."""
+    old, young = put(store, key, b"old, and of nobody"), put(store, key, b"young")
+    named = submit().submission.runs[0].artefact.sha256
+    for digest in (old, named):
+        age(store.folder.object(digest), DAY + 60)
+    for folder in (store.folder.log, store.folder.results, store.folder.object(old).parent):
+        (folder / ".dead.12345678.tmp").write_bytes(b"half")
+        age(folder / ".dead.12345678.tmp", HOUR + 60)
+    (store.folder.log / ".alive.12345678.tmp").write_bytes(b"being written")
+    return old, young, named
+
+
+def test_gc_removes_what_dead_processes_left_and_what_nobody_names(store, litter):
+    old, young, named = litter
+    before = store.total_bytes()
+    garbage = store.gc()
+    assert (garbage.temporary, garbage.objects) == (3, 1)
+    assert garbage.files == 4
+    assert garbage.bytes == 3 * len(b"half") + len(b"old, and of nobody")
+    assert not store.has_object(old)
+    assert store.has_object(young)
+    assert store.has_object(named)
+    assert [path.name for path in store.folder.path.rglob(".*.tmp")] == [".alive.12345678.tmp"]
+    assert store.total_bytes() == before - len(b"old, and of nobody")
+    assert store.gc().files == 0
+
+
+def test_a_dry_run_counts_the_same_and_removes_nothing(store, litter):
+    before = sorted(path for path in store.folder.path.rglob("*"))
+    counted = store.gc(dry_run=True)
+    assert sorted(path for path in store.folder.path.rglob("*")) == before
+    assert counted == store.gc()
+
+
+def test_an_object_that_is_brought_again_is_young_again(store, key, litter):
+    old, _, _ = litter
+    assert put(store, key, b"old, and of nobody") == old
+    assert store.gc().objects == 0
+    assert store.has_object(old)
+
+
+def test_ages_are_arguments(store, litter):
+    garbage = store.gc(temporary_older_than=0, objects_older_than=0)
+    assert (garbage.temporary, garbage.objects) == (4, 2)
+
+
+def test_gc_leaves_an_upload_in_flight_alone(store, key):
+    data = b"first half, second half"
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+
+    def slow():
+        yield data[:10]
+        assert store.gc(objects_older_than=0).files == 0
+        yield data[10:]
+
+    assert store.put_object(digest, slow(), by=key.public)
+    assert store.object_bytes(digest) == data

@@ -1,0 +1,402 @@
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import shutil
+import sqlite3
+import time
+import traceback
+from pathlib import Path
+
+import pytest
+
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.keys import SigningKey
+from leaderboard.scoring import result_of
+from leaderboard.store import Index, Store
+from leaderboard.submission import SignedSubmission, utc
+from sme_registry.errors import UnknownNameError
+from tests.leaderboard.conftest import (
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
+from tests.leaderboard.store.crashing import make_read_only, small_disk
+from tests.leaderboard.store.made_up import made_up_result
+
+
+def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
+    """Submissions of every status; a waiting one only where asked for."""
+    signed = [put_submission(store, key, number) for number in range(4)]
+    for number in range(3):
+        claim = store.claim("worker")
+        assert claim is not None
+        assert claim.id == signed[number].id
+        code = "onnx_op" if number == 1 else ""
+        assert store.finish(claim, made_up_result(store, claim.id, code=code))
+    store.withdraw(signed_withdrawal(signed[2].id, key))
+    if not waiting:
+        store.withdraw(signed_withdrawal(signed[3].id, key))
+
+
+def put_artefacts(store: Store, key: SigningKey, number: int) -> SignedSubmission:
+    """A submission whose artefacts are on the board, and which has not been received."""
+    signed, artefacts = tiny_submission(store, key, number)
+    for digest, data in artefacts.items():
+        while not store.has_object(digest):
+            with contextlib.suppress(BoardError):
+                store.put_object(digest, [data], by=key.public)
+    return signed
+
+
+def compacted(path: Path) -> bytes:
+    """The bytes of a database without its history."""
+    copy = path.with_name("compacted")
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        connection.execute("VACUUM INTO ?", (str(copy),))
+    data = copy.read_bytes()
+    copy.unlink()
+    return data
+
+
+def dump(path: Path) -> list[str]:
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return list(connection.iterdump())
+
+
+def derived(store: Store) -> list[object]:
+    with store.turn() as index:
+        return list(index.derived_rows())
+
+
+def test_the_index_that_grew_equals_the_one_made_anew(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        fill(store, key)
+        path = store.folder.index
+    grown, grown_dump = compacted(path), dump(path)
+    assert len(grown_dump) > 12
+    made = []
+    for _ in range(2):
+        with Store.open(tmp_path / "board") as store:
+            store.reindex()
+        made.append(path.read_bytes())
+        assert dump(path) == grown_dump
+        assert compacted(path) == grown
+    assert made[0] == made[1]
+
+
+def test_reindex_from_the_files_alone_gives_equal_bytes_elsewhere(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        fill(store, key, waiting=True)
+        store.reindex()
+    shutil.copytree(tmp_path / "board", tmp_path / "copy")
+    (tmp_path / "copy" / "index.sqlite").unlink()
+    Store.open(tmp_path / "copy").close()
+    copied = (tmp_path / "copy" / "index.sqlite").read_bytes()
+    assert copied == (tmp_path / "board" / "index.sqlite").read_bytes()
+
+
+def test_an_entry_row_says_what_board_and_ranking_need(store, key):
+    fill(store, key, waiting=True)
+    rows = store.entries()
+    assert [row.status for row in rows] == ["scored", "rejected", "withdrawn", "waiting"]
+    assert [row.code for row in rows] == ["", "onnx_op", "", ""]
+    assert [row.method for row in rows] == [f"Linear {number}" for number in range(4)]
+    assert {(row.runs, row.steps, row.key) for row in rows} == {(1, 1000, key.public)}
+    for row in rows:
+        assert store.entry(row.id) == row
+        result = store.result(row.id)
+        assert (row.scores is None) == (result is None or result.scores is None)
+        if row.scores is not None:
+            assert row.scores == result.scores
+        assert (store.withdrawal(row.id) is not None) == (row.status == "withdrawn")
+    assert store.waiting() == 1
+    assert store.done() == 3
+
+
+def test_rows_of_the_boards_own_key_are_reference_rows(store, key):
+    method = {"name": "constant", "version": "1", "family": "reference", "knowledge": "family"}
+    own = put_submission(store, store.folder.signing_key(), 1, method=method)
+    pretender = put_submission(store, key, 2, method=method)
+    assert store.entry(own.id).reference
+    assert not store.entry(pretender.id).reference
+
+
+def test_the_same_submission_twice_is_one_row(store, submit):
+    signed = submit()
+    assert not store.receive(signed)
+    assert len(store.entries()) == 1
+    assert store.head.sequence == 1
+    assert store.submission(signed.id) == signed
+
+
+def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, submit):
+    signed = submit()
+    with pytest.raises(Rejection) as refused:
+        store.withdraw(signed_withdrawal(signed.id, SigningKey.generate()))
+    assert refused.value.code == "bad_signature"
+    assert store.withdraw(signed_withdrawal(signed.id, key))
+    assert not store.withdraw(signed_withdrawal(signed.id, key))
+    assert store.entry(signed.id).status == "withdrawn"
+    assert store.waiting() == 0
+
+
+def test_what_is_unknown_is_said_to_be_unknown(store, key):
+    unknown = "sha256:" + "0" * 64
+    with pytest.raises(UnknownNameError, match="no submission"):
+        store.submission(unknown)
+    with pytest.raises(UnknownNameError, match="no submission"):
+        store.withdraw(signed_withdrawal(unknown, key))
+    assert store.result(unknown) is None
+    assert store.entry(unknown) is None
+
+
+def test_submissions_are_counted_by_key_and_time(store, key, submit):
+    submit(1)
+    submit(2)
+    put_submission(store, SigningKey.generate(), 3)
+    now = datetime.datetime.now(datetime.UTC)
+    day = datetime.timedelta(days=1)
+    assert len(store.submissions_of(key.public, utc(now - day))) == 2
+    assert store.submissions_of(key.public, utc(now + day)) == []
+
+
+@pytest.mark.parametrize("harm", ["missing", "empty", "noise", "torn", "schema", "another board"])
+def test_an_index_of_no_use_is_made_anew_on_opening(tmp_path, key, harm):
+    with tiny_board(tmp_path / "board") as store:
+        fill(store, key, waiting=True)
+        expected = derived(store)
+        path = store.folder.index
+    if harm == "missing":
+        path.unlink()
+    elif harm == "empty":
+        path.write_bytes(b"")
+    elif harm == "noise":
+        path.write_bytes(os.urandom(10_000))
+    elif harm == "torn":
+        data = path.read_bytes()
+        path.write_bytes(data[:4096] + bytes(len(data) - 8192) + data[-4096:])
+    elif harm == "schema":
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute("PRAGMA user_version = 7")
+    else:
+        with tiny_board(tmp_path / "other") as other:
+            put_submission(other, key)
+        shutil.copyfile(tmp_path / "other" / "index.sqlite", path)
+    before = path.read_bytes() if path.exists() else None
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert len(store.entries()) == 4
+    assert (path.read_bytes() if path.exists() else None) == before
+    with Store.open(tmp_path / "board") as store:
+        assert derived(store) == expected
+
+
+def test_an_index_that_is_behind_catches_up(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        put_submission(store, key)
+    shutil.copyfile(tmp_path / "board" / "index.sqlite", tmp_path / "old")
+    with Store.open(tmp_path / "board") as store:
+        fill_rest = put_submission(store, key, 1)
+        expected = derived(store)
+    shutil.copyfile(tmp_path / "old", tmp_path / "board" / "index.sqlite")
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert store.entry(fill_rest.id) is not None
+    with Store.open(tmp_path / "board") as store:
+        assert derived(store) == expected
+
+
+def test_an_index_that_lies_about_its_place_is_made_anew(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        for number in range(3):
+            put_submission(store, key, number)
+        expected, second = derived(store), store.log(2, 1)[0]
+        with store.turn() as index:
+            index.connection.execute("UPDATE head SET sequence = ?, digest = ?", (2, second.digest))
+    for read_only in (True, False):
+        with Store.open(tmp_path / "board", read_only=read_only) as store:
+            assert len(store.entries()) == 3
+    with Store.open(tmp_path / "board") as store:
+        assert derived(store) == expected
+
+
+@pytest.mark.parametrize("which", ["index.sqlite", "index.sqlite*"])
+def test_an_index_deleted_in_mid_work_is_made_anew_by_who_comes_next(tmp_path, key, which):
+    with tiny_board(tmp_path / "board") as first, Store.open(tmp_path / "board") as second:
+        put_submission(first, key, 0)
+        assert len(second.entries()) == 1
+        for path in (tmp_path / "board").glob(which):
+            path.unlink()
+        put_submission(first, key, 1)
+        assert first.folder.index.exists()
+        put_submission(second, key, 2)
+        assert len(first.entries()) == len(second.entries()) == 3
+        first.reindex()
+        put_submission(second, key, 3)
+        assert derived(first) == derived(second)
+        assert [entry.sequence for entry in first.log()] == [0, 1, 2, 3, 4]
+    with Store.open(tmp_path / "board") as third:
+        expected = derived(third)
+        third.reindex()
+        assert derived(third) == expected
+
+
+def test_read_only_opening_writes_nothing(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        fill(store, key, waiting=True)
+    names = sorted(path.name for path in (tmp_path / "board").iterdir())
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert len(store.entries()) == 4
+        for refused in (
+            lambda: store.put_object("sha256:" + "0" * 64, [b""], by=key.public),
+            lambda: put_submission(store, key, 9),
+            lambda: store.claim("worker"),
+            store.reindex,
+            store.gc,
+        ):
+            with pytest.raises(BoardError, match="read-only"):
+                refused()
+    left = {path.name for path in (tmp_path / "board").iterdir()}
+    assert left - set(names) <= {"index.sqlite-wal", "index.sqlite-shm"}
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["after closing", "after a kill"])
+def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
+    with small_disk(tmp_path / "disk", "4m") as disk:
+        if disk is None:
+            if os.geteuid() == 0:
+                pytest.skip("root may neither mount here nor be kept from writing by modes")
+            disk = tmp_path / "disk"
+        store = tiny_board(disk / "board")
+        fill(store, key, waiting=True)
+        if killed:  # SQLite's log of writes is then left beside the database, and not in it
+            child = os.fork()
+            if child == 0:
+                other = Store.open(disk / "board")
+                put_submission(other, key, 7)
+                os._exit(0)
+            os.waitpid(child, 0)
+            shutil.copytree(disk / "board", disk / "killed")
+        expected = derived(store)
+        store.close()
+        board = disk / ("killed" if killed else "board")
+        assert (board / "index.sqlite-wal").exists() == killed
+        if disk.is_mount():
+            make_read_only(disk)
+        else:
+            for path in [board, *board.rglob("*")]:
+                path.chmod(0o555 if path.is_dir() else 0o444)
+        with pytest.raises(OSError, match=r"denied|ead-only"):
+            (board / "new").touch()
+        with Store.open(board, read_only=True) as read:
+            assert len(read.entries()) == (5 if killed else 4)
+            assert read.result(read.entries()[0].id) is not None
+            with read._reading() as index:
+                assert list(index.derived_rows()) == expected
+        with pytest.raises(BoardError):
+            Store.open(board)
+
+
+@pytest.mark.parametrize("deleted", [0, 20], ids=["", "while the index is deleted"])
+def test_processes_take_turns(tmp_path, key, deleted):
+    tiny_board(tmp_path / "board").close()
+    children = []
+    for worker in range(3):
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                with Store.open(tmp_path / "board") as store:
+                    for number in range(8):
+                        signed = put_artefacts(store, key, 10 * worker + number)
+                        received = False
+                        while not received:
+                            # Whose index is deleted in the midst of a write is told so.
+                            with contextlib.suppress(BoardError):
+                                store.receive(signed)
+                                received = True
+                status = 0
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                os._exit(status)
+        children.append(child)
+    for _ in range(deleted):
+        (tmp_path / "board" / "index.sqlite").unlink(missing_ok=True)
+        time.sleep(0.02)
+    assert [os.waitpid(child, 0)[1] for child in children] == [0, 0, 0]
+    with Store.open(tmp_path / "board") as store:
+        assert len(store.entries()) == 24
+        assert [entry.sequence for entry in store.log()] == list(range(25))
+        expected = derived(store)
+        store.reindex()
+        assert derived(store) == expected
+
+
+def test_a_turn_nests(store, key):
+    with store.turn() as outer, store.turn() as inner:
+        assert isinstance(inner, Index)
+        assert inner is outer
+        put_submission(store, key)
+        assert len(store.entries()) == 1
+    assert len(store.entries()) == 1
+
+
+def test_a_turn_that_fails_after_the_log_entry_loses_nothing(store, key):
+    def fails() -> None:
+        with store.turn():
+            put_submission(store, key)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fails()
+    assert len(store.entries()) == 1
+    assert put_submission(store, key, 1)
+    assert [entry.sequence for entry in store.log()] == [0, 1, 2]
+
+
+def test_a_new_board_goes_only_into_a_new_folder(tmp_path):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "file").write_text("mine")
+    with pytest.raises(BoardError, match="no board can be made here"):
+        tiny_board(tmp_path / "taken")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+    tiny_board(tmp_path / "board").close()
+    before = (tmp_path / "board" / "board.json").read_bytes()
+    with pytest.raises(BoardError, match="no board can be made here"):
+        tiny_board(tmp_path / "board")
+    assert (tmp_path / "board" / "board.json").read_bytes() == before
+
+
+def test_a_suite_with_teams_makes_no_board(tmp_path):
+    import sme_registry
+    from sme_registry.spec import EvaluationProtocol, Suite
+
+    team = sme_registry.load("SME/Team2-v1").plain()
+    del team["seed"]
+    suite = Suite.parse({"classes": [{"name": "Team", "setting": team, "seeds": [0]}]})
+    with pytest.raises(BoardError, match="single agents"):
+        Store.create(
+            tmp_path / "board",
+            title="Teams",
+            suite_name="teams-v1",
+            suite=suite,
+            protocol_name="quick-v1",
+            protocol=EvaluationProtocol(states_per_region=200),
+        )
+    assert not (tmp_path / "board").exists()
+
+
+def test_a_result_of_a_killed_scorer_is_removed_on_opening(tmp_path, key):
+    with tiny_board(tmp_path / "board") as store:
+        signed = put_submission(store, key)
+        path = store.folder.result(signed.id)
+        runs = made_up_result(store, signed.id).runs
+    path.write_text(str(result_of(store.document, signed.id, runs, {})))
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert store.result(signed.id) is None
+    assert path.exists()
+    with Store.open(tmp_path / "board") as store:
+        assert store.result(signed.id) is None
+    assert not path.exists()

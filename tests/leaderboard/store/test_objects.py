@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.store import Store
+from tests.leaderboard.conftest import tiny_board
+
+KEY = "ab" * 32
+
+
+def digest(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def files(store: Store) -> list[str]:
+    return [path.name for path in store.folder.objects.rglob("*") if path.is_file()]
+
+
+def test_an_object_is_new_once_and_comes_back_as_it_was(store):
+    data = os.urandom(100_000)
+    pieces = [data[start : start + 4096] for start in range(0, len(data), 4096)]
+    assert store.put_object(digest(data), pieces, by=KEY)
+    assert not store.put_object(digest(data), pieces, by=KEY)
+    assert store.has_object(digest(data))
+    assert store.object_bytes(digest(data)) == data
+    assert stat.S_IMODE(store.folder.object(digest(data)).stat().st_mode) == 0o644
+
+
+def test_bytes_of_another_digest_leave_nothing(store):
+    with pytest.raises(Rejection) as refused:
+        store.put_object(digest(b"one"), [b"another"], by=KEY)
+    assert refused.value.code == "artefact_digest"
+    assert files(store) == []
+
+
+def test_a_stream_is_cut_off_at_the_limit_and_leaves_nothing(tmp_path):
+    with tiny_board(tmp_path / "board", limits={"artefact_bytes": 1000}) as store:
+        read = 0
+
+        def endless() -> Iterator[bytes]:
+            nonlocal read
+            while True:
+                read += 100
+                yield bytes(100)
+
+        with pytest.raises(Rejection) as refused:
+            store.put_object(digest(b""), endless(), by=KEY)
+        assert refused.value.code == "too_large"
+        assert read == 1100
+        assert files(store) == []
+
+
+def test_an_upload_that_breaks_off_leaves_nothing(store):
+    def broken() -> Iterator[bytes]:
+        yield b"half"
+        raise ConnectionAbortedError
+
+    with pytest.raises((BoardError, ConnectionAbortedError)):
+        store.put_object(digest(b"half and half"), broken(), by=KEY)
+    assert files(store) == []
+
+
+def test_altered_bytes_are_not_handed_out(store):
+    store.put_object(digest(b"policy"), [b"policy"], by=KEY)
+    store.folder.object(digest(b"policy")).write_bytes(b"Policy")
+    with pytest.raises(TamperedError, match="objects/"):
+        store.object_bytes(digest(b"policy"))
+
+
+def test_a_missing_object_is_said_to_be_missing(store):
+    with pytest.raises(BoardError, match="cannot be read"):
+        store.object_bytes(digest(b"never seen"))
+
+
+def test_a_path_is_no_digest(store):
+    for name in ("../../board.key", "sha256:../board.key", "sha256:" + "A" * 64):
+        with pytest.raises(ValueError, match="not a digest"):
+            store.has_object(name)
+
+
+def test_bytes_count_for_who_brought_them_until_and_after_they_are_submitted(store, key, submit):
+    since = "2000-01-01T00:00:00Z"
+    store.put_object(digest(b"12345"), [b"12345"], by=key.public)
+    assert store.uploads(key.public, since) == store.total_bytes() == 5
+    signed = submit()
+    size = 5 + signed.submission.runs[0].artefact.size
+    assert store.uploads(key.public, since) == store.total_bytes() == size
+    assert store.uploads(key.public, "2999-01-01T00:00:00Z") == 0
+    assert store.uploads(KEY, since) == 0
+    store.reindex()  # who brought what nobody submitted is forgotten, but not its size
+    assert store.total_bytes() == size
+
+
+def test_many_threads_bring_the_same_object_once(store):
+    data = os.urandom(50_000)
+    new: list[bool] = []
+
+    def bring() -> None:
+        new.append(store.put_object(digest(data), [data], by=KEY))
+
+    threads = [threading.Thread(target=bring) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(new) == 8
+    assert any(new)
+    assert files(store) == [store.folder.object(digest(data)).name]
+    assert store.total_bytes() == len(data)

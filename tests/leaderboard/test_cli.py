@@ -1,0 +1,217 @@
+"""The command line, as it is typed, from a key to a page; and its exit codes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from leaderboard.cli import app
+from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.keys import SigningKey
+from leaderboard.store import Store
+from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry.spec import ProtocolFile, SuiteFile
+from tests.leaderboard.conftest import linear_onnx, tiny_suite
+
+READERS = ("rank", "show", "verify")
+KEEPERS = ("init", "score", "site", "serve", "reindex", "gc", "demo")
+COMMANDS = ("keygen", "export-sb3", "new", "check", "submit", "withdraw", *READERS, *KEEPERS)
+
+
+def board_command(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def good(*arguments: str | Path) -> str:
+    result = board_command(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def fails(code: int, *arguments: str | Path) -> str:
+    """The one line of a command that ends with this exit code."""
+    result = board_command(*arguments)
+    assert result.exit_code == code, result.output
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+@pytest.fixture(autouse=True)
+def _home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty folder, a key and a small suite: all that a newcomer has."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    suite = tiny_suite()
+    SuiteFile(name="tiny", version=1, digest=suite.digest, suite=suite).write("tiny-v1.json")
+    protocol = EvaluationProtocol(states_per_region=200)
+    ProtocolFile(name="small", version=1, digest=protocol.digest, protocol=protocol).write(
+        "small-v1.json"
+    )
+    Path("policy.onnx").write_bytes(linear_onnx(300))
+    spec: SMESpec = suite.instances[0]
+    runs = [
+        {"spec": spec.digest, "policy": "policy.onnx", "steps": 1000, "seed": 0},
+        {"spec": spec.digest, "policy": None, "steps": 10, "seed": 1},
+    ]
+    Path("runs.json").write_text(json.dumps(runs))
+
+
+def make_board() -> None:
+    good(
+        "init", "board", "--suite", "tiny-v1.json", "--protocol", "small-v1.json",
+        "--runs-to-rank", "2",
+    )  # fmt: skip
+
+
+def make_bundle(name: str = "bundle", *more: str) -> str:
+    """The submission's id."""
+    return good(
+        "new", name, "--runs", "runs.json", "--suite", "tiny-v1.json", "--method", "Linear",
+        "--submitter", "A Lab", *more,
+    ).split()[0]  # fmt: skip
+
+
+def test_help_teaches_every_command_with_an_example() -> None:
+    top = good("--help")
+    for command in COMMANDS:
+        assert command in top
+        assert f"sme-leaderboard {command}" in good(command, "--help")
+
+
+def test_from_a_key_to_a_page() -> None:
+    assert "public key" in good("keygen")
+    make_board()
+    id = make_bundle()
+    checked = good("check", "bundle", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")
+    assert "WD regret" in checked
+
+    assert good("submit", "bundle", "board").strip() == id
+    assert good("submit", "bundle", "board").strip() == id  # twice is once
+    assert good("score", "board").strip() == "3 scored."
+
+    ranking = json.loads(good("rank", "board", "--json"))
+    text = json.dumps(ranking)
+    assert id in text
+    assert "optimal" in text
+    assert "Linear" in good("rank", "board")
+    assert good("rank", "board", "--csv").count("\n") >= 4
+    assert "tabular" in good("rank", "board", "--latex")
+
+    shown = json.loads(good("show", "board", id, "--json"))
+    # One of its two runs failed, and scores 1: the IQM of two is their mean.
+    alone = shown["result"]["runs"][0]["wd"]
+    assert shown["result"]["scores"]["wd"]["value"] == pytest.approx((alone + 1.0) / 2)
+    assert "A Lab" in good("show", "board", id.removeprefix("sha256:")[:8])
+
+    assert "Whole" in good("verify", "board", "--rescore", "1")
+    page = Path(good("site", "board", "--out", "public").strip())
+    assert page == Path("public/index.html").resolve()
+    assert "Linear" in page.read_text()
+
+    good("withdraw", "board", id, "--reason", "a bug")
+    assert id not in json.dumps(json.loads(good("rank", "board", "--json")))
+    assert "withdrawn" in fails(1, "submit", "bundle", "board")
+
+
+def test_home_and_board_find_the_same_numbers() -> None:
+    good("keygen")
+    make_board()
+    id = make_bundle()
+    here = ("--suite", "tiny-v1.json", "--protocol", "small-v1.json")
+    at_home = json.loads(good("check", "bundle", *here, "--json"))
+    good("submit", "bundle", "board")
+    good("score", "board")
+    on_board = json.loads(good("show", "board", id, "--json"))["result"]
+    for field in ("scores", "runs", "classes", "suite", "protocol"):
+        assert at_home[field] == on_board[field]
+
+
+def test_what_is_rejected_ends_with_1_and_its_code() -> None:
+    good("keygen")
+    make_board()
+    Path("policy.onnx").write_bytes(b"not a model")
+    new = ("new", "bundle", "--runs", "runs.json", "--suite", "tiny-v1.json")
+    assert "onnx_malformed" in fails(1, *new, "--method", "M", "--submitter", "S")
+    assert not Path("bundle").exists()
+
+    Path("policy.onnx").write_bytes(linear_onnx(300))
+    make_bundle()
+    next(Path("bundle/artefacts").iterdir()).write_bytes(linear_onnx(301))
+    assert "artefact_digest" in fails(1, "submit", "bundle", "board")
+    assert "artefact_digest" in fails(1, "check", "bundle", "--suite", "tiny-v1.json")
+
+
+def test_bad_usage_ends_with_2() -> None:
+    good("keygen")
+    assert "exists already" in fails(2, "keygen")
+    assert "init" in fails(2, "rank", "nowhere")
+    assert "no such folder" in fails(
+        2, "new", "b", "--runs", "runs/*", "--method", "M", "--submitter", "S"
+    )
+    assert "knowledge" in fails(
+        2, "new", "b", "--runs", "runs.json", "--method", "M", "--submitter", "S",
+        "--knowledge", "much", "--suite", "tiny-v1.json",
+    )  # fmt: skip
+    assert "CLASS=N" in fails(
+        2, "new", "b", "--runs", "runs.json", "--method", "M", "--submitter", "S",
+        "--started", "many", "--suite", "tiny-v1.json",
+    )  # fmt: skip
+    make_board()
+    assert "at most one" in fails(2, "rank", "board", "--json", "--csv")
+    assert "new folder" in fails(2, "init", "board", "--suite", "tiny-v1.json")
+    assert "no submission" in fails(2, "show", "board", "abcdef0123")
+
+
+def test_a_board_whose_references_wait_shows_nothing() -> None:
+    make_board()
+    assert "reference" in fails(2, "rank", "board")
+    assert "reference" in fails(2, "site", "board")
+    assert not Path("board/site/index.html").exists()
+
+
+def test_an_altered_result_ends_with_3_and_is_named() -> None:
+    make_board()
+    good("score", "board")
+    path = sorted(Path("board/results").iterdir())[0]
+    path.write_text(path.read_text().replace('"wd"', '"dw"', 1))
+    assert path.name in fails(3, "verify", "board")
+
+
+def test_the_index_comes_back_from_the_files() -> None:
+    good("keygen")
+    make_board()
+    make_bundle()
+    good("submit", "bundle", "board")
+    good("score", "board")
+    before = good("rank", "board", "--csv")
+    for path in Path("board").glob("index.sqlite*"):
+        path.unlink()
+    assert "3 entries" in good("reindex", "board")
+    assert good("rank", "board", "--csv") == before
+    with sqlite3.connect("board/index.sqlite") as index:
+        assert index.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    index.close()
+
+
+def test_gc_removes_what_no_submission_names_and_only_says_so_before() -> None:
+    make_board()
+    key = SigningKey.generate()
+    data = linear_onnx(1)
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    with Store.open("board") as store:
+        store.put_object(digest, [data], by=key.public)
+    assert "1 files" in good("gc", "board", "--older-than-hours", "0", "--dry-run")
+    with Store.open("board") as store:
+        assert store.has_object(digest)
+    good("gc", "board", "--older-than-hours", "0")
+    with Store.open("board") as store:
+        assert not store.has_object(digest)
+    good("score", "board")
+    assert "Whole" in good("verify", "board")

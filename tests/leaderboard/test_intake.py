@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import datetime
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from leaderboard import intake
+from leaderboard.board import hex_of
+from leaderboard.errors import Rejection
+from leaderboard.keys import SigningKey
+from leaderboard.ranking import refuse_unpublishable
+from leaderboard.scorer import run_scorer
+from leaderboard.store import Store
+from leaderboard.submission import SignedSubmission, utc
+from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
+
+ANY_TIME = "2000-01-01T00:00:00Z"
+
+
+def put(store: Store, key: SigningKey, artefacts: dict[str, bytes]) -> None:
+    for digest, data in artefacts.items():
+        store.put_object(digest, [data], by=key.public)
+
+
+def bundle(folder: Path, signed: SignedSubmission, artefacts: dict[str, bytes]) -> Path:
+    (folder / "artefacts").mkdir(parents=True)
+    (folder / "submission.json").write_bytes(signed.to_bytes())
+    for digest, data in artefacts.items():
+        (folder / "artefacts" / f"{hex_of(digest)}.onnx").write_bytes(data)
+    return folder
+
+
+def objects(store: Store) -> list[Path]:
+    return [path for path in store.folder.objects.rglob("*") if path.is_file()]
+
+
+def code_of(call: Callable[[], Any]) -> str:
+    with pytest.raises(Rejection) as caught:
+        call()
+    assert caught.value.message.endswith(".")
+    return caught.value.code
+
+
+def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmission:
+    """A submission of a file that is on the board, whatever it is."""
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    put(store, key, {digest: data})
+    signed, _ = tiny_submission(store, key)
+    plain = signed.submission.plain()
+    for run in plain["runs"]:
+        run["artefact"] = {"sha256": digest, "size": len(data)}
+    return type(signed.submission).parse(plain).signed(key)
+
+
+# Submissions.
+
+
+def test_a_submission_is_kept_once(store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    assert intake.receive(store, signed.to_bytes()) == signed.id
+    assert intake.receive(store, signed.to_bytes()) == signed.id
+    assert [entry.id for entry in store.entries()] == [signed.id]
+    assert store.head.sequence == 1
+
+
+def test_a_known_submission_is_known_whatever_its_age(store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    intake.receive(store, signed.to_bytes())
+    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=999)
+    assert intake.receive(store, signed.to_bytes(), at=later) == signed.id
+
+
+def test_a_submission_that_is_old_is_refused(store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=15)
+    assert code_of(lambda: intake.receive(store, signed.to_bytes(), at=later)) == "stale_time"
+    assert store.entries() == []
+
+
+def test_an_artefact_that_is_not_there_is_missed(store: Store, key: SigningKey) -> None:
+    signed, _ = tiny_submission(store, key)
+    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "artefact_missing"
+
+
+def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    plain = signed.submission.plain()
+    plain["runs"][0]["artefact"]["size"] -= 1
+    other = type(signed.submission).parse(plain).signed(key)
+    assert code_of(lambda: intake.receive(store, other.to_bytes())) == "artefact_digest"
+    assert store.entries() == []
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"not a model", "onnx_malformed"),
+        (linear_onnx(1, observation_dim=5), "onnx_interface"),
+        (linear_onnx(1, action_dim=2), "onnx_interface"),
+        (linear_onnx(1).replace(b"Gemm", b"Gamm"), "onnx_op"),
+    ],
+)
+def test_artefacts_pass_the_gate_with_the_widths_of_their_spec(
+    store: Store, key: SigningKey, data: bytes, code: str
+) -> None:
+    signed = with_artefact(store, key, data)
+    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == code
+    assert store.entries() == []
+
+
+def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> None:
+    signed, _ = tiny_submission(store, key)
+    plain = signed.submission.plain()
+    for run in plain["runs"]:
+        run["artefact"] = None
+    failed = type(signed.submission).parse(plain).signed(key)
+    assert intake.receive(store, failed.to_bytes()) == failed.id
+
+
+def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
+        put_submission(store, key, 1)
+        put_submission(store, key, 2)
+        signed, artefacts = tiny_submission(store, key, 3)
+        put(store, key, artefacts)
+        first = store.submissions_of(key.public, ANY_TIME)[0]
+        free = datetime.datetime.fromisoformat(first) + datetime.timedelta(days=1)
+        with pytest.raises(Rejection, match=f"quota: .* after {utc(free)}") as caught:
+            intake.receive(store, signed.to_bytes())
+        assert caught.value.code == "quota"
+        after = free + datetime.timedelta(seconds=2)
+        assert intake.receive(store, signed.to_bytes(), at=after) == signed.id
+
+
+def test_the_quota_of_one_key_is_not_anothers(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 1}) as store:
+        put_submission(store, key, 1)
+        other = SigningKey.generate()
+        signed, artefacts = tiny_submission(store, other, 2)
+        put(store, other, artefacts)
+        assert intake.receive(store, signed.to_bytes()) == signed.id
+
+
+def test_a_board_where_many_wait_takes_no_more(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
+        put_submission(store, key, 1)
+        signed, artefacts = tiny_submission(store, key, 2)
+        put(store, key, artefacts)
+        assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "quota"
+        assert len(intake.submit_references(store)) == 2  # without them nothing is ever shown
+
+
+# Bundles.
+
+
+def test_a_bundle_brings_its_artefacts(tmp_path: Path, store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    folder = bundle(tmp_path / "bundle", signed, artefacts)
+    for _ in range(2):
+        assert intake.submit_bundle(store, folder) == signed.id
+    assert len(store.entries()) == 1
+    for digest, data in artefacts.items():
+        assert store.object_bytes(digest) == data
+
+
+def test_a_bundle_that_is_refused_leaves_nothing(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    signed, artefacts = tiny_submission(store, key, created=ANY_TIME)
+    folder = bundle(tmp_path / "old", signed, artefacts)
+    assert code_of(lambda: intake.submit_bundle(store, folder)) == "stale_time"
+    signed, artefacts = tiny_submission(store, key)
+    folder = bundle(tmp_path / "changed", signed, dict.fromkeys(artefacts, b"?"))
+    assert code_of(lambda: intake.submit_bundle(store, folder)) == "artefact_digest"
+    assert (objects(store), store.entries()) == ([], [])
+
+
+# The board's own rows.
+
+
+def test_reference_rows_are_one_of_each_however_often(tmp_path: Path) -> None:
+    with tiny_board(tmp_path / "b", instances=2) as store:
+        ids = intake.submit_references(store)
+        assert intake.submit_references(store) == ids
+        rows = store.entries()
+        assert [row.id for row in rows] == ids
+        assert [row.method for row in rows] == ["optimal", "constant"]
+        assert [row.knowledge for row in rows] == ["oracle", "family"]
+        assert all(row.reference and row.runs == 2 for row in rows)
+        opened = store.log(0, 1)[0].time
+        created = {store.submission(id).submission.created for id in ids}
+        assert created == {opened}
+
+
+def test_reference_rows_stay_where_other_versions_write_other_bytes(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids = intake.submit_references(store)
+    others = [
+        (name, knowledge, lambda _: linear_onnx(7), text)
+        for name, knowledge, _, text in intake._REFERENCES
+    ]
+    monkeypatch.setattr(intake, "_REFERENCES", others)
+    assert intake.submit_references(store) == ids
+    assert len(store.entries()) == 2
+
+
+def test_reference_rows_make_a_board_publishable(store: Store) -> None:
+    intake.submit_references(store)
+    assert run_scorer(store.folder.path) == 2
+    refuse_unpublishable(store.entries())
+
+
+def test_a_board_that_is_old_still_takes_its_reference_rows(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = store.log(0, 1)[0].model_copy(update={"time": "2020-01-01T00:00:00Z"})
+    monkeypatch.setattr(store, "log", lambda *_: [entry])
+    assert len(intake.submit_references(store)) == 2
+
+
+def test_a_name_of_a_reference_row_is_no_reference_row(store: Store, key: SigningKey) -> None:
+    method = {"name": "optimal", "version": "1", "family": "reference", "knowledge": "oracle"}
+    put_submission(store, key, method=method)
+    assert len(intake.submit_references(store)) == 2
+    assert [row.reference for row in store.entries()] == [False, True, True]
+
+
+# Withdrawals.
+
+
+def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
+    signed = put_submission(store, key)
+    withdrawal = intake.withdrawal_of(signed.id, key, "a bug")
+    for _ in range(2):
+        assert intake.withdraw(store, withdrawal) == signed.id
+    entry = store.entry(signed.id)
+    assert entry is not None
+    assert entry.status == "withdrawn"
+    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "withdrawn"
+
+
+def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
+    signed = put_submission(store, key)
+    forged = intake.withdrawal_of(signed.id, SigningKey.generate())
+    assert code_of(lambda: intake.withdraw(store, forged)) == "bad_signature"
+    board = intake.withdrawal_of(signed.id, store.folder.signing_key())
+    assert code_of(lambda: intake.withdraw(store, board)) == "bad_signature"
+
+
+def test_what_is_not_there_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
+    withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key)
+    assert code_of(lambda: intake.withdraw(store, withdrawal)) == "unknown_submission"
+
+
+def test_a_withdrawal_is_read_back(key: SigningKey) -> None:
+    withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key, "a bug")
+    assert intake.read_withdrawal(withdrawal.model_dump_json().encode()) == withdrawal
+    assert code_of(lambda: intake.read_withdrawal(b"{")) == "not_json"
+    assert code_of(lambda: intake.read_withdrawal(b"[]")) == "schema"
+    assert code_of(lambda: intake.read_withdrawal(b" " * 10**6)) == "too_large"
+
+
+# Uploads.
+
+
+def test_an_upload_is_signed_for_one_object(key: SigningKey) -> None:
+    this, other = "sha256:" + "1" * 64, "sha256:" + "2" * 64
+    header = intake.upload_header(key, this)
+    assert intake.uploader(header, this) == key.public
+    assert code_of(lambda: intake.uploader(header, other)) == "bad_signature"
+    assert code_of(lambda: intake.uploader(None, this)) == "bad_signature"
+
+
+@pytest.mark.parametrize("minutes", [-11, 11])
+def test_an_upload_is_signed_for_ten_minutes(key: SigningKey, minutes: int) -> None:
+    digest = "sha256:" + "1" * 64
+    header = intake.upload_header(key, digest)
+    moment = datetime.datetime.now(datetime.UTC)
+    nearly = moment + datetime.timedelta(minutes=minutes * 9 / 11)
+    past = moment + datetime.timedelta(minutes=minutes)
+    assert intake.uploader(header, digest, at=nearly) == key.public
+    assert code_of(lambda: intake.uploader(header, digest, at=past)) == "stale_time"
+
+
+def test_a_signature_of_a_submission_is_none_of_an_upload(key: SigningKey) -> None:
+    digest, time = "sha256:" + "1" * 64, utc(datetime.datetime.now(datetime.UTC))
+    signature = key.sign("submission", f"{digest} {time}")
+    header = f"SME-Ed25519 key={key.public},time={time},signature={signature}"
+    assert code_of(lambda: intake.uploader(header, digest)) == "bad_signature"
+
+
+def test_upload_quotas_count_what_is_there_and_under_way(tmp_path: Path, key: SigningKey) -> None:
+    limits = {"upload_bytes_per_day": 1000, "total_bytes": 2000, "artefact_bytes": 900}
+    with tiny_board(tmp_path / "b", limits=limits) as store:
+        put(store, key, {"sha256:" + _sha256(bytes(500)): bytes(500)})
+        me, other = key.public, SigningKey.generate().public
+        intake.check_upload(store, me, 500)
+        intake.check_upload(store, other, 900)
+        assert code_of(lambda: intake.check_upload(store, me, 501)) == "quota"
+        assert code_of(lambda: intake.check_upload(store, me, 500, pending_of_key=1)) == "quota"
+        assert code_of(lambda: intake.check_upload(store, other, 900, pending=601)) == "quota"
+        assert code_of(lambda: intake.check_upload(store, other, 901)) == "too_large"
+        tomorrow = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=1, seconds=2)
+        intake.check_upload(store, me, 900, at=tomorrow)
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,17 @@
+"""Small data sets for these tests, made without a file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sme_registry import SMESpec, materialize
+from sme_registry.datasets import DatasetRecipe, Transitions
+from sme_registry.datasets.collect import collect
+from sme_registry.datasets.recipe import behaviour_of
+
+TINY = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
+
+
+def transitions_of(spec: SMESpec = TINY, nu: Any = 0.5, count: int = 600) -> Transitions:
+    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(nu),), transitions=count, seed=3)
+    return collect(recipe, materialize(spec))

@@ -1,0 +1,245 @@
+"""Training on a data set: short real runs, what they report, and what they refuse."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sme_registry import EvaluationReport, SMESpec, materialize
+from sme_registry.datasets import Transitions, make_dataset
+from sme_registry.errors import (
+    DigestMismatchError,
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.offline import OfflinePolicy, OfflineRecord, OfflineResult, train_offline
+from tests.offline.sets import TINY, transitions_of
+
+PROTOCOL = {"states_per_region": 50}
+
+
+@pytest.fixture(scope="module")
+def transitions() -> Transitions:
+    return transitions_of()
+
+
+def short(data: Any, **changes: Any) -> OfflineResult:
+    settings: dict[str, Any] = {
+        "algorithm": "bc",
+        "steps": 40,
+        "batch_size": 32,
+        "evaluations": 2,
+        "episodes": 3,
+        "hyperparameters": {"hidden": [16, 16]},
+        "spec": TINY,
+        "protocol": PROTOCOL,
+    }
+    return train_offline(data, **{**settings, **changes})
+
+
+def parts(result: OfflineResult) -> list[np.ndarray]:
+    return [array for layer in result.policy.layers for array in layer]
+
+
+@pytest.mark.parametrize("algorithm", ["bc", "IQL"])
+def test_the_same_seed_gives_the_same_policy_and_scores(
+    transitions: Transitions, algorithm: str
+) -> None:
+    one, two = (short(transitions, algorithm=algorithm) for _ in range(2))
+    for first, second in zip(parts(one), parts(two), strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert one.record.evaluations == two.record.evaluations
+    assert one.report == two.report
+    other = short(transitions, algorithm=algorithm, seed=1)
+    assert not np.array_equal(parts(one)[0], parts(other)[0])
+
+
+def test_training_leaves_torch_as_it_was(transitions: Transitions) -> None:
+    torch.set_num_threads(2)
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    short(transitions)
+    assert torch.equal(torch.rand(3), expected)
+    assert torch.get_num_threads() == 2
+
+
+def test_evaluations_are_evenly_spaced_and_the_last_is_of_the_policy_returned(
+    transitions: Transitions,
+) -> None:
+    result = short(transitions, steps=10, evaluations=3)
+    assert [score.step for score in result.record.evaluations] == [3, 7, 10]
+    last = result.record.evaluations[-1]
+    similarities, rewards = by_hand(result, evaluation=2)
+    assert last.similarity == pytest.approx(similarities.mean())
+    assert last.similarity_sd == pytest.approx(similarities.std())
+    assert last.episode_return == pytest.approx(rewards.sum() / 3)
+
+
+def by_hand(result: OfflineResult, evaluation: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every step's r̃ and R of three episodes, from the task's own equations."""
+    from sme_registry.task import streams
+
+    task = materialize(TINY)
+    s = streams.uniform(0, f"rollouts/{evaluation}/initial_state", 6).reshape(3, 2)
+    similarities, rewards = [], []
+    for t in range(TINY.horizon):
+        clock = np.full((3, 1), t / TINY.horizon)
+        seen = np.concatenate([s, clock, np.zeros((3, 1))], axis=1).astype(np.float32)
+        a = result.policy(seen)
+        similarities.append(task.similarity(s, a))
+        rewards.append(task.step_reward(s, a))
+        s = task.transition(s, a)
+    return np.array(similarities), np.array(rewards)
+
+
+def test_bc_imitates_the_optimum() -> None:
+    optimal = transitions_of(nu=0.0, count=2000)
+    result = short(
+        optimal, steps=400, batch_size=128, hyperparameters={"hidden": [64], "learning_rate": 0.01}
+    )
+    assert result.record.behaviour.similarity == pytest.approx(1.0, abs=1e-7)  # float32 actions
+    assert result.record.score > 0.95
+    assert result.report.regions[0].similarity > 0.95
+
+
+def test_iql_surpasses_random_behaviour() -> None:
+    noisy = transitions_of(nu="random", count=2000)
+    result = short(
+        noisy,
+        algorithm="iql",
+        steps=500,
+        batch_size=128,
+        hyperparameters={"hidden": [64], "learning_rate": 0.01},
+    )
+    assert result.record.improvement > 0.1
+
+
+def test_the_behaviour_s_score_is_that_of_the_set(transitions: Transitions) -> None:
+    behaviour = short(transitions).record.behaviour
+    assert behaviour.similarity == transitions.similarities.mean()
+    assert behaviour.similarity_sd == transitions.similarities.std()
+    assert behaviour.step_reward == transitions.step_rewards.mean()
+
+
+def test_a_folder_holds_what_was_returned(transitions: Transitions, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    result = short(transitions, folder=folder)
+    assert OfflineRecord.read(folder / "offline.json") == result.record
+    assert EvaluationReport.read(folder / "evaluation.json") == result.report
+    read = OfflinePolicy.load(folder / "policy.npz")
+    observations = np.random.default_rng(0).random((5, 4), dtype=np.float32)
+    np.testing.assert_array_equal(read(observations), result.policy(observations))
+    assert result.record.dataset_digest == transitions.digest
+    assert {"torch", "numpy", "python"} <= result.record.versions.keys()
+
+
+def test_a_folder_with_a_training_is_replaced_only_when_told(
+    transitions: Transitions, tmp_path: Path
+) -> None:
+    short(transitions, folder=tmp_path, steps=1, evaluations=1)
+    with pytest.raises(OptionError, match="holds a training"):
+        short(transitions, folder=tmp_path)
+    assert short(transitions, folder=tmp_path, force=True).record.steps == 40
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OptionError, match=r"notes\.txt"):
+        short(transitions, folder=tmp_path, force=True)
+
+
+def test_a_record_with_another_spec_s_digest_is_refused(
+    transitions: Transitions, tmp_path: Path
+) -> None:
+    short(transitions, folder=tmp_path, steps=1, evaluations=1)
+    path = tmp_path / "offline.json"
+    path.write_text(path.read_text().replace(TINY.digest, SMESpec().digest))
+    with pytest.raises(DigestMismatchError, match="spec_digest"):
+        OfflineRecord.read(path)
+
+
+def test_a_set_on_disk_brings_its_task_and_protocol(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    dataset = make_dataset(
+        TINY, 0.5, transitions=100, protocol=PROTOCOL, name="sme/tiny-v0", folder=tmp_path
+    )
+    for data in (dataset, dataset.path):
+        result = short(data, spec=None, protocol=None, steps=2)
+        assert result.record.spec == TINY
+        assert result.record.dataset == "sme/tiny-v0"
+        assert result.record.recipe_digest == dataset.record.recipe_digest
+        assert result.report.protocol.states_per_region == 50
+    with pytest.raises(OptionError, match="the set is of"):
+        short(dataset, spec=SMESpec())
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "said"),
+    [
+        ({"algorithm": "iq"}, UnknownNameError, "Did you mean 'iql'"),
+        ({"steps": 0}, OptionError, "steps=0"),
+        ({"steps": True}, OptionError, "steps=True"),
+        ({"batch_size": 601}, OptionError, r"batch_size=601: must be an integer in \[1, 600\]"),
+        ({"seed": -1}, OptionError, "seed=-1"),
+        ({"evaluations": 41}, OptionError, r"evaluations=41: must be an integer in \[1, 40\]"),
+        ({"episodes": 0}, OptionError, "episodes=0"),
+        ({"hyperparameters": {"expectile": 0.7}}, SpecError, "expectile=0.7: unknown field"),
+        ({"algorithm": "iql", "hyperparameters": {"expectile": 1.0}}, SpecError, "expectile=1.0"),
+        ({"hyperparameters": {"hidden": []}}, SpecError, "hidden"),
+        ({"hyperparameters": [1]}, OptionError, "hyperparameters"),
+        ({"spec": None}, OptionError, "spec=None"),
+        ({"spec": SMESpec()}, OptionError, "observations of shape"),
+        ({"spec": TINY.derive(seed=6)}, OptionError, "is not the task of the set"),
+        ({"spec": "Team2"}, SpecError, "team"),
+        ({"spec": "Nowhere"}, UnknownNameError, "Nowhere"),
+        ({"protocol": "papr-v1"}, UnknownNameError, "paper-v1"),
+    ],
+)
+def test_bad_input_is_refused(
+    transitions: Transitions, changes: dict[str, Any], error: type[SMEError], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        short(transitions, **changes)
+
+
+def test_what_is_no_data_set_is_refused() -> None:
+    with pytest.raises(OptionError, match="must be a data set"):
+        short([1, 2, 3])
+    with pytest.raises(UnknownNameError, match="no data set of this id"):
+        short("sme/nothing-v0", spec=None)
+
+
+def test_numbers_that_are_not_finite_are_refused(transitions: Transitions) -> None:
+    columns = transitions.columns()
+    columns["rewards"] = np.where(np.arange(600) == 7, np.nan, columns["rewards"])
+    with pytest.raises(OptionError, match="rewards: has NaN"):
+        short(Transitions(**columns))
+
+
+def test_a_training_that_diverges_says_so(transitions: Transitions) -> None:
+    columns = transitions.columns()
+    columns["rewards"] = columns["rewards"] + 1e30  # whose square no float32 holds
+    with pytest.raises(PolicyError, match="diverged before step"):
+        short(Transitions(**columns), algorithm="iql")
+
+
+def test_without_torch_it_says_what_to_install(
+    transitions: Transitions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingDependencyError, match=r"sme-registry\[offline\]"):
+        short(transitions)
+
+
+def test_progress_ends_at_the_last_step(transitions: Transitions) -> None:
+    told: list[tuple[int, int, str]] = []
+    short(transitions, progress=lambda *said: told.append(said))
+    assert told[-1][:2] == (40, 40)
+    assert told[-1][2].startswith("live r̃ 0.")

@@ -1,0 +1,139 @@
+"""Plans of small cells, and work for them that waits, fails or dies as a test wants it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.result import CellResult
+
+PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
+STARTED, GATE = "started", "gate"
+
+
+def small_file(
+    seeds: int = 2, algorithms: Sequence[str | dict[str, Any]] = ("constant",), **fields: Any
+) -> StudyFile:
+    """References, or other algorithms, on one small class, `seeds` runs each: milliseconds each."""
+    plan = StudyPlan.parse(
+        {
+            "classes": [
+                {"name": "small", "setting": {"state_dim": 2, "action_dim": 2}, "seeds": [1, 2]}
+            ],
+            "algorithms": [
+                {"name": one, "uses": f"reference:{one}", "steps": 0}
+                if isinstance(one, str)
+                else one
+                for one in algorithms
+            ],
+            "seeds": seeds,
+            "evaluations": 0,
+            "protocol": PROTOCOL,
+            **fields,
+        }
+    )
+    return StudyFile(name="small", description="For tests.", digest=plan.digest, plan=plan)
+
+
+def noted(folder: Path, cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+    """The real thing, with a note in `folder` that it was begun, and by whom."""
+    handle = os.open(folder / STARTED, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.write(handle, f"{cell.digest} {os.getpid()} {cell.seed}\n".encode())
+    os.close(handle)
+    return run_cell(cell, progress, model_path)
+
+
+def gated(
+    folder: Path, cell: Cell, progress: Any = None, model_path: Any = None, *, open_for: int = 0
+) -> CellResult:
+    """Runs of a number from `open_for` on wait until the gate is there."""
+    result = noted(folder, cell, progress, model_path)
+    wait_for(lambda: cell.seed < open_for or (folder / GATE).exists())
+    return result
+
+
+def raising(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+    """Run 1 raises."""
+    if cell.seed == 1:
+        raise ValueError("this one is broken")
+    return run_cell(cell, progress, model_path)
+
+
+def dying(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+    """Run 1 is killed, as the kernel does where memory runs out."""
+    if cell.seed == 1:
+        print("last words", flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run_cell(cell, progress, model_path)
+
+
+def littering(cell: Cell, progress: Any = None, model_path: Any = None) -> CellResult:
+    """Removes the folder for temporary files that cells share, as a cleaner of /tmp would."""
+    shutil.rmtree(tempfile.gettempdir())
+    return run_cell(cell)
+
+
+def modelled(cell: Cell, progress: Any = None, model_path: Path | None = None) -> CellResult:
+    """Leaves a model, and says how far it is."""
+    if progress is not None:
+        progress(10, 10)
+    if model_path is not None:
+        model_path.write_bytes(cell.digest.encode())
+    return run_cell(cell)
+
+
+def surroundings(
+    folder: Path, cell: Cell, progress: Any = None, model_path: Any = None
+) -> CellResult:
+    """Writes down the threads that this process may use."""
+    import numba
+
+    threads = f"{os.environ['OMP_NUM_THREADS']} {numba.get_num_threads()}"
+    (folder / "threads").write_text(threads)
+    return run_cell(cell)
+
+
+def starts(folder: Path) -> Counter[str]:
+    """How often each cell was begun, by key."""
+    path = folder / STARTED
+    return (
+        Counter(line.split()[0] for line in path.read_text().splitlines())
+        if path.exists()
+        else Counter()
+    )
+
+
+def pids(folder: Path) -> list[int]:
+    """The processes that began cells."""
+    return [int(line[1]) for line in _lines(folder)]
+
+
+def _lines(folder: Path) -> list[list[str]]:
+    path = folder / STARTED
+    return [line.split() for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits for its parent does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def wait_for(condition: Any, seconds: float = 60.0) -> None:
+    """Poll until it holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError("what was waited for did not come about")
+        time.sleep(0.02)

@@ -1,0 +1,66 @@
+"""Studies that have been run: folders with real results of learners that learn in milliseconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.ledger import Ledger
+
+LEARNERS = {
+    "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},
+    "Beta": {"half_life": 6.0, "k": 0.25, "complexity": 0.1},
+}
+CLASSES: dict[str, dict[str, Any]] = {
+    "default": {},
+    "k-25": {"k": 25},
+    "r_min-0_5": {"r_min": 0.5},
+    "complexity-10": {"complexity": 10, "policy_init": "unit_variance"},
+    "plane": {"state_dim": 2, "action_dim": 2, "complexity": 10},
+}
+
+
+def study_file(
+    classes: dict[str, dict[str, Any]] = CLASSES,
+    learners: dict[str, dict[str, float]] = LEARNERS,
+    **fields: Any,
+) -> StudyFile:
+    """Learners and a reference on small classes, with five seeds each."""
+    plan = StudyPlan.parse(
+        {
+            "classes": [
+                {
+                    "name": name,
+                    "setting": {"state_dim": 8, "action_dim": 4, "horizon": 20, **setting},
+                    "seeds": list(range(1, 6)),
+                }
+                for name, setting in classes.items()
+            ],
+            "algorithms": [
+                *(
+                    {"name": name, "uses": "tests.studies.learners:blend", "hyperparameters": own}
+                    for name, own in learners.items()
+                ),
+                {"name": "constant", "uses": "reference:constant", "steps": 0},
+            ],
+            "seeds": 5,
+            "steps": 40,
+            "evaluations": 20,
+            "evaluation_episodes": 3,
+            "protocol": {"states_per_region": 100, "epsilons": [0.5, 1.0]},
+            **fields,
+        }
+    )
+    return StudyFile(name="finished", description="For tests.", digest=plan.digest, plan=plan)
+
+
+def finish(file: StudyFile, folder: Path, leave_out: Any = lambda planned: False) -> Ledger:
+    """Run a plan's cells here and keep the results, except for those left out."""
+    ledger = Ledger(folder)
+    ledger.write_plan(file)
+    for planned in file.plan.cells:
+        if not leave_out(planned):
+            ledger.write(run_cell(planned.cell))
+    return ledger

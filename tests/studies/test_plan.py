@@ -1,0 +1,320 @@
+"""Plans: how those of the catalogue were made, what they take, how they are cut, by command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from sme_registry.cli import app
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
+from sme_registry.studies.cell import run_cell
+from sme_registry.studies.estimate import Estimator, makespan
+from sme_registry.studies.runner import run_study
+from sme_registry.studies.scaling import scaled, selected
+from tests.studies.cells import raising, small_file
+
+ABLATIONS = catalogue.find(StudyFile, "paper-ablations")
+THREE = ("-a", "PPO", "-a", "TD3", "-a", "SAC")
+
+# The plans of the catalogue are what these commands write, with a description.
+MADE_BY: dict[str, tuple[str, ...]] = {
+    "smoke": (
+        *("--suite", "smoke", *THREE, "-a", "reference:linear", "--seeds", "2"),
+        *("-n", "250", "-n", "PPO=2048", "--evaluations", "10", "--protocol", "quick-v1"),
+    ),
+    "paper-ablations": (
+        *("--suite", "paper-ablations", *THREE, "--seeds", "10"),
+        *("-n", "100000", "--evaluations", "400"),
+    ),
+    "plane-maps": (
+        *("-t", "Plane1", "-t", "Plane10", "-t", "Plane50", *THREE, "--seeds", "3"),
+        *("-n", "20000", "-n", "PPO=100000", "--evaluations", "100"),
+    ),
+}  # fmt: skip
+OFFLINE = "offline-quality"
+
+
+def offline_quality() -> StudyPlan:
+    """METHOD, section 4: three depths, five qualities, BC and IQL; no command writes such names."""
+    setting = {name: value for name, value in SMESpec().plain().items() if name != "seed"}
+    return StudyPlan.parse(
+        {
+            "classes": [
+                {
+                    "name": f"complexity{L}",
+                    "setting": {**setting, "complexity": L},
+                    "seeds": list(range(1, 11)),
+                }
+                for L in (1, 10, 50)
+            ],
+            "algorithms": [
+                {
+                    "name": f"{learner.upper()} ({nu:g})",
+                    "uses": f"offline:{learner}",
+                    "hyperparameters": {"nu": nu},
+                    "action_range": "unit",
+                }
+                for nu in (0.0, 0.1, 0.25, 0.5, 1.0)
+                for learner in ("bc", "iql")
+            ],
+            "seeds": 10,
+            "steps": 20_000,
+            "evaluations": 20,
+            "evaluation_episodes": 10,
+        }
+    )
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+def sme(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, ["study", *map(str, arguments)])
+
+
+def good(*arguments: str | Path) -> str:
+    result = sme(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refused(*arguments: str | Path) -> str:
+    result = sme(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert len(result.stderr.splitlines()) == 1
+    return result.stderr
+
+
+class TestCatalogue:
+    def test_every_plan_is_made_by_a_command_that_is_written_down(self) -> None:
+        assert {file.name for file in catalogue.entries(StudyFile)} == {*MADE_BY, OFFLINE}
+
+    @pytest.mark.parametrize("name", MADE_BY)
+    def test_a_plan_is_what_its_command_writes(self, name: str) -> None:
+        file = catalogue.find(StudyFile, name)
+        path = f"{file.versioned_name}.json"
+        good("new", path, "--name", name, "--description", file.description, *MADE_BY[name])
+        assert file.description
+        assert Path(path).read_text() == (catalogue.spec_folder() / "studies" / path).read_text()
+
+    def test_the_offline_study_is_the_papers(self) -> None:
+        assert catalogue.find(StudyFile, OFFLINE).plan == offline_quality()
+
+    def test_the_papers_ablations_are_what_the_paper_did(self) -> None:
+        plan = ABLATIONS.plan
+        assert plan.classes == catalogue.find(SuiteFile, "paper-ablations").suite.classes
+        axes = {member.name.rsplit("-", 1)[0] for member in plan.classes[1:]}
+        assert axes == {"state_dim", "action_dim", "k", "r_min", "D", "complexity"}
+        assert plan.classes[0].name == "default"
+        assert [algorithm.uses for algorithm in plan.algorithms] == ["PPO", "TD3", "SAC"]
+        assert not any(algorithm.hyperparameters for algorithm in plan.algorithms)
+        assert (plan.seeds, plan.evaluations, plan.evaluation_episodes) == (10, 400, 5)
+        assert plan.protocol.states_per_region == 50_000
+        assert len({planned.cell.digest for planned in plan.cells}) == 26 * 3 * 10
+
+
+class TestScaled:
+    def test_budgets_replace_the_plans_and_leave_references_alone(self) -> None:
+        smoke = catalogue.find(StudyFile, "smoke")
+        cut = scaled(smoke, steps=100, steps_of={"TD3": 50}, seeds=1, evaluations=3)
+        steps = {planned.algorithm: planned.cell.steps for planned in cut.plan.cells}
+        assert steps == {"PPO": 100, "TD3": 50, "SAC": 100, "linear": 0}
+        assert {planned.cell.evaluations for planned in cut.plan.cells} == {3}
+        assert len(cut.plan.cells) == 3 * 4
+        assert (cut.name, cut.digest) == ("smoke-scaled", cut.plan.digest)
+        assert scaled(cut, seeds=2).name == "smoke-scaled"
+
+    def test_more_seeds_keep_every_cell_of_fewer(self) -> None:
+        few = {planned.cell.digest for planned in scaled(ABLATIONS, seeds=2).plan.cells}
+        many = {planned.cell.digest for planned in scaled(ABLATIONS, seeds=4).plan.cells}
+        assert few < many
+
+    def test_what_changes_nothing_is_the_same_plan(self) -> None:
+        assert scaled(ABLATIONS, steps=100_000, seeds=10) is ABLATIONS
+
+    def test_bad_budgets_are_refused(self) -> None:
+        with pytest.raises(UnknownNameError, match="Did you mean 'PPO'"):
+            scaled(ABLATIONS, steps_of={"PPo": 1})
+        with pytest.raises(SpecError, match=r"seeds=0: must be an integer in \[1"):
+            scaled(ABLATIONS, seeds=0)
+
+
+class TestSelected:
+    def test_any_pattern_of_a_kind_and_both_kinds(self) -> None:
+        found = selected(ABLATIONS.plan.cells, ["class=k-*", "class=default", "algorithm=[PT]*"])
+        assert {cell.class_name for cell in found} == {"k-5", "k-10", "k-25", "k-100", "default"}
+        assert {cell.algorithm for cell in found} == {"PPO", "TD3"}
+        assert len(found) == 5 * 2 * 10
+        assert selected(ABLATIONS.plan.cells) == ABLATIONS.plan.cells
+
+
+class TestEstimate:
+    @pytest.mark.parametrize(
+        ("jobs", "workers", "ends"),
+        [([], 2, 0), ([3], 4, 3), ([3, 3, 3], 1, 9), ([1, 5, 2, 2], 2, 5), ([4, 1, 1, 4], 2, 6)],
+    )
+    def test_a_job_begins_as_soon_as_somebody_is_free(
+        self, jobs: list[float], workers: int, ends: float
+    ) -> None:
+        assert makespan(jobs, workers) == ends
+
+    def test_without_results_it_is_between_a_quick_core_and_a_slow_one(self) -> None:
+        by_algorithm = {cell.algorithm: cell.cell for cell in ABLATIONS.plan.cells[:3]}
+        ppo, td3 = (Estimator().seconds(by_algorithm[name]) for name in ("PPO", "TD3"))
+        assert 60 < ppo.low < 80 < 130 < ppo.high < 180
+        assert 1200 < td3.low < 1250 < 2100 < td3.high < 2200
+
+    def test_a_deep_task_takes_longer_to_judge(self) -> None:
+        cells = {cell.class_name: cell.cell for cell in ABLATIONS.plan.cells}
+        low = {name: Estimator().seconds(cells[name]).low for name in ("default", "complexity-50")}
+        assert low["complexity-50"] > low["default"] + 10
+
+    def test_what_has_finished_replaces_the_table_for_its_algorithm_alone(self) -> None:
+        few, many = (small_file(1, evaluations=n).plan.cells[0].cell for n in (10, 20))
+        result = run_cell(few)
+        slow = result.model_copy(
+            update={"timing": result.timing.model_copy(update={"total": 60.0})}
+        )
+        estimator = Estimator([slow])
+        assert estimator.knows(many)
+        seconds = estimator.seconds(many)
+        assert seconds.low == seconds.high
+        assert 110 < seconds.low < 125  # twice the work, and the start
+        assert estimator.seconds(ABLATIONS.plan.cells[0].cell) == Estimator().seconds(
+            ABLATIONS.plan.cells[0].cell
+        )
+        estimator = Estimator([slow])
+        estimator.observe(slow, 600.0)  # by the clock, on cores that are shared
+        assert estimator.seconds(many).low > 500
+
+
+class TestCommands:
+    @pytest.mark.parametrize("command", ["new", "plan", "run", "status"])
+    def test_the_help_has_examples(self, command: str) -> None:
+        text = good(command, "--help")
+        assert "Examples:" in text
+        assert text.count(f"sme study {command}") >= 3
+
+    def test_a_plan_says_what_it_takes_before_anything_runs(self) -> None:
+        made = json.loads(good("plan", "paper-ablations", "--cores", "64", "-j", "2", "--json"))
+        assert (made["cells"], made["done"]) == (780, 0)
+        assert (len(made["classes"]), made["algorithms"]) == (26, ["PPO", "TD3", "SAC"])
+        seconds = {entry["cores"]: entry for entry in made["seconds"]}
+        assert list(seconds) == [1, 2, 64]
+        assert seconds[1]["low"] / 2 <= seconds[2]["low"] < seconds[1]["low"] * 0.51
+        assert seconds[64]["low"] < seconds[64]["high"] < seconds[1]["high"] / 50
+        text = good("plan", "paper-ablations", "--cores", "64", "-j", "2")
+        for words in (
+            "780 cells",
+            "a cluster, 64 cores",
+            "this machine, 2 at once",
+            "260",
+            "k-100",
+        ):
+            assert words in text
+        assert "From a table of costs, not from results: PPO, SAC, TD3" in text
+
+    def test_the_plans_of_the_catalogue_are_listed(self) -> None:
+        names = [entry["name"] for entry in json.loads(good("plan", "--json"))]
+        assert names == catalogue.names(StudyFile)
+        assert all(name in good("plan") for name in names)
+
+    def test_scales_and_selections_mean_the_same_to_plan_run_and_status(
+        self, tmp_path: Path
+    ) -> None:
+        small_file(seeds=4, algorithms=["optimal", "constant"]).write(tmp_path / "p.json")
+        cut = ("--seeds", "3", "--only", "algorithm=opt*")
+        assert json.loads(good("plan", "p.json", *cut, "--json"))["cells"] == 3
+        options = ("-f", "s", "--executor", "in-process", "--json")
+        ran = json.loads(good("run", "p.json", *cut, *options))
+        assert (ran["study"], ran["cells"], ran["done"]) == ("small-scaled-v1", 3, 3)
+        found = json.loads(good("status", "s", "--json"))
+        assert (found["cells"], found["done"], found["waiting"]) == (6, 3, 3)
+        only = ("--only", "algorithm=opt*")
+        found = json.loads(good("status", "s", "--seeds", "4", *only, "--json"))
+        assert (found["cells"], found["done"], found["waiting"]) == (4, 3, 1)
+        planned = json.loads(good("plan", "p.json", *only, "--folder", "s", "--json"))
+        assert (planned["cells"], planned["done"]) == (4, 3)
+        assert planned["estimated_from_results"] == ["reference:optimal"]
+
+    def test_status_shows_what_is_done_what_failed_and_what_is_left(self, tmp_path: Path) -> None:
+        file = small_file(seeds=3)
+        run_study(file, tmp_path / "s", executor="in-process", run=raising, progress=False)
+        text = good("status", "s")
+        for words in ("2 !1 / 3", "3 cells: 2 done, 1 failed", "ValueError: this one is broken"):
+            assert words in text
+        text = good("status", "s", "--seeds", "5")
+        assert "of one core" in text
+
+    def test_a_new_plan_has_what_was_asked_for(self) -> None:
+        options = ("--action-range", "unit", "--action-range", "symmetric", "--seeds", "4")
+        algorithms = ("-a", "PPO", "-a", "TQC=sb3_contrib:TQC", "-a", "reference:random")
+        good("new", "mine.json", "-t", "Default", "--suite", "smoke", *algorithms, *options)
+        plan = StudyFile.read("mine.json").plan
+        assert [member.name for member in plan.classes] == [
+            "default", "complexity10", "plane10", "Default",
+        ]  # fmt: skip
+        assert [algorithm.name for algorithm in plan.algorithms] == [
+            f"{name} ({where})"
+            for name in ("PPO", "TQC", "random")
+            for where in ("unit", "symmetric")
+        ]
+        assert plan.algorithms[2] == StudyAlgorithm(
+            name="TQC (unit)", uses="sb3_contrib:TQC", action_range="unit"
+        )
+        assert plan.algorithms[5].steps == 0
+        assert plan.seeds == 4
+        assert "--force" in refused("new", "mine.json", "-t", "Default", "-a", "PPO")
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (("plan", "smoek"), "Did you mean 'smoke"),
+            (("plan", "missing.json"), "cannot be read"),
+            (("plan", "smoke", "--steps", "many"), "--steps 'many'"),
+            (("plan", "smoke", "--steps", "5", "--steps", "6"), "given twice"),
+            (("plan", "smoke", "--steps", "PP=6"), "Did you mean 'PPO'"),
+            (("plan", "smoke", "--only", "class=defalt"), "Did you mean 'default'"),
+            (("plan", "smoke", "--seeds", "0"), "seeds=0"),
+            (
+                ("run", "smoke", "-f", "s", "--ray", "local", "--executor", "processes"),
+                "--ray local",
+            ),
+            (("run", "smoke", "-f", "s", "--jobs", "0"), "--jobs"),
+            (("run", "smoke"), "--folder"),
+            (("status", "nowhere"), "holds no study"),
+            (("new", "x", "-t", "Default", "-a", "PPO"), "must end in .json"),
+            (("new", "x.json", "-a", "PPO"), "--suite"),
+            (("new", "x.json", "-t", "Default"), "--algorithm"),
+            (("new", "x.json", "-t", "Default", "-a", "PPO", "-a", "PPO"), "given twice"),
+            (("new", "x.json", "-t", "Default", "-a", "PPO", "--seeds", "0"), "seeds=0"),
+        ],
+    )
+    def test_bad_input_is_one_line_and_writes_nothing(
+        self, arguments: tuple[str, ...], words: str, tmp_path: Path
+    ) -> None:
+        assert words in refused(*arguments)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_with_a_changed_digest_is_refused(tmp_path: Path) -> None:
+    plain: dict[str, Any] = small_file().plain()
+    plain["plan"]["seeds"] = 3
+    (tmp_path / "p.json").write_text(json.dumps(plain))
+    assert "digest=" in refused("plan", "p.json")
+
+
+def test_a_plan_is_a_document_whose_digest_ignores_names_outside_it() -> None:
+    plan = small_file().plan
+    assert StudyPlan.parse(json.loads(json.dumps(plan.plain()))).digest == plan.digest
+    with pytest.raises(OptionError, match="class=GLOB"):
+        selected(plan.cells, ["constant"])
