@@ -36,8 +36,11 @@ cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_
 lost = cluster.add_node(num_cpus=2)
 
 def lose():
-    cells.wait_for(lambda: sum(cells.starts(notes).values()) == 3, seconds=200)
+    cells.wait_for(lambda: len(cells.pids(notes)) == 3, seconds=200)
+    workers = cells.pids(notes)
     cluster.remove_node(lost, allow_graceful=False)
+    # A worker outlives its node for a moment, in which it could still end its cell.
+    cells.wait_for(lambda: sum(map(cells.alive, workers)) == 1, seconds=100)
     (notes / cells.GATE).touch()
 
 losing = threading.Thread(target=lose)
