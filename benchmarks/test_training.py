@@ -10,9 +10,9 @@ import pytest
 
 import sme_registry
 from sme_registry import SMESpec, materialize
+from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.training.actor import actor
 from sme_registry.training.algorithms import one_thread
-from sme_registry.training.rollouts import rollouts, start_states
 
 sb3 = pytest.importorskip("stable_baselines3")
 

@@ -30,6 +30,8 @@ from sme_registry.envs.batch import Batch, Observation
 from sme_registry.envs.options import initial_states
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.rollouts import LANES
+from sme_registry.evaluation.rollouts import rollouts as roll_out
 from sme_registry.spec import SMESpec
 from sme_registry.spec.document import plain_number
 from sme_registry.spec.resolve import resolve
@@ -37,7 +39,6 @@ from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 
 CONFIDENCE = 0.95
-_LANES = 4096
 _ROUNDED = 1e-6  # of r_cum, which an observation holds as float32
 
 Steps = npt.NDArray[np.int64]
@@ -130,15 +131,17 @@ def exact_return(
     where, first = _positions(resolved, states, t, r_cum, actions)
     if rollouts == 1:
         _refuse_random(asked, task, where)
-    totals = np.stack(
-        [roll_out(task, asked, *where, actions=first, gamma=gamma) for _ in range(rollouts)]
-    )
-    undiscounted, discounted, lengths, similarities, _ = np.moveaxis(totals, 1, 0)
+    states, t, r_cum = where
+    done = [
+        roll_out(asked, task, states, t=t, r_cum=r_cum, actions=first, gamma=gamma)
+        for _ in range(rollouts)
+    ]
+    lengths = np.stack([each.length for each in done])
     return ExactReturn(
-        _interval(undiscounted),
-        _interval(discounted),
+        _interval(np.stack([each.episode_return for each in done])),
+        _interval(np.stack([each.discounted_return for each in done])),
         lengths.mean(axis=0),
-        similarities.sum(axis=0) / lengths.sum(axis=0),
+        np.average([each.similarity for each in done], axis=0, weights=lengths),
         gamma,
         rollouts,
     )
@@ -166,57 +169,6 @@ def positions(
     t = np.rint(seen[:, S] * spec.horizon).astype(np.int64)
     r_cum = np.minimum(seen[:, S + 1] * spec.k, t % spec.k)
     return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
-
-
-def roll_out(
-    task: Task,
-    act: Act,
-    states: Array,
-    t: Steps | None = None,
-    r_cum: Array | None = None,
-    *,
-    actions: Array | None = None,
-    gamma: float = 1.0,
-) -> Array:
-    """One episode to its end from each state, thousands side by side.
-
-    Args:
-      task: the task, of a single agent.
-      act: from observations `[B, S + 2]` to actions `[B, A]` of the unit range; clipped. It is
-        asked for episodes that have ended, too, until the last beside them has.
-      states: `[M, S]`.
-      t: `[M]` steps completed; None for 0.
-      r_cum: `[M]`; None for 0.
-      actions: `[M, A]` of the first step; None for the policy's.
-      gamma: γ.
-
-    Returns:
-      `[5, M]`: the sum of rewards, the same discounted, the steps, the sum of r̃, and of r̃².
-    """
-    M = len(states)
-    t = np.zeros(M, np.int64) if t is None else t
-    r_cum = np.zeros(M) if r_cum is None else r_cum
-    totals = np.empty((5, M))
-    # Neighbours end together, so that few lanes wait for the last of theirs.
-    order = np.argsort(t, kind="stable")
-    for begin in range(0, M, _LANES):
-        lanes = order[begin : begin + _LANES]
-        batch = Batch(task, len(lanes), reuse=True)
-        batch.place(states[lanes], t[lanes], r_cum[lanes, None])
-        observation = batch.observe()
-        sums, running, weight = np.zeros((5, len(lanes))), np.ones(len(lanes)), 1.0
-        chosen = None if actions is None else actions[lanes]
-        while running.any():
-            taken = act(observation.copy()) if chosen is None else chosen
-            given = batch.advance(np.asarray(taken, np.float64))
-            similarity, _, _, reward, _ = given.values[:, 0]
-            ones, squares = np.ones_like(reward), similarity**2
-            sums += running * np.stack([reward, weight * reward, ones, similarity, squares])
-            weight *= gamma
-            running[given.terminated | given.truncated] = 0.0
-            observation, chosen = given.observation, None
-        totals[:, lanes] = sums
-    return totals
 
 
 def _single(task: Task) -> Task:
@@ -291,8 +243,8 @@ def _number(name: str, value: Any, low: float, high: float, whole: bool = False)
 def _refuse_random(act: Act, task: Task, where: tuple[Array, Steps, Array]) -> None:
     """Raise where a policy answers the same observations differently."""
     states, t, r_cum = where
-    batch = Batch(task, min(len(states), _LANES))
-    batch.place(states[:_LANES], t[:_LANES], r_cum[:_LANES, None])
+    batch = Batch(task, min(len(states), LANES))
+    batch.place(states[:LANES], t[:LANES], r_cum[:LANES, None])
     if not np.array_equal(act(batch.observe()), act(batch.observe())):
         raise OptionError(
             "rollouts=1: the policy draws its actions, so one episode from a state is no exact "

@@ -24,7 +24,6 @@ import numpy as np
 from pydantic import Field
 
 from sme_registry.datasets import Dataset, Transitions, open_dataset
-from sme_registry.datasets.ground_truth import roll_out
 from sme_registry.errors import (
     DigestMismatchError,
     MissingDependencyError,
@@ -33,6 +32,7 @@ from sme_registry.errors import (
     SpecError,
 )
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.files import read_json, to_json, write_atomically
 from sme_registry.offline.hyperparameters import (
     BCHyperparameters,
@@ -371,17 +371,12 @@ def _live(
     step: int,
     losses: dict[str, float],
 ) -> LiveScore:
-    S = task.spec.state_dim
-    name = f"rollouts/{evaluation}/initial_state"
-    starts = streams.uniform(seed, name, episodes * S).reshape(episodes, S)
-    returns, _, lengths, similarities, squares = roll_out(task, policy, starts)
-    mean = float(similarities.sum() / lengths.sum())
-    variance = float(squares.sum() / lengths.sum()) - mean**2
+    done = rollouts(policy, task, start_states(seed, evaluation, episodes, task.spec.state_dim))
     return LiveScore(
         step=step,
-        similarity=mean,
-        similarity_sd=float(np.sqrt(max(0.0, variance))),
-        episode_return=float(returns.mean()),
+        similarity=done.per_step(done.similarity),
+        similarity_sd=done.similarity_sd,
+        episode_return=float(done.episode_return.mean()),
         losses=losses,
     )
 

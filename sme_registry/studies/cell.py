@@ -17,6 +17,7 @@ from pathlib import Path
 from sme_registry.errors import OptionError, PolicyError, SpecError
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.files import write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.algorithms import Learner, find_algorithm, new_learner, reference_name
@@ -26,7 +27,6 @@ from sme_registry.task import materialize
 from sme_registry.training.actor import actor
 from sme_registry.training.algorithms import one_thread, quiet
 from sme_registry.training.record import installed_versions
-from sme_registry.training.rollouts import rollouts, start_states
 
 Progress = Callable[[int, int], None]
 

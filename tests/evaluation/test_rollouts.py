@@ -15,9 +15,9 @@ import sme_registry
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.training.actor import Perceptron, actor
 from sme_registry.training.algorithms import one_thread
-from sme_registry.training.rollouts import rollouts, start_states
 
 PLAIN = SMESpec(state_dim=3, action_dim=2)
 # Payouts every 7 steps, a threshold, and an end at the first bad step.

@@ -1,0 +1,127 @@
+"""`rollouts`: whole episodes of a policy, thousands side by side, with their exact regret.
+
+The same scores as `stable_baselines3.common.evaluation.evaluate_policy` gives on single
+environments that begin in the same states, at the price of one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.envs.batch import Array, Batch, Observation
+from sme_registry.envs.options import initial_states, single_agent
+from sme_registry.task import Task, streams
+
+LANES = 4096
+"""Episodes side by side at most, so that memory does not grow with their number."""
+
+
+class Rollouts(NamedTuple):
+    """Episodes that have ended, `[n]` each.
+
+    Attributes:
+      episode_return: the sum of an episode's rewards, in [0, T].
+      discounted_return: the same, the i-th reward by γ^i.
+      length: its steps, in [1, T].
+      mean_regret: mean of 1 − step reward over its steps, in [0, 1].
+      similarity: mean r̃ over its steps, in [0, 1].
+      similarity_square: mean r̃² over its steps, in [0, 1].
+    """
+
+    episode_return: Array
+    discounted_return: Array
+    length: Array
+    mean_regret: Array
+    similarity: Array
+    similarity_square: Array
+
+    def per_step(self, values: Array) -> float:
+        """The mean over all steps of all episodes of what is given as each episode's mean."""
+        return float(np.average(values, weights=self.length))
+
+    @property
+    def similarity_sd(self) -> float:
+        """The standard deviation of r̃ over all steps of all episodes."""
+        variance = self.per_step(self.similarity_square) - self.per_step(self.similarity) ** 2
+        return float(np.sqrt(max(0.0, variance)))
+
+
+def start_states(seed: int, evaluation: int, episodes: int, state_dim: int) -> Array:
+    """Where the episodes of an evaluation begin: new ones each time, from a stream of their own.
+
+    A function of its arguments alone, so two algorithms that are trained with the same seed are
+    evaluated from the same states, and evaluating moves no other random stream.
+
+    Args:
+      seed: of the run.
+      evaluation: its number, from 0.
+      episodes: n.
+      state_dim: S.
+
+    Returns:
+      `[n, S]` uniform in (0, 1).
+    """
+    stream = f"rollouts/{evaluation}/initial_state"
+    return streams.uniform(seed, stream, episodes * state_dim).reshape(episodes, state_dim)
+
+
+def rollouts(
+    policy: Callable[[Observation], Any],
+    task: Task,
+    states: Array,
+    *,
+    t: npt.NDArray[np.int64] | None = None,
+    r_cum: Array | None = None,
+    actions: Array | None = None,
+    gamma: float = 1.0,
+) -> Rollouts:
+    """An episode from each of the states, to its end.
+
+    Args:
+      policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, which are
+        clipped to it; B is at most `LANES`. It is asked for episodes that have ended too, until
+        the last beside them has.
+      task: the task, of a single agent.
+      states: `[n, S]` in [0, 1].
+      t: `[n]` steps completed there, in [0, T); None for 0, where an episode begins.
+      r_cum: `[n]` the rewards since the last payout; None for 0.
+      actions: `[n, A]` of the first step, in place of the policy's; None for the policy's.
+      gamma: γ of the discounted return, in [0, 1].
+
+    Raises:
+      SpecError: the task is a team's.
+      StateError: states of another shape, or outside the cube.
+      ActionError: actions of another shape, or not finite.
+    """
+    task = single_agent(task)
+    n = len(states)
+    states = initial_states(states, (n, task.spec.state_dim))
+    t = np.zeros(n, np.int64) if t is None else t
+    r_cum = np.zeros(n) if r_cum is None else r_cum
+    totals = np.empty((6, n))
+    # Neighbours end together, so that few lanes wait for the last of theirs.
+    order = np.argsort(t, kind="stable")
+    for begin in range(0, n, LANES):
+        lanes = order[begin : begin + LANES]
+        batch = Batch(task, len(lanes), reuse=True)
+        batch.place(states[lanes], t[lanes], r_cum[lanes, None])
+        observation = batch.observe()
+        sums, running, weight = np.zeros((6, len(lanes))), np.ones(len(lanes)), 1.0
+        first = None if actions is None else actions[lanes]
+        while running.any():
+            taken = policy(observation.copy()) if first is None else first
+            done = batch.advance(np.asarray(taken, np.float64))
+            similarity, _, regret, reward, _ = done.values[:, 0]
+            step = (reward, weight * reward, 1.0, regret, similarity, similarity**2)
+            for total, value in zip(sums, step, strict=True):
+                total += running * value
+            weight *= gamma
+            running[done.terminated | done.truncated] = 0.0
+            observation, first = done.observation, None
+        totals[:, lanes] = sums
+    paid, discounted, length, *means = totals
+    return Rollouts(paid, discounted, length, *(total / length for total in means))
