@@ -22,7 +22,6 @@ from leaderboard.result import Result
 from leaderboard.scoring import evaluation_seed, result_of, score_submission
 from leaderboard.statistics import run_metrics
 from leaderboard.store import (
-    TEMPORARY,
     Index,
     IndexUnusable,
     Log,
@@ -34,6 +33,7 @@ from leaderboard.store import (
 )
 from leaderboard.submission import SignedSubmission, SignedWithdrawal
 from sme_registry.errors import OptionError
+from sme_registry.files import TEMPORARY
 
 Progress = Callable[[int, int], None]
 

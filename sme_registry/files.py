@@ -1,7 +1,8 @@
 """Reading strict JSON, importing what a file names, and writes that are whole or absent.
 
-Every file this package writes goes through `write_atomically`: into a temporary file beside
-the target, then renamed over it. A killed process leaves the old file, never half a new one.
+Every file this package writes goes through `whole`, most by `write_atomically`: into a temporary
+file beside the target, then renamed over it. A killed process leaves the old file, never half a new
+one, and at most a temporary file that `TEMPORARY` matches.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import json
 import os
 import secrets
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 from sme_registry.errors import MalformedDocumentError, OptionError, SMEError, did_you_mean
 
 MAX_DOCUMENT_BYTES = 64 * 2**20
+TEMPORARY = ".*.tmp*"  # the star at the end: SQLite's own files beside one of ours
 
 
 def parse_json(text: str | bytes, source: str = "document") -> Any:
@@ -117,6 +120,40 @@ def imported(name: str, field: str, error: type[SMEError]) -> Any:
         sys.path.remove(folder)
 
 
+def temporary_beside(path: Path) -> Path:
+    """A new name beside `path`, in its file system, that `TEMPORARY` matches."""
+    return path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.tmp")
+
+
+@contextlib.contextmanager
+def whole(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
+    """A stream whose bytes become `path` when the block ends well, and nothing otherwise.
+
+    Args:
+      path: the target, in a folder that is there.
+      new: link instead of rename, so that an existing file is never replaced.
+
+    Raises:
+      OSError: the disk is full, the folder cannot be written to, or (`new`) the name is taken;
+        what stood there is untouched.
+    """
+    temporary = temporary_beside(path)
+    try:
+        # Not mkstemp, whose 0600 would hide results from colleagues; the umask is the user's.
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        with os.fdopen(handle, "wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        if new:
+            os.link(temporary, path)
+        else:
+            os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            os.unlink(temporary)
+
+
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
     """Write a file whole or not at all; the folder is made where it is missing.
 
@@ -131,28 +168,16 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
       OptionError: the folder cannot be made or written to; what stood there is untouched.
     """
     path = Path(path)
-    temporary: str | None = None
     try:
         data = content.encode("utf-8") if isinstance(content, str) else content
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = str(path.parent / f".{path.name[:64]}.{secrets.token_hex(8)}")
-        # Not mkstemp, whose 0600 would hide results from colleagues; the umask is the user's.
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        with os.fdopen(handle, "wb") as stream:
+        with whole(path) as stream:
             stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        temporary = None
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
         reason = getattr(error, "strerror", None) or str(error)
         raise OptionError(
             f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
         ) from None
-    finally:
-        if temporary is not None:
-            with contextlib.suppress(OSError, ValueError):
-                os.unlink(temporary)
     return path
 
 

@@ -6,7 +6,6 @@ state from which the next one goes on.
 """
 
 from leaderboard.store.documents import digest_of, read_document
-from leaderboard.store.files import TEMPORARY
 from leaderboard.store.index import EntryRow, Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
@@ -14,7 +13,6 @@ from leaderboard.store.store import Claim, Garbage, Store
 
 __all__ = [
     "EMPTY",
-    "TEMPORARY",
     "Claim",
     "EntryRow",
     "Garbage",

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: a temporary one beside, fsync, then rename or link, then fsync.
+"""Files that are whole or absent, and durable: the folder that names them is synced, too.
 
 A process that is killed leaves at most a temporary file, `.name.xxxxxxxx.tmp`, which `gc` removes.
 """
@@ -7,48 +7,30 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from leaderboard.errors import BoardError
-
-TEMPORARY = ".*.tmp*"  # the star at the end: SQLite's own files beside one of ours
-
-
-def temporary_beside(path: Path) -> Path:
-    """A new name beside `path`, in its file system, that `TEMPORARY` matches."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+from sme_registry import files
 
 
 @contextlib.contextmanager
 def whole(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """A stream whose bytes become `path` when the block ends well, and nothing otherwise.
+    """`sme_registry.files.whole`, such that the file is still there after a loss of power.
 
     Args:
       path: the target; its folder is made where it is missing.
-      new: link instead of rename, so that an existing file is never replaced.
+      new: never replace an existing file.
 
     Raises:
       BoardError: the disk is full, the folder cannot be written to, or (`new`) the name is taken.
     """
-    temporary = temporary_beside(path)
     try:
         make_folder(path.parent)
-        try:
-            with open(temporary, "xb") as stream:
-                os.fchmod(stream.fileno(), 0o644)
-                yield stream
-                stream.flush()
-                os.fsync(stream.fileno())
-            if new:
-                os.link(temporary, path)
-            else:
-                os.replace(temporary, path)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
+        with files.whole(path, new=new) as stream:
+            os.fchmod(stream.fileno(), 0o644)
+            yield stream
         sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error

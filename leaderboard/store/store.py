@@ -30,6 +30,7 @@ from leaderboard.store.log import EMPTY, Event, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.submission import SignedSubmission, SignedWithdrawal, now, utc
 from sme_registry.errors import UnknownNameError
+from sme_registry.files import TEMPORARY, temporary_beside
 from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
 
 LEASE_SECONDS = 60.0
@@ -145,7 +146,7 @@ class Store:
             )
         path = Path(path)
         # Made beside and renamed, so that no folder ever holds half a board.
-        making = Folder(files.temporary_beside(path.absolute()))
+        making = Folder(temporary_beside(path.absolute()))
         try:
             for folder in (making.log, making.submissions, making.withdrawals, making.results):
                 files.make_folder(folder)
@@ -547,7 +548,7 @@ class Store:
         with self.turn() as index:
             temporary = [
                 path
-                for path in self.folder.path.rglob(files.TEMPORARY)
+                for path in self.folder.path.rglob(TEMPORARY)
                 if path.is_file() and path.stat().st_mtime <= at - temporary_older_than
             ]
             objects = [
@@ -715,7 +716,7 @@ class Store:
     def _rebuild(self) -> None:
         """A new index from the log, put in the old one's place; the board is locked meanwhile."""
         path = self.folder.index
-        making = files.temporary_beside(path)
+        making = temporary_beside(path)
         with self._sqlite_explained():
             try:
                 index = Index.empty(making, self.folder, self.document)
