@@ -28,6 +28,7 @@ from leaderboard.scoring import score_submission
 from leaderboard.store import Claim, Store
 from leaderboard.store.store import LEASE_SECONDS
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
+from sme_registry.terminal.interrupts import hear, starting_deaf, uninterrupted
 
 Progress = Callable[[int, int], None]
 
@@ -176,7 +177,8 @@ def run_scorers(
                     not until_empty or (len(alive) < left and store.claimable())
                 ):
                     name = worker_name()
-                    alive[name] = _start(path, name, until_empty, lease_seconds)
+                    with uninterrupted(), starting_deaf():  # or it would be nobody's
+                        alive[name] = _start(path, name, until_empty, lease_seconds)
                     if started is not None:
                         started(alive[name].process.pid or 0)
                 connection.wait([each.process.sentinel for each in alive.values()], _LOOK_SECONDS)
@@ -230,6 +232,7 @@ def _scorer_process(
     signal.signal(signal.SIGINT, interrupted)
     parent = multiprocessing.parent_process()
     try:
+        hear()
         run_scorer(
             path,
             worker=worker,

@@ -44,6 +44,7 @@ from leaderboard.site import Pages, content_type
 from leaderboard.store import Store
 from leaderboard.submission import MAX_BYTES, SignedSubmission
 from sme_registry.errors import MissingDependencyError, SMEError
+from sme_registry.terminal.interrupts import hear, starting_deaf
 
 try:
     from fastapi import FastAPI, Request
@@ -657,7 +658,8 @@ def _scorers(path: str, workers: int) -> Iterator[None]:
     process = multiprocessing.get_context("spawn").Process(
         target=_mind_scorers, args=(path, workers), name="scorers"
     )
-    process.start()
+    with starting_deaf():
+        process.start()
     try:
         yield
     finally:
@@ -681,6 +683,7 @@ def _mind_scorers(path: str, workers: int) -> None:
     threading.Thread(target=_end_with_parent, name="end with the server", daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt):
         try:
+            hear()
             run_scorers(path, workers, until_empty=False)
         except SMEError as error:
             _log.error("no more scoring here: %s", error)

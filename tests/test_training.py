@@ -28,8 +28,9 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
+from sme_registry.terminal.interrupts import uninterrupted
 from sme_registry.terminal.progress import Meter, duration
-from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, checkpoint, train
+from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, train
 from sme_registry.training.algorithms import known_algorithm
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
 
@@ -275,7 +276,7 @@ def test_an_interrupt_waits_until_what_is_being_saved_is_written() -> None:
     written, before = [], signal.getsignal(signal.SIGINT)
 
     def save() -> None:
-        with checkpoint.uninterrupted():
+        with uninterrupted():
             signal.raise_signal(signal.SIGINT)
             written.append("checkpoint and record")
 

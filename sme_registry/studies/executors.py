@@ -23,7 +23,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing import connection, resource_tracker
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -32,7 +32,7 @@ from sme_registry.files import parse_json, to_json
 from sme_registry.spec import Cell
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.result import CellFailure, CellResult
-from sme_registry.training.checkpoint import uninterrupted
+from sme_registry.terminal.interrupts import starting_deaf, uninterrupted
 from sme_registry.training.record import installed_versions
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -230,7 +230,7 @@ class _Job:
         ours, theirs = spawn.Pipe(duplex=False)
         log = scratch / f"{cell.digest.removeprefix('sha256:')}.log"
         process = spawn.Process(target=_child, args=(theirs, run, cell, keep_model, log))
-        with _one_thread(), _no_interrupt():
+        with _one_thread(), starting_deaf():
             process.start()
         theirs.close()  # so that the pipe ends when the process does
         return cls(cell, process, ours, log)
@@ -306,17 +306,6 @@ def _one_thread() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Children started inside are deaf to Ctrl-C from their first instruction on."""
-    resource_tracker.ensure_running()  # which would lift the block
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class OnRay:

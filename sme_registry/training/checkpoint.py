@@ -6,12 +6,8 @@ In two files a kill between them would pair a model with another model's buffer.
 
 from __future__ import annotations
 
-import contextlib
 import io
-import signal
-import threading
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,24 +38,6 @@ def save(model: Any, path: Path) -> None:
         with zipfile.ZipFile(archive, "a") as members:
             members.writestr(_MEMBER, replay.getvalue())
     write_atomically(path, archive.getvalue())
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """An interrupt (Ctrl-C) waits until the block is done, so that what it writes agrees.
-
-    And inside `torch.save` it would turn into an error of PyTorch's about a broken archive.
-    """
-    pressed: list[int] = []
-    handled = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, lambda *_: pressed.append(1)) if handled else None
-    try:
-        yield
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
-    if pressed:
-        signal.raise_signal(signal.SIGINT)
 
 
 def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:

@@ -30,6 +30,7 @@ from sme_registry.files import write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
+from sme_registry.terminal.interrupts import uninterrupted
 from sme_registry.terminal.progress import Meter
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
@@ -277,7 +278,7 @@ def _learn(
     wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
 
     def save_checkpoint(steps_done: int) -> None:
-        with checkpoint.uninterrupted():
+        with uninterrupted():
             checkpoint.save(model, path)
             record.updated(**_so_far(steps_done, log, callback)).write(folder)
 
@@ -306,7 +307,7 @@ def _learn(
     steps_done = int(model.num_timesteps) // record.agents
     record = record.updated(**_so_far(steps_done, log, callback))
     saved = io.BytesIO()
-    with checkpoint.uninterrupted():
+    with uninterrupted():
         model.save(saved)
         write_atomically(folder / MODEL, saved.getvalue())
         record.write(folder)
