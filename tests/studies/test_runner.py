@@ -217,7 +217,7 @@ def test_two_runs_on_one_folder_share_the_cells_and_each_is_run_once(
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(study: Path, tmp_path: Path) -> None:
     plan = tmp_path / "plan.json"
     small_file(algorithms=("constant",), evaluations=100_000, evaluation_episodes=100).write(plan)
-    command = [*SME, "study", "run", str(plan), "--folder", str(study)]
+    command = [*SME, "study", "run", str(plan), "--folder", str(study), "--jobs", "2"]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:

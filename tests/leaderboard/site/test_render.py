@@ -464,9 +464,12 @@ def test_a_thousand_entries_take_little_time(board, tmp_path, record_property, m
             quick.setattr(os, "fsync", lambda _: None)
             for index in range(30):
                 boards.submit(many, key, f"method {index}", [0.1 + index / 100] * 6)
-        start = time.process_time()
-        write_site(many, tmp_path / "site")
-        each = (time.process_time() - start) / 32
+        taken = []
+        for attempt in range(3):
+            start = time.process_time()
+            write_site(many, tmp_path / f"site {attempt}")
+            taken.append((time.process_time() - start) / 32)
+        each = min(taken)
     board_ms, site_s = 1e3 * sorted(times)[8], 1000 * each
     print(f"\nboard of 1,000 entries: {board_ms:.0f} ms; site of 1,000 × 30 runs: {site_s:.1f} s")
     assert board_ms < 200
