@@ -333,6 +333,27 @@ def test_one_changed_axis_decides_its_cause_and_two_decide_nothing() -> None:
     assert found.finding("credit assignment").answer == "cannot tell"
 
 
+def test_beside_a_run_that_has_not_learnt_either_an_axis_is_not_cleared() -> None:
+    def credit(policy: Any, other: Any, k: int = 100) -> tuple[str, str]:
+        here, there = SPEC.derive(k=k, horizon=100), SPEC.derive(k=101 - k, horizon=100)
+        found = diagnose(
+            of_policy(policy, here), against=of_policy(other, there), states=256, episodes=8
+        ).finding("credit assignment")
+        return found.answer, found.text
+
+    nothing, little = reference_policy("constant", SPEC), shrunk
+    answer, text = credit(nothing, nothing)
+    assert answer == "cannot tell"
+    assert "Only k differs" in text
+    assert "has learnt next to nothing itself (ν from 0.9)" in text
+    assert "train both longer" in text
+    # Any of these decides: the run itself has learnt, the other has, k = 1 needs no other run.
+    assert credit(little, nothing)[0] == "no"
+    assert credit(little, little)[0] == "no"
+    assert credit(nothing, little)[0] == "yes"
+    assert credit(nothing, nothing, k=1) == ("no", "k = 1: every action is paid for itself.")
+
+
 def test_what_cannot_be_diagnosed_is_refused_in_a_sentence(tmp_path: Path) -> None:
     team = SMESpec(team={"agents": [{"action_dim": 2}, {"action_dim": 2}], "reward": "team"})
     with pytest.raises(SpecError, match="one agent"):

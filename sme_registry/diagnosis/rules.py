@@ -23,7 +23,7 @@ from sme_registry.spec import SMESpec
 THRESHOLDS = {
     "solved": 0.1,  # ν at most: nothing is left to explain
     "like_constant": 0.95,  # ν at least: no better than the constant ½
-    "channel_unlearnt": 0.9,  # ν of a channel at least
+    "unlearnt": 0.9,  # ν of a channel, or of the run beside this one, at least
     "channel_learnt": 0.6,  # ν of a channel at most
     "excess_saturation": 0.2,  # share of entries at a bound beyond the optimum's
     "share_of_squared_error": 0.5,  # of one form, for it to be the form
@@ -73,7 +73,9 @@ def findings(
             if kind == "why" and case.solved:
                 said: _Said = "no", _NOTHING.format(numbers.own.normalised, _T["solved"])
             else:
-                said = _by_comparison(case, question) or rule(case)
+                # The first that decides; where none does, the first, which knows the most.
+                answers = [a for a in (_by_comparison(case, question), rule(case)) if a is not None]
+                said = next((a for a in answers if a[0] != "cannot tell"), answers[0])
             found.append(
                 Finding(question=question, kind=kind, answer=said[0], text=said[1])  # type: ignore[arg-type]
             )
@@ -116,11 +118,11 @@ def headline(numbers: Numbers, found: tuple[Finding, ...]) -> str:
 
 def _channels(case: _Case) -> _Said:
     channels = case.numbers.channels
-    bad = [c for c in channels if c.normalised >= _T["channel_unlearnt"]]
+    bad = [c for c in channels if c.normalised >= _T["unlearnt"]]
     good = [c for c in channels if c.normalised <= _T["channel_learnt"]]
     worst = max(channels, key=lambda c: c.normalised)
     best = min(channels, key=lambda c: c.normalised)
-    limits = f"unlearnt from {_T['channel_unlearnt']:g}, learnt to {_T['channel_learnt']:g}"
+    limits = f"unlearnt from {_T['unlearnt']:g}, learnt to {_T['channel_learnt']:g}"
     if bad and good:
         names = ", ".join(f"{c.channel} (ν {c.normalised:.2f}, slope {c.slope:.2f})" for c in bad)
         share = sum(c.regret for c in bad) / max(case.numbers.own.regret, 1e-12)
@@ -396,9 +398,9 @@ def _dimension(case: _Case) -> _Said:
         if probe.held_out <= _T["probe_far_better"] * own:
             return "no", f"{told}: as many states as the training had steps are enough."
     channels = case.numbers.channels
-    bad = sum(c.normalised >= _T["channel_unlearnt"] for c in channels)
+    bad = sum(c.normalised >= _T["unlearnt"] for c in channels)
     return "cannot tell", (
-        f"{size}; {bad} of {len(channels)} action channels have ν from {_T['channel_unlearnt']:g}, "
+        f"{size}; {bad} of {len(channels)} action channels have ν from {_T['unlearnt']:g}, "
         f"and random actions are paid in {random.paid:.1%} of steps. Give --against a run with a "
         "smaller state_dim or action_dim, or --probe-capacity."
     )
@@ -532,4 +534,9 @@ def _by_comparison(case: _Case, question: str) -> _Said | None:
         f"here and {nu.there:.2f} there (it counts from {_T['difference']:g}). This is one run "
         "against one: another seed could move it as far, and a study gives the interval."
     )
+    if abs(nu.here - nu.there) < _T["difference"] and nu.there >= _T["unlearnt"]:
+        return "cannot tell", (
+            f"{text} The run beside it has learnt next to nothing itself (ν from "
+            f"{_T['unlearnt']:g}), so there was nothing to lose: train both longer."
+        )
     return _yes_if(nu.here - nu.there >= _T["difference"], text)
