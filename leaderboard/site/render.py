@@ -25,14 +25,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from leaderboard import ranking, tables
-from leaderboard.board import hex_of
+from leaderboard.board import Folder, hex_of
 from leaderboard.errors import CODES
 from leaderboard.result import Estimate, Result, RunScore
 from leaderboard.site import charts
 from leaderboard.store import EntryRow, Store
 from leaderboard.store.files import write as write_whole
 from leaderboard.submission import Run, SignedSubmission, Submission
-from sme_registry.errors import MissingDependencyError
+from sme_registry.errors import MissingDependencyError, OptionError
 
 try:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -501,9 +501,11 @@ def write_site(
 
     Raises:
       NotPublishable: the reference rows are missing or leave 0 and 1; nothing is written.
+      OptionError: the folder is a board, or one of those that a board consists of.
       BoardError: a file cannot be written.
     """
     out = Path(out)
+    _refuse_board(out)
     pages = Pages(store)
     paths = list(pages.paths())
 
@@ -526,6 +528,21 @@ def write_site(
                 progress(done, len(paths))
         _settle(pending, 0)
     return out / "index.html"
+
+
+def _refuse_board(out: Path) -> None:
+    """Refuse a folder where pages would replace a board's files: a site has a board.json, too."""
+    target = out.resolve()
+    for above in (target, *target.parents):
+        board = Folder(above)
+        if not (board.key.exists() or (board.board.is_file() and board.log.is_dir())):
+            continue
+        own = (board.log, board.objects, board.results, board.submissions, board.withdrawals)
+        if target == above or any(target.is_relative_to(folder.resolve()) for folder in own):
+            raise OptionError(
+                f"out={str(out)!r}: is of the board {above}, whose files the pages would replace. "
+                f"Give another folder, such as {above / 'site'}."
+            )
 
 
 def content_type(path: str) -> str:

@@ -3,6 +3,7 @@ import json
 import os
 import posixpath
 import re
+import shutil
 import time
 from collections import Counter
 from html.parser import HTMLParser
@@ -16,6 +17,7 @@ from leaderboard.keys import SigningKey
 from leaderboard.site import STATIC, Pages, content_type, render, write_site
 from leaderboard.store import Store
 from leaderboard.submission import SignedWithdrawal, Withdrawal
+from sme_registry.errors import OptionError
 from tests.leaderboard.site import boards
 
 VOID = {"meta", "link", "input", "br", "img"}
@@ -378,6 +380,45 @@ def test_a_folder_that_cannot_be_written_to_is_an_error_that_says_so(board, tmp_
     (tmp_path / "site").write_text("a file")
     with pytest.raises(BoardError, match="cannot be written"):
         write_site(board[0], tmp_path / "site")
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        "board",
+        "link",
+        "board/site/..",
+        "board/log",
+        "board/objects/site",
+        "board/results",
+        "board/submissions",
+        "board/withdrawals/x",
+        "other",
+        "other/results",
+        "keyed",
+    ],
+)
+def test_pages_never_replace_a_boards_own_files(tmp_path, out):
+    (tmp_path / "link").symlink_to("board")
+    (tmp_path / "keyed").mkdir()
+    SigningKey.generate().write(tmp_path / "keyed" / "board.key")
+    with boards.create(tmp_path / "board", classes=1) as store:
+        shutil.copytree(store.folder.path, tmp_path / "other")
+        (tmp_path / "other" / "board.key").unlink()  # as one that is handed on
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
+        with pytest.raises(OptionError, match=r"is of the board .* another folder"):
+            write_site(store, tmp_path / out)
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
+        assert not list(tmp_path.rglob("*.html"))
+
+
+def test_pages_may_lie_in_a_board_and_beside_it(tmp_path):
+    with boards.create(tmp_path / "board", classes=1) as store:
+        for out in (tmp_path / "board" / "site", tmp_path):
+            for _ in range(2):  # the site's own board.json makes no board of its folder
+                assert write_site(store, out).is_file()
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert len(store.entries()) == 2
 
 
 def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
