@@ -9,7 +9,8 @@ Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the consta
     slope                    of N_m on ε_m, least squares over m = 0 … M
     points                   100 (r̃_WD − mean r̃_OOD), the paper's form
 
-A run that failed, or was started and not listed, scores 1 in every region.
+A run that failed, or was started and not listed, scores 1 in every region and every metric, that
+is 100 points: what nobody can look at is not taken to hold outside.
 """
 
 from __future__ import annotations

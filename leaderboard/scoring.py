@@ -139,7 +139,7 @@ def _score_runs(
     for index, run in enumerate(submission.runs):
         class_name, spec = instances[run.spec]
         if run.artefact is None:
-            runs.append(_failed(board, class_name, run.spec))
+            runs.append(failed_run(board, class_name, run.spec))
             continue
         digest = run.artefact.sha256
         if (run.spec, digest) not in scored:
@@ -193,7 +193,7 @@ def _never_listed(
             "Count the runs of this version of the method only.",
         )
     return [
-        _failed(board, name, None)
+        failed_run(board, name, None)
         for name, count in listed.items()
         for _ in range(started[name] - count)
     ]
@@ -252,8 +252,14 @@ def _run_score(
     )
 
 
-def _failed(board: BoardDocument, class_name: str, spec: str | None) -> RunScore:
-    """A run without a policy: as bad as the constant one everywhere."""
+def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunScore:
+    """A run without a policy scores 1 in every region and every metric.
+
+    Args:
+      board: whose protocol has the regions.
+      class_name: the suite's class that it was started in.
+      spec: digest of the instance; null where the run is not listed.
+    """
     regret = (1.0,) * len(board.protocol.edges)
     return RunScore(
         spec=spec,

@@ -29,10 +29,14 @@ def run_metrics(
       levels: ε_m, 0 for WD.
 
     Returns:
-      `wd`, `ood`, `decay` and `slope`, dimensionless, and `points`, in hundredths of r̃.
+      `wd`, `ood`, `decay` and `slope`, dimensionless, and `points`, in hundredths of r̃. Without
+      a policy each is 1 (100 points), whatever N_m: were D that of N_m = 1 everywhere, 0, it would
+      pay to leave out runs.
     """
-    N, offset = np.asarray(regret), np.asarray(levels) - np.mean(levels)
-    r = np.zeros(len(N)) if similarity is None else np.asarray(similarity)
+    if similarity is None:
+        return {"wd": 1.0, "ood": 1.0, "decay": 1.0, "slope": 1.0, "points": 100.0}
+    N, r = np.asarray(regret), np.asarray(similarity)
+    offset = np.asarray(levels) - np.mean(levels)
     wd, ood = float(N[0]), float(N[1:].mean())
     return {
         "wd": wd,

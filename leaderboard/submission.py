@@ -83,7 +83,7 @@ class Run(StrictModel):
       spec: digest of the instance.
       seed: of the training run.
       steps: environment steps taken.
-      artefact: the policy; null where the run failed, which then scores 1 in every region.
+      artefact: the policy; null where the run failed, which then scores 1 in every metric.
     """
 
     spec: Digest
@@ -112,7 +112,8 @@ class Submission(Document):
     Attributes:
       runs: at least one for each instance of the suite.
       runs_started: of each class by name, all runs ever started with this method; those that are
-        not listed in `runs` score 1, so that picking the best ones gains nothing.
+        not listed in `runs` score 1 in every metric, so that to leave one out gains nothing,
+        unless it was worse than that.
       created: when it was signed.
       code: a link to the method's code; null where there is none.
       statement: anything a reader should know.

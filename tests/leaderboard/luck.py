@@ -45,7 +45,8 @@ def gains(store: Store, submission: Submission, draws: int) -> dict[str, tuple[f
                 protocol = board.protocol.model_copy(update={"seed": seed})
                 report = evaluate(policy, spec, protocol, action_range="unit")
                 regret = [region.normalised_regret for region in report.regions]
-                metrics.append(run_metrics(regret, None, levels))
+                similarity = [region.similarity for region in report.regions]
+                metrics.append(run_metrics(regret, similarity, levels))
         found[name] = (gain(metrics, "wd"), gain(metrics, "ood"))
     return found
 

@@ -17,8 +17,15 @@ from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.board import BoardDocument
 from leaderboard.errors import BoardError
 from leaderboard.keys import SigningKey
-from leaderboard.result import METRICS, Estimate, Result, Scores
-from leaderboard.scoring import _oracle_like, evaluation_seed, score_submission
+from leaderboard.result import METRICS, Estimate, Result, RunScore, Scores
+from leaderboard.scoring import (
+    _oracle_like,
+    evaluation_seed,
+    failed_run,
+    result_of,
+    score_submission,
+)
+from leaderboard.statistics import run_metrics
 from leaderboard.submission import Submission
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
 from sme_registry.spec import Suite
@@ -182,9 +189,38 @@ def test_failed_and_unlisted_runs_score_one() -> None:
         if run.artefact is None:
             assert run.regret == (1.0,) * 6
             assert run.similarity is run.evaluation_seed is None
-            assert (run.wd, run.ood, run.decay, run.slope, run.points) == (1.0, 1.0, 0.0, 0.0, 0.0)
+            assert [getattr(run, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
     # Of four runs the best and the worst are cut, which leaves two that score 1.
     assert shallow.wd == 1.0
+
+
+def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
+    levels = [high for _, high in BOARD.protocol.edges]
+
+    def run(class_name: str, slope: float) -> RunScore:
+        regret = tuple(0.2 + slope * level for level in levels)
+        similarity = tuple(1.0 - 0.25 * N for N in regret)
+        return RunScore(
+            spec=SUITE.instances[0].digest,
+            class_name=class_name,
+            artefact=digest_of(LINEAR),
+            evaluation_seed=0,
+            regret=regret,
+            similarity=similarity,
+            **run_metrics(regret, similarity, levels),
+        )
+
+    slopes = [0.1 * number for number in range(1, 9)]
+    runs = [run(name, slope) for name in ("shallow", "deep") for slope in slopes]
+    withheld = [
+        run if run.slope < 0.45 else failed_run(BOARD, run.class_name, None) for run in runs
+    ]
+    honest, chosen = (result_of(BOARD, "sha256:" + "0" * 64, each, {}) for each in (runs, withheld))
+
+    assert honest.scores is not None
+    assert chosen.scores is not None
+    for metric in METRICS:
+        assert getattr(honest.scores, metric).value < getattr(chosen.scores, metric).value, metric
 
 
 def test_no_interval_of_a_regret_reaches_below_zero() -> None:

@@ -41,18 +41,24 @@ def test_metrics_of_a_run_are_those_written_out_by_hand() -> None:
 def test_slope_is_that_of_the_least_squares_line() -> None:
     regret = np.random.default_rng(1).random(6)
 
-    slope = run_metrics(tuple(regret), None, LEVELS)["slope"]
+    slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["slope"]
 
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
 
 @pytest.mark.parametrize("levels", [LEVELS, (0.0, 0.1, 0.3, 0.7)])
-def test_a_run_without_a_policy_has_no_decay_slope_or_points_at_all(
+def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
     levels: tuple[float, ...],
 ) -> None:
-    found = run_metrics((1.0,) * len(levels), None, levels)
+    found = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
 
     assert found == {"wd": 1.0, "ood": 1.0, "decay": 0.0, "slope": 0.0, "points": 0.0}
+
+
+def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
+    found = run_metrics((1.0,) * 6, None, LEVELS)
+
+    assert found == {"wd": 1.0, "ood": 1.0, "decay": 1.0, "slope": 1.0, "points": 100.0}
 
 
 # Over runs
