@@ -66,7 +66,8 @@ def run_scorer(
       How many results were written.
 
     Raises:
-      BoardError: the board cannot be written to, or an artefact of it is gone.
+      BoardError: the board cannot be written to, an artefact of it is gone, or a reference row
+        cannot be scored.
       TamperedError: a file of the board is not what its log says.
     """
     worker = worker_name() if worker is None else worker
@@ -96,9 +97,15 @@ def _score(store: Store, claim: Claim, progress: Progress | None) -> bool:
         # Perhaps the machine is at fault, perhaps what the policy did to it: it counts as lost.
         store.abandon(claim.worker)
         raise
-    except Exception:
+    except Exception as error:
         _log.exception("%s: attempt %d was lost", claim.id, claim.attempt)
         store.abandon(claim.worker)
+        entry = store.entry(claim.id)
+        if entry is not None and entry.reference:  # which is never given up
+            raise BoardError(
+                f"reference row {entry.method!r}: cannot be scored here: "
+                f"{type(error).__name__}: {error}. It waits: mend what fails, and score again."
+            ) from error
         return False
     return store.finish(claim, result)
 

@@ -366,7 +366,8 @@ class Store:
 
         A claim holds for `seconds` of the machine's running time, whatever is done to its clock;
         `heartbeat` renews it. A submission whose claims were lost five times is rejected with
-        `scoring_failed`.
+        `scoring_failed`, but never a reference row: it is the machine that failed, and without
+        the row the board would show nothing for good.
 
         Args:
           worker: who claims; no two at once may have the same name.
@@ -381,7 +382,8 @@ class Store:
         with self.turn() as index:
             while True:
                 row = index.one(
-                    "SELECT id, coalesce(attempt, 0), coalesce(lost, 0) + (worker IS NOT NULL) "
+                    "SELECT id, reference, coalesce(attempt, 0), "
+                    "coalesce(lost, 0) + (worker IS NOT NULL) "
                     "FROM entry LEFT JOIN lease ON submission = id WHERE status = 'waiting' "
                     "AND (submission IS NULL OR boot <> ? OR expires <= ?) "
                     "ORDER BY sequence LIMIT 1",
@@ -389,8 +391,8 @@ class Store:
                 )
                 if row is None:
                     return None
-                id, attempts, lost = row
-                if lost >= ATTEMPTS:
+                id, reference, attempts, lost = row
+                if lost >= ATTEMPTS and not reference:
                     self._finish(self._given_up(id))
                     continue
                 boot, at = _running_time()

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard import scorer
+from leaderboard import intake, scorer
 from leaderboard.errors import BoardError, TamperedError
+from leaderboard.ranking import refuse_unpublishable
 from leaderboard.scorer import run_scorer, run_scorers
 from leaderboard.scoring import score_submission
 from leaderboard.store import Store
@@ -157,6 +158,36 @@ def test_processes_that_only_die_are_given_up(store, board, monkeypatch):
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
     assert store.waiting() == 3
+
+
+def test_scorers_killed_over_a_reference_row_leave_it_to_be_scored(store, monkeypatch):
+    references = intake.submit_references(store)
+    for attempt in range(ATTEMPTS):
+        store.abandon(store.claim(f"killed {attempt}").worker)
+    monkeypatch.setattr(scorer, "_BARREN_DEATHS", 2)
+
+    def kill_once_it_claims(pid):
+        while store.claimable() == store.waiting():
+            threading.Event().wait(0.01)
+        os.kill(pid, signal.SIGKILL)
+
+    with pytest.raises(BoardError, match="2 scorers died"):
+        run_scorers(store.folder.path, 1, started=kill_once_it_claims)
+    assert store.waiting() == len(references)
+    assert run_scorers(store.folder.path, 1) == len(references)
+    refuse_unpublishable(store.entries())
+
+
+def test_a_fault_over_a_reference_row_ends_the_scorer_and_leaves_it(store, monkeypatch, caplog):
+    intake.submit_references(store)
+    with monkeypatch.context() as patch:
+        patch.setattr(scorer, "score_submission", lambda *_: _raise(ZeroDivisionError("by 0")))
+        with caplog.at_level(logging.ERROR):
+            for _ in range(ATTEMPTS + 1):
+                with pytest.raises(BoardError, match="'optimal'.*ZeroDivisionError: by 0"):
+                    run_scorer(store.folder.path)
+    assert len(caplog.records) == ATTEMPTS + 1
+    assert run_scorer(store.folder.path) == 2
 
 
 SCRIPT = """

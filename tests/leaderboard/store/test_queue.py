@@ -4,6 +4,7 @@ import time
 
 import pytest
 
+from leaderboard import intake
 from leaderboard.store import Store
 from leaderboard.store.store import ATTEMPTS
 from tests.leaderboard.conftest import signed_withdrawal
@@ -104,6 +105,30 @@ def test_a_submission_that_lost_every_attempt_is_rejected(store, submit):
     assert store.entry(lost.id).code == "scoring_failed"
     assert store.result(lost.id).code == "scoring_failed"
     assert store.given_up() == 1
+
+
+def test_a_reference_row_is_never_given_up(store, submit):
+    references = intake.submit_references(store)
+    other = submit()
+    for attempt in range(1, ATTEMPTS + 3):
+        claim = store.claim(f"worker {attempt}")
+        assert (claim.id, claim.attempt) == (references[0], attempt)
+        store.abandon(claim.worker)
+    assert store.given_up() == 0
+    for id in (*references, other.id):
+        claim = store.claim("whole")
+        assert claim.id == id
+        assert store.finish(claim, made_up_result(store, id))
+
+
+def test_a_reference_row_that_was_given_up_once_stays_so_in_the_log(store):
+    """As scorers did before: such a board is still read, and its log followed."""
+    first, second = intake.submit_references(store)
+    claim = store.claim("worker")
+    assert store.finish(claim, store._given_up(first))
+    store.reindex()
+    assert store.entry(first).code == "scoring_failed"
+    assert store.claim("worker").id == second
 
 
 def test_what_is_withdrawn_while_it_is_scored_gets_no_result(store, key, submit):
