@@ -9,6 +9,7 @@ What the schema cannot know. In this order, the first that fails is told:
     unknown_spec     every run is on an instance of the suite
     duplicate_run    no run, and no artefact within one instance, is listed twice
     missing_run      every instance has a run, and every class a count of the runs started
+    schema           which is no more than a result can hold
     too_large        no artefact is above this board's limit
 
 Reference submissions, signed by the board itself, are checked like any other.
@@ -23,6 +24,7 @@ from collections import Counter
 
 from leaderboard.board import BoardDocument
 from leaderboard.errors import Rejection
+from leaderboard.scoring import refuse_countless
 from leaderboard.submission import Submission
 from sme_registry.spec import Suite
 
@@ -104,7 +106,8 @@ def check_runs(suite: Suite, submission: Submission) -> None:
     """Refuse runs that are not on the suite's instances, listed twice, missing or uncounted.
 
     Raises:
-      Rejection: `unknown_spec`, `duplicate_run` or `missing_run`.
+      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` where more runs were
+        started than a result can hold.
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
     for index, run in enumerate(submission.runs):
@@ -200,3 +203,4 @@ def _check_started(submission: Submission, listed: Counter[str]) -> None:
                 f"runs_started.{name}={started.get(name)}: must be at least {count}, the runs "
                 "listed. Count every run that was ever started with this method.",
             )
+    refuse_countless(started)

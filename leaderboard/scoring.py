@@ -13,7 +13,7 @@ to make a new policy for each attempt. What is held at once is one artefact and 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 
 import numpy as np
@@ -53,6 +53,23 @@ def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str
     """
     text = f"{protocol_digest}\n{spec_digest}\n{artefact_digest}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
+
+
+def refuse_countless(started: Mapping[str, int]) -> None:
+    """Refuse more runs than a result can hold.
+
+    Args:
+      started: how many, by class.
+
+    Raises:
+      Rejection: `schema`.
+    """
+    if sum(started.values()) > MAX_RUNS:
+        raise Rejection(
+            "schema",
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
+            "Count the runs of this version of the method only.",
+        )
 
 
 def score_submission(
@@ -186,12 +203,7 @@ def _never_listed(
     started = {
         name: max(submission.runs_started.get(name, 0), count) for name, count in listed.items()
     }
-    if sum(started.values()) > MAX_RUNS:
-        raise Rejection(
-            "schema",
-            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
-            "Count the runs of this version of the method only.",
-        )
+    refuse_countless(started)
     return [
         failed_run(board, name, None)
         for name, count in listed.items()

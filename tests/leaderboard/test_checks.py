@@ -220,6 +220,15 @@ def test_runs_started_that_do_not_count_the_runs_listed_are_refused(started, mat
     refused("missing_run", match, runs_started=started)
 
 
+def test_more_runs_started_than_a_result_can_hold_are_refused():
+    accepted(runs_started={"A": 9_000, "B": 1_000})
+    refused(
+        "schema",
+        "runs_started=10001: must be at most 10,000 in all",
+        runs_started={"A": 9_000, "B": 1_001},
+    )
+
+
 def test_failed_runs_count_as_started():
     runs = [run(A0), run(A1), run(B0), run(B0, 1)]
     refused("missing_run", "runs_started.B=1: must be at least 2", runs=runs)
