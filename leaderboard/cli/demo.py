@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -9,13 +10,16 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from leaderboard.board import Folder
 from leaderboard.cli import keeping, reading
+from leaderboard.errors import BoardError
 from leaderboard.keys import SigningKey
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, Suite, SuiteFile
 from sme_registry.terminal import err, out
 
-_FOLDERS = ("board", "bundle", "site")
+_FOLDERS = ("bundle", "site", "board")  # removed in this order: all are known by the board
+_TITLE, _SUITE = "Demonstration", "demo"
 
 
 def demo(
@@ -28,7 +32,7 @@ def demo(
 ) -> None:
     """Submit a trained run to a board of its own task, score it, and write the board's page.
 
-    An earlier demonstration in the same folder is replaced.
+    An earlier demonstration in the same folder is replaced; anything else there is refused.
 
     Examples:
 
@@ -45,19 +49,20 @@ def demo(
     if record is None or record.status != "finished":
         raise OptionError(f"run={str(run)!r}: holds no finished run. `sme demo` makes one.")
     folder = run / "leaderboard" if out_folder is None else out_folder
+    _refuse_others(folder)
     for name in _FOLDERS:
-        shutil.rmtree(folder / name, ignore_errors=True)
+        shutil.rmtree(folder / name, ignore_errors=True)  # what resists is named by who writes next
 
     setting = record.spec.plain()
     seed = setting.pop("seed")
-    suite = Suite.parse({"classes": [{"name": "demo", "setting": setting, "seeds": [seed]}]})
-    file = SuiteFile(name="demo", version=1, digest=suite.digest, suite=suite)
+    suite = Suite.parse({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
+    file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
     protocol: EvaluationProtocol = record.protocol
 
     err().print("A board of this task alone, with the two reference rows; the agent is submitted.")
     with Store.create(
         folder / "board",
-        title="Demonstration",
+        title=_TITLE,
         suite_name=file.versioned_name,
         suite=suite,
         protocol_name=_name_of(protocol),
@@ -83,6 +88,31 @@ def demo(
         f"The board, to be opened in a browser ({escape(str(folder))}):"
     )
     keeping.site(folder / "board", folder / "site")
+
+
+def _refuse_others(folder: Path) -> None:
+    """Refuse a folder where something stands that no demonstration has made.
+
+    Raises:
+      OptionError: with what it is.
+    """
+    there = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
+    if there and not _is_demonstration(folder / "board"):
+        raise OptionError(
+            f"out={str(folder)!r}: {', '.join(map(str, there))}: there already, and not made by a "
+            "demonstration. Nothing was removed: give another --out, or move them elsewhere."
+        )
+
+
+def _is_demonstration(path: Path) -> bool:
+    """Whether a demonstration made this board; a link may lead to one that is meant to stay."""
+    try:
+        document = Folder(path).read()
+    except BoardError:
+        return False
+    made = (_TITLE, f"{_SUITE}-v1", [_SUITE])
+    classes = [member.name for member in document.suite.classes]
+    return not path.is_symlink() and (document.title, document.suite_name, classes) == made
 
 
 def _name_of(protocol: EvaluationProtocol) -> str:

@@ -215,3 +215,43 @@ def test_gc_removes_what_no_submission_names_and_only_says_so_before() -> None:
         assert not store.has_object(digest)
     good("score", "board")
     assert "Whole" in good("verify", "board")
+
+
+@pytest.fixture
+def trained() -> Path:
+    """A run of a few steps."""
+    from sme_registry.training import train
+
+    train(
+        {"state_dim": 2, "action_dim": 1}, algorithm="A2C", steps=64, folder="run",
+        protocol={"states_per_region": 200}, progress=False,
+    )  # fmt: skip
+    return Path("run")
+
+
+def test_a_demonstration_replaces_an_earlier_one_and_nothing_else(trained: Path) -> None:
+    good("demo", trained)
+    demonstrated = Path("run/leaderboard")
+    first = (demonstrated / "board" / "board.key").read_text()
+    (demonstrated / "site" / "extra.html").write_text("of the earlier one")
+    good("demo", trained)
+    assert (demonstrated / "board" / "board.key").read_text() != first
+    assert not (demonstrated / "site" / "extra.html").exists()
+
+    make_board()
+    Path("bundles/bundle").mkdir(parents=True)
+    Path("bundles/bundle/mine.txt").write_text("kept")
+    Path("pages/site").mkdir(parents=True)
+    Path("linked").mkdir()
+    Path("linked/board").symlink_to(demonstrated.resolve() / "board")
+    for name, folder in (
+        ("board", "."),
+        ("bundle", "bundles"),
+        ("site", "pages"),
+        ("board", "linked"),
+    ):
+        before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+        said = fails(2, "demo", trained, "--out", folder)
+        assert f"{Path(folder) / name}: there already" in " ".join(said.split())
+        assert "Nothing was removed" in said
+        assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
