@@ -184,7 +184,7 @@ def test_a_fault_over_a_reference_row_ends_the_scorer_and_leaves_it(store, monke
         patch.setattr(scorer, "score_submission", lambda *_: _raise(ZeroDivisionError("by 0")))
         with caplog.at_level(logging.ERROR):
             for _ in range(ATTEMPTS + 1):
-                with pytest.raises(BoardError, match="'optimal'.*ZeroDivisionError: by 0"):
+                with pytest.raises(BoardError, match=r"'optimal'.*ZeroDivisionError: by 0"):
                     run_scorer(store.folder.path)
     assert len(caplog.records) == ATTEMPTS + 1
     assert run_scorer(store.folder.path) == 2
