@@ -147,7 +147,7 @@ def _score_runs(
 ) -> tuple[list[RunScore], dict[str, str]]:
     """The listed runs in order, then those that were not listed; and what versions they are of."""
     instances = board.instances
-    never_listed = _never_listed(board, submission, instances)
+    unlisted = never_listed(board, submission, instances)
     policies = {(run.spec, run.artefact.sha256) for run in submission.runs if run.artefact}
     states = board.protocol.states_per_region * len(board.protocol.edges)
     scored: dict[tuple[str, str], RunScore] = {}
@@ -177,13 +177,22 @@ def _score_runs(
             scored[run.spec, digest] = _run_score(board, class_name, report, digest)
             versions = versions or _versions(report)
         runs.append(scored[run.spec, digest])
-    return runs + never_listed, versions
+    return runs + unlisted, versions
 
 
-def _never_listed(
+def never_listed(
     board: BoardDocument, submission: Submission, instances: Instances
 ) -> list[RunScore]:
-    """A score of 1 for each run that was started and is not listed."""
+    """A score of 1 for each run that was started and is not listed.
+
+    Args:
+      board: the suite.
+      submission: says how many were started.
+      instances: the board's.
+
+    Raises:
+      Rejection: `unknown_spec`, `missing_run` or `schema`, where `checks` saw no such submission.
+    """
     listed = dict.fromkeys((member.name for member in board.suite.classes), 0)
     for index, run in enumerate(submission.runs):
         if run.spec not in instances:

@@ -16,10 +16,16 @@ from pathlib import Path
 from typing import Any
 
 from leaderboard.board import BoardDocument, Folder, hex_of
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.keys import verifies
 from leaderboard.result import Result
-from leaderboard.scoring import evaluation_seed, result_of, score_submission
+from leaderboard.scoring import (
+    evaluation_seed,
+    failed_run,
+    never_listed,
+    result_of,
+    score_submission,
+)
 from leaderboard.statistics import run_metrics
 from leaderboard.store import (
     Index,
@@ -31,7 +37,7 @@ from leaderboard.store import (
     digest_of,
     read_document,
 )
-from leaderboard.submission import SignedSubmission, SignedWithdrawal
+from leaderboard.submission import Artefact, Run, SignedSubmission, SignedWithdrawal
 from sme_registry.errors import OptionError
 from sme_registry.files import TEMPORARY
 
@@ -325,20 +331,27 @@ def _verify_numbers(store: Store, fresh: Index, count: _Counter) -> int:
 
 
 def _verify_runs(store: Store, result: Result, where: str) -> None:
-    """That the runs scored are those submitted, on the states that were theirs."""
-    listed = store.submission(result.submission).submission.runs
-    document = store.document
-    for number, (run, found) in enumerate(itertools.zip_longest(listed, result.runs)):
-        expected: tuple[str | None, str | None, int | None]
-        if run is None:  # started, and not listed
-            expected = (None, None, None)
-        elif run.artefact is None:
-            expected = (run.spec, None, None)
-        else:
-            digest = run.artefact.sha256
-            seed = evaluation_seed(document.protocol.digest, run.spec, digest)
-            expected = (run.spec, digest, seed)
-        if found is None or (found.spec, found.artefact, found.evaluation_seed) != expected:
+    """That the runs scored are those submitted, on their own states, and those without policy 1."""
+    submission, document = store.submission(result.submission).submission, store.document
+    instances = document.instances
+    try:
+        unlisted = never_listed(document, submission, instances)
+    except Rejection as error:
+        raise TamperedError(where, f"is of a submission that cannot be scored: {error}") from None
+    pairs = itertools.zip_longest([*submission.runs, *unlisted], result.runs)
+    for number, (run, found) in enumerate(pairs):
+        match run:
+            case Run(spec=spec, artefact=Artefact(sha256=digest)):
+                seed = evaluation_seed(document.protocol.digest, spec, digest)
+                right = found is not None and (
+                    (found.spec, found.class_name, found.artefact, found.evaluation_seed)
+                    == (spec, instances[spec][0], digest, seed)
+                )
+            case Run(spec=spec):
+                right = found == failed_run(document, instances[spec][0], spec)
+            case _:
+                right = found == run
+        if not right:
             raise TamperedError(where, f"runs.{number}: is not of the run that was submitted")
 
 

@@ -24,7 +24,12 @@ from leaderboard.submission import SignedSubmission
 from leaderboard.verify import VerifyReport, verify
 from sme_registry.errors import OptionError
 from sme_registry.files import to_json
-from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_board
+from tests.leaderboard.conftest import (
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
 
 
 @pytest.fixture(scope="module")
@@ -369,6 +374,33 @@ def test_a_board_that_lies_and_signs_it_is_found_out(board, lie):
         runs = (run.model_copy(update=better), *result.runs[1:])
         anew = result_of(folder.read(), id, runs, result.versions)
         path.write_text(to_json(anew.plain()))
+    resign(board, folder.signing_key())
+    assert found(board) == where(board, path)
+
+
+@pytest.mark.parametrize("lie", ["leaves it out", "scores it 0", "gives it the constant's decay"])
+@pytest.mark.parametrize("kind", ["failed", "not listed"])
+def test_a_board_that_spares_a_run_without_a_policy_is_found_out(tmp_path, kind, lie):
+    board = tmp_path / "board"
+    key = SigningKey.generate()
+    with tiny_board(board) as store:
+        plain = tiny_submission(store, key)[0].submission.plain()
+        failed = {**plain["runs"][0], "seed": 7, "artefact": None}
+        runs = [*plain["runs"], failed] if kind == "failed" else plain["runs"]
+        signed = put_submission(store, key, runs=runs, runs_started={"Tiny": 2})
+    run_scorer(board)
+    assert verify(board).results == 1
+    folder = Folder(board)
+    path = folder.result(signed.id)
+    result = Result.parse(json.loads(path.read_text()))
+    first, without = result.runs
+    spared = {
+        "leaves it out": [],
+        "scores it 0": [without.model_copy(update={"regret": (0.0,) * 6})],
+        "gives it the constant's decay": [without.model_copy(update={"decay": 0.0})],
+    }[lie]
+    anew = result_of(folder.read(), signed.id, [first, *spared], result.versions)
+    path.write_text(to_json(anew.plain()))
     resign(board, folder.signing_key())
     assert found(board) == where(board, path)
 
