@@ -9,7 +9,9 @@ learner, here `sb3_contrib_cell:wide_trpo` of this very file. In a plan, for `sm
 folder, the same reads
 
     {"name": "TRPO", "uses": "sb3_contrib:TRPO"}
-    {"name": "TRPO, wide", "uses": "sb3_contrib_cell:wide_trpo", "hyperparameters": {"width": 128}}
+    {"name": "TRPO (wide)", "uses": "sb3_contrib_cell:wide_trpo", "hyperparameters": {"width": 128}}
+
+and `sme study new PLAN.json --from EDITED.json` makes a plan of a file that was edited so.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from sme_registry.studies.cell import run_cell
 ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
     "PPO": ("PPO", {}),
     "TRPO": ("sb3_contrib:TRPO", {}),
-    "TRPO, wide": ("sb3_contrib_cell:wide_trpo", {"width": 128}),
+    "TRPO (wide)": ("sb3_contrib_cell:wide_trpo", {"width": 128}),
     "linear": ("reference:linear", {}),
 }
 

@@ -65,4 +65,4 @@ def test_the_sb3_contrib_example_trains_all_it_names() -> None:
     done = run(ROOT / "examples" / "sb3_contrib_cell.py", "--env", "Plane1", "--steps", "64")
     assert done.returncode == 0, done.stderr
     rows = [line[:12].strip() for line in done.stdout.splitlines()]
-    assert rows == ["algorithm", "PPO", "TRPO", "TRPO, wide", "linear"]
+    assert rows == ["algorithm", "PPO", "TRPO", "TRPO (wide)", "linear"]

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from sme_registry.cli import names, study_report
 from sme_registry.errors import OptionError
+from sme_registry.files import read_json
 from sme_registry.spec import (
     PlannedCell,
     StudyFile,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 _SECONDS_PER_DAY = 86_400
 _LINES_OF_FAILURES = 20
+_BESIDE_FROM = ("path", "name", "description", "source", "force")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -88,6 +90,7 @@ class ExecutorName(enum.StrEnum):
 
 @app.command("new")
 def new(
+    context: typer.Context,
     path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
     suite: Annotated[
         str | None, typer.Option(help="Its classes: a suite's name, or its path.")
@@ -120,13 +123,23 @@ def new(
     protocol: Annotated[
         str, typer.Option(help="Of the evaluation within and out of distribution at the end.")
     ] = "paper-v1",
-    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
-    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    name: Annotated[str | None, typer.Option(help="By default --from's, or the file's.")] = None,
+    description: Annotated[str | None, typer.Option(help="One or two sentences.")] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="PLAN",
+            help="In place of the options above: the plan of a file that was edited, whatever its "
+            "digest; of a file that is a plan alone; or of the catalogue, to edit it.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write a plan: which algorithms on which tasks, how often, and how long.
 
-    A plan is a file that a colleague can run. References learn nothing and take no steps.
+    A plan is a file that a colleague can run. References learn nothing and take no steps. What has
+    no option, such as hyperparameters, is edited in the file, which --from then makes a plan again.
 
     Examples:
 
@@ -135,49 +148,91 @@ def new(
       sme study new deep.json -t Default -t Complexity10 -a TQC=sb3_contrib:TQC -n 10000
 
       sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
+
+      sme study new wider.json --from edited.json
     """
     from sme_registry.evaluation import resolve_protocol
-    from sme_registry.studies.scaling import scaled
 
     if path.suffix != ".json":
         raise OptionError(f"{path}: must end in .json, by which every command knows a path.")
     if path.exists() and not force:
         raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
-    classes = [*(_suite_classes(suite) if suite is not None else ()), *map(_class, task or ())]
+    own = {"name": name, "description": description}
+    own = {field: text for field, text in own.items() if text is not None}
+    if source is None:
+        plan = _made(
+            str(path),
+            [*(_suite_classes(suite) if suite is not None else ()), *map(_class, task or ())],
+            algorithm or (),
+            action_range or ["symmetric"],
+            steps,
+            seeds=seeds,
+            evaluations=evaluations,
+            evaluation_episodes=evaluation_episodes,
+            protocol=resolve_protocol(protocol).plain(),
+        )
+        file = StudyFile.sealed(plan.plain(), str(path), **{"name": path.stem, **own})
+    else:
+        _refuse_beside_from(context)
+        data = read_json(source) if names.is_path(source) else _find(source).plain()
+        named = isinstance(data, dict) and "name" in data
+        file = StudyFile.sealed(data, source, **{**({} if named else {"name": path.stem}), **own})
+    file.write(path)
+    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    err().print(f"[dim]sme study plan {escape(str(path))}  says what it takes[/]", soft_wrap=True)
+
+
+def _refuse_beside_from(context: typer.Context) -> None:
+    """Raise where what --from brings is also given as an option.
+
+    Raises:
+      OptionError: names the option.
+    """
+    for option in context.params:
+        given = context.get_parameter_source(option)
+        # By name: newer versions of Typer bring their own Click.
+        if option not in _BESIDE_FROM and given is not None and given.name == "COMMANDLINE":
+            raise OptionError(
+                f"--{option.replace('_', '-')}: the plan of --from has its own. Change it in that "
+                "file, or leave out --from."
+            )
+
+
+def _made(
+    path: str,
+    classes: Sequence[SuiteClass],
+    algorithms: Sequence[str],
+    ranges: Sequence[str],
+    steps: list[str] | None,
+    **fields: Any,
+) -> StudyPlan:
+    """The plan that the options of `sme study new` describe.
+
+    Raises:
+      OptionError, SpecError, UnknownNameError: an option is missing or wrong.
+    """
+    from sme_registry.studies.scaling import scaled
+
     if not classes:
         raise OptionError(
             "--suite: missing: on which tasks? Give --suite smoke, or --task Default."
         )
-    if not algorithm:
+    if not algorithms:
         raise OptionError("--algorithm: missing: what is run? Give for example --algorithm PPO.")
-    ranges = action_range or ["symmetric"]
-    algorithms = [_algorithm(text, each, len(ranges) > 1) for text in algorithm for each in ranges]
     plan = StudyPlan.parse(
         {
             "classes": [member.plain() for member in classes],
-            "algorithms": algorithms,
-            "seeds": seeds,
-            "evaluations": evaluations,
-            "evaluation_episodes": evaluation_episodes,
-            "protocol": resolve_protocol(protocol).plain(),
+            "algorithms": [
+                _algorithm(text, each, len(ranges) > 1) for text in algorithms for each in ranges
+            ],
+            **fields,
         },
-        str(path),
+        path,
     )
     every, single = _budgets(steps)
     # Scaled as a plan of the catalogue would be, so that the options mean the same.
     draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
-    plan = scaled(draft, steps=every, steps_of=single).plan
-    file = StudyFile.parse(
-        {
-            "name": path.stem if name is None else name,
-            "description": description,
-            "digest": plan.digest,
-            "plan": plan.plain(),
-        }
-    )
-    file.write(path)
-    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
-    err().print(f"[dim]sme study plan {escape(str(path))}  says what it takes[/]", soft_wrap=True)
+    return scaled(draft, steps=every, steps_of=single).plan
 
 
 def _suite_classes(name: str) -> Sequence[SuiteClass]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field
 
-from sme_registry.errors import DigestMismatchError
+from sme_registry.errors import DigestMismatchError, SpecError
 from sme_registry.files import read_json, to_json, write_atomically
 from sme_registry.spec.document import Digest, Integer, Name, StrictModel
 from sme_registry.spec.protocol import EvaluationProtocol
@@ -31,9 +31,15 @@ class Fingerprint(StrictModel):
 
 
 class Envelope(StrictModel):
-    """What every file carries beside its document."""
+    """What every file carries beside its document.
+
+    Attributes:
+      content: the field that holds the document.
+      remedy: what turns a changed document, or one alone, into a file; `{source}` is where it is.
+    """
 
     content: ClassVar[str]
+    remedy: ClassVar[str]
 
     name: Name
     version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
@@ -55,16 +61,25 @@ class Envelope(StrictModel):
           source: what to call it in an error, such as its path.
 
         Raises:
-          SpecError: a field is wrong.
+          SpecError: a field is wrong or missing.
           DigestMismatchError: the digest is of another document.
         """
+        remedy = cls.remedy.format(source=source)
+        document: Any = cls.model_fields[cls.content].annotation
+        if isinstance(data, dict) and data and "digest" not in data:
+            alone = data.keys() <= document.model_fields.keys()
+            if alone or cls.content in data:
+                raise SpecError(
+                    f"{source}: digest: missing: must be that of the {cls.content}. To have it, "
+                    f"{remedy}."
+                )
         envelope = cls.parse(data, source)
         found = getattr(envelope, cls.content).digest
         if found != envelope.digest:
             raise DigestMismatchError(
                 f"{source}: digest={envelope.digest!r}: its {cls.content} has {found!r}. The "
                 f"{cls.content} or the digest was changed after it was written: take the file "
-                f"again from its source, or save the changed {cls.content} as a new file."
+                f"again from its source, or {remedy}."
             )
         return envelope
 
@@ -92,6 +107,7 @@ class EnvFile(Envelope):
     """A task's file: `specs/envs/*.json`, or what `sme_registry.save` writes."""
 
     content = "spec"
+    remedy = "save the changed spec as a new file, in Python `sme_registry.save(spec, path)`"
 
     spec: SMESpec
     fingerprint: Fingerprint
@@ -101,6 +117,10 @@ class SuiteFile(Envelope):
     """A suite's file: `specs/suites/*.json`."""
 
     content = "suite"
+    remedy = (
+        "write the changed suite as a new file, in Python "
+        "`SuiteFile(name=…, digest=suite.digest, suite=suite).write(path)`"
+    )
 
     suite: Suite
 
@@ -109,13 +129,35 @@ class StudyFile(Envelope):
     """A study's file: `specs/studies/*.json`."""
 
     content = "plan"
+    remedy = "write the changed plan as a new file: `sme study new NEW.json --from {source}`"
 
     plan: StudyPlan
+
+    @classmethod
+    def sealed(cls, data: Any, source: str, **given: Any) -> Self:
+        """A plan that was edited, or stands alone, as a file with the digest that it has now.
+
+        Args:
+          data: plain data of a file, whose digest does not matter, or of a plan.
+          source: what to call it in an error, such as its path.
+          **given: fields of the file, such as `name`, in place of those in `data`.
+
+        Raises:
+          SpecError: a field is wrong or missing.
+        """
+        is_file = isinstance(data, dict) and cls.content in data
+        plan = StudyPlan.parse(data[cls.content] if is_file else data, source)
+        own = {**(data if is_file else {}), **given}
+        return cls.parse({**own, "digest": plan.digest, "plan": plan.plain()}, source)
 
 
 class ProtocolFile(Envelope):
     """A protocol's file: `specs/protocols/*.json`."""
 
     content = "protocol"
+    remedy = (
+        "write the changed protocol as a new file, in Python "
+        "`ProtocolFile(name=…, digest=protocol.digest, protocol=protocol).write(path)`"
+    )
 
     protocol: EvaluationProtocol

@@ -14,7 +14,14 @@ from sme_registry.errors import (
     OptionError,
     SpecError,
 )
-from sme_registry.spec import EnvFile, SMESpec
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    StudyFile,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.task import fingerprint, materialize
 from sme_registry.task.task import _draw_cached
 from tests.strategies import specs
@@ -70,6 +77,24 @@ def test_a_changed_spec_is_noticed_by_its_digest(saved):
     assert str(saved) in message
     assert SMESpec.parse(fields).digest in message
     assert "take the file again from its source, or save the changed spec as a new file" in message
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [
+        (EnvFile, "sme_registry.save("),
+        (SuiteFile, "SuiteFile(name=…, digest=suite.digest, suite=suite).write(path)"),
+        (ProtocolFile, "ProtocolFile(name=…, digest=protocol.digest, protocol=protocol)"),
+        (StudyFile, "`sme study new NEW.json --from mine.json`"),
+    ],
+)
+def test_of_what_has_no_digest_or_another_the_remedy_of_its_kind_is_named(kind, remedy):
+    plain = catalogue.entries(kind)[0].plain()
+    without = {field: value for field, value in plain.items() if field != "digest"}
+    for data in (without, plain[kind.content], plain | {"digest": "sha256:" + "0" * 64}):
+        with pytest.raises(SpecError, match="digest") as caught:
+            kind.open(data, "mine.json")
+        assert remedy in str(caught.value)
 
 
 def test_a_changed_digest_is_noticed(saved):

@@ -310,7 +310,79 @@ def test_a_plan_with_a_changed_digest_is_refused(tmp_path: Path) -> None:
     plain: dict[str, Any] = small_file().plain()
     plain["plan"]["seeds"] = 3
     (tmp_path / "p.json").write_text(json.dumps(plain))
-    assert "digest=" in refused("plan", "p.json")
+    text = refused("plan", "p.json")
+    assert "digest=" in text
+    assert "`sme study new NEW.json --from p.json`" in text
+
+
+class TestEdited:
+    """A plan that was changed by hand becomes a file again by the command that the error names."""
+
+    def written(self, form: str) -> StudyPlan:
+        """Write edited.json, with hyperparameters; the plan that it is meant to be."""
+        file = small_file()
+        plain: dict[str, Any] = file.plain()
+        plain["plan"]["algorithms"][0].update(uses="PPO", hyperparameters={"n_steps": 64})
+        if form == "no digest":
+            del plain["digest"]
+        Path("edited.json").write_text(json.dumps(plain["plan"] if form == "bare" else plain))
+        return StudyPlan.parse(plain["plan"])
+
+    @pytest.mark.parametrize("form", ["old digest", "no digest", "bare"])
+    def test_the_error_names_the_command_that_makes_it_a_file(self, form: str) -> None:
+        plan = self.written(form)
+        for command in (("plan",), ("run", "-f", "study")):
+            assert "`sme study new NEW.json --from edited.json`" in refused(*command, "edited.json")
+        good("new", "new.json", "--from", "edited.json")
+        file = StudyFile.read("new.json")
+        assert file.plan == plan
+        assert file.plan.algorithms[0].hyperparameters == {"n_steps": 64}
+        told = ("new", "") if form == "bare" else ("small", "For tests.")
+        assert (file.name, file.description) == told
+        assert json.loads(good("plan", "new.json", "--json"))["digest"] == plan.digest
+
+    def test_it_may_take_a_name_and_the_place_of_what_was_edited(self) -> None:
+        plan = self.written("old digest")
+        itself = ("new", "edited.json", "--from", "edited.json")
+        assert "--force" in refused(*itself)
+        good(*itself, "--force", "--name", "other", "--description", "")
+        file = StudyFile.read("edited.json")
+        assert (file.name, file.description, file.plan) == ("other", "", plan)
+
+    def test_a_plan_of_the_catalogue_is_copied_to_be_edited(self) -> None:
+        good("new", "mine.json", "--from", "paper-ablations")
+        assert StudyFile.read("mine.json") == ABLATIONS
+
+    @pytest.mark.parametrize(
+        ("option", "words"),
+        [
+            (("--seeds", "10"), "--seeds: the plan of --from has its own"),
+            (("--action-range", "unit"), "--action-range: the plan of --from"),
+            (("--name", "a b"), "name='a b'"),
+        ],
+    )
+    def test_what_the_plan_says_already_is_no_option(
+        self, option: tuple[str, ...], words: str
+    ) -> None:
+        self.written("bare")
+        assert words in refused("new", "new.json", "--from", "edited.json", *option)
+        assert not Path("new.json").exists()
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("[]", "must be an object"),
+            ('{"plan": []}', "must be an object"),
+            ('{"classes": [}', "edited.json"),
+            ('{"seeds": 3}', "classes: missing"),
+        ],
+    )
+    def test_what_is_no_plan_is_refused(self, text: str, words: str) -> None:
+        Path("edited.json").write_text(text)
+        result = sme("new", "new.json", "--from", "edited.json")
+        assert result.exit_code == 2
+        assert words in result.stderr
+        assert not Path("new.json").exists()
 
 
 def test_a_plan_is_a_document_whose_digest_ignores_names_outside_it() -> None:
