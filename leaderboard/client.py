@@ -79,6 +79,8 @@ def submit(
 def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
     """What a board says of a submission: `id`, `status`, and its `result` once it is scored.
 
+    Until the board shows any number the result is None, and `withheld` says why.
+
     Raises:
       Rejection: `unknown_submission`.
       BoardError: the board cannot be reached or does not answer as a board does.
@@ -246,7 +248,8 @@ def _digits(id: str) -> str:
         return hex_of(id)
     except ValueError:
         raise OptionError(
-            f"id={id!r:.90}: must be 'sha256:' and 64 hex digits. Copy it from the board."
+            f"id={id!r:.90}: must be 'sha256:' and 64 hex digits: where a board is served, their "
+            "beginning is not enough. Copy the whole id from the board."
         ) from None
 
 

@@ -4,7 +4,7 @@
     PUT  /api/objects/<hex>        an artefact, streamed; signed for, see `intake`
     GET  /api/objects/<hex>        its bytes, so that anyone can recompute; HEAD: is it there?
     POST /api/submissions          202 taken, 200 known already
-    GET  /api/submissions/<hex>    status and result
+    GET  /api/submissions/<hex>    status and result, whose scores the reference rows may withhold
     POST /api/withdrawals          200
     GET  /api/board?metric=wd      the ranking
     GET  /api/log?start=0          a hundred entries of the signed log
@@ -269,14 +269,7 @@ class _Served:
             raise Rejection(
                 "unknown_submission", f"submission={id}: is not on this board. Check the id."
             )
-        result = self._store.result(id)
-        return {
-            "id": id,
-            "status": entry.status,
-            "received": entry.received,
-            **self._store.submission(id).plain(),
-            "result": None if result is None else result.plain(),
-        }
+        return tables.told(self._store, entry).plain()
 
     async def post_withdrawal(self, request: Request) -> Response:
         text = await _document(request, "withdrawal")

@@ -1,4 +1,6 @@
-"""A ranking as JSON, CSV or LaTeX. Each file says what it is of: suite, protocol, log and date.
+"""A ranking as JSON, CSV or LaTeX, and what may be told of one submission.
+
+Each file of a ranking says what it is of: suite, protocol, log and date.
 
 What submitters wrote is made harmless: a cell of text that a spreadsheet would take for a formula
 begins with an apostrophe, and what LaTeX would take for a command is shown as it was written.
@@ -8,12 +10,15 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass
 from typing import Any
 
 from leaderboard.board import BoardDocument
-from leaderboard.ranking import Metric, RankedRow
-from leaderboard.result import METRICS, Estimate
-from leaderboard.submission import now
+from leaderboard.errors import NotPublishable
+from leaderboard.ranking import Metric, RankedRow, refuse_unpublishable
+from leaderboard.result import METRICS, Estimate, Result
+from leaderboard.store import EntryRow, Store
+from leaderboard.submission import SignedSubmission, SignedWithdrawal, now
 from sme_registry.files import to_json as plain_to_json
 
 Head = tuple[int, str]
@@ -35,6 +40,49 @@ _LATEX = {
     "|": r"\textbar{}",
     '"': r"\textquotedbl{}",
 }
+
+
+@dataclass(frozen=True)
+class Told:
+    """What may be told of one submission.
+
+    Attributes:
+      entry: its row.
+      signed: as it was signed.
+      result: None where there is none, or where its scores are withheld.
+      withheld: why they are; empty where they are not.
+      withdrawal: None where it stands.
+    """
+
+    entry: EntryRow
+    signed: SignedSubmission
+    result: Result | None
+    withheld: str
+    withdrawal: SignedWithdrawal | None
+
+    def plain(self) -> dict[str, Any]:
+        """The same as plain data."""
+        return {
+            "id": self.entry.id,
+            "status": self.entry.status,
+            "received": self.entry.received,
+            **self.signed.plain(),
+            "result": self.result and self.result.plain(),
+            "withheld": self.withheld,
+            "withdrawal": self.withdrawal and self.withdrawal.plain(),
+        }
+
+
+def told(store: Store, entry: EntryRow) -> Told:
+    """What may be told of a submission: its scores only where the board shows any number."""
+    result = store.result(entry.id)
+    withheld = ""
+    if result is not None and result.scores is not None:
+        try:
+            refuse_unpublishable(store.entries())
+        except NotPublishable as error:
+            result, withheld = None, str(error)
+    return Told(entry, store.submission(entry.id), result, withheld, store.withdrawal(entry.id))
 
 
 def to_json(
@@ -138,6 +186,11 @@ def to_latex(
     return "\n".join(lines) + "\n"
 
 
+def fixed(value: float, digits: int = 3) -> str:
+    """A number as every table shows it: fixed digits, and no negative zero."""
+    return f"{value:z.{digits}f}"
+
+
 def _of(board: BoardDocument, head: Head, date: str | None) -> dict[str, Any]:
     """What a file is of."""
     return {
@@ -180,19 +233,19 @@ def _harmless(cell: Any) -> Any:
         return str(cell).lower()
     if not isinstance(cell, str):
         return cell
-    text = _one_line(cell)
+    text = one_line(cell)
     return f"'{text}" if text.startswith(_FORMULA_STARTS) else text
 
 
 def _latex(text: str) -> str:
     """Text that LaTeX shows as it was written, on one line."""
-    return "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
+    return "".join(_LATEX.get(letter, letter) for letter in one_line(text))
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
     """Text without line ends, and without what is not seen but turns others' direction."""
     return "".join(letter for letter in " ".join(text.split()) if letter.isprintable())
 
 
 def _interval(estimate: Estimate) -> str:
-    return f"${estimate.value:.3f}$ [${estimate.low:.3f}$, ${estimate.high:.3f}$]"
+    return f"${fixed(estimate.value)}$ [${fixed(estimate.low)}$, ${fixed(estimate.high)}$]"

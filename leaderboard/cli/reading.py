@@ -70,6 +70,8 @@ def rank(
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
+    from leaderboard.tables import fixed
+
     reasons = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
     table = Table(
@@ -93,7 +95,7 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
             notes.get(row.reason, "") if row.first is None else ranks(row.first, row.last),
             escape(f"{entry.method} {entry.version}".strip()),
             escape(entry.submitter),
-            *(_interval(v) if name == metric else f"{v.value:z.3f}" for name, v in shown.items()),
+            *(_interval(v) if name == metric else fixed(v.value) for name, v in shown.items()),
             str(entry.runs),
             style="dim" if row.first is None else None,
         )
@@ -106,9 +108,11 @@ def ranks(first: int, last: int | None) -> str:
 
 
 def _interval(value: Estimate) -> str:
+    from leaderboard.tables import fixed
+
     if value.low == value.high:  # of one run in each class nothing is known of its spread
-        return f"{value.value:z.3f}"
-    return f"{value.value:z.3f} ({value.low:z.3f} to {value.high:z.3f})"
+        return fixed(value.value)
+    return f"{fixed(value.value)} ({fixed(value.low)} to {fixed(value.high)})"
 
 
 def show(
@@ -120,20 +124,26 @@ def show(
 ) -> None:
     """One submission: who, what, and each number with where it comes from.
 
+    Where the reference rows wait or leave 0 and 1, it says so instead of the numbers.
+
     Examples:
 
       sme-leaderboard show board 3f2a
     """
+    from leaderboard import tables
     from leaderboard.store import Store
 
     with Store.open(board, read_only=True) as store:
         entry = find_entry(store, id)
-        signed, result = store.submission(entry.id), store.result(entry.id)
+        told = tables.told(store, entry)
     if json:
-        plain = None if result is None else result.plain()
-        print_json({"status": entry.status, **signed.plain(), "result": plain})
+        print_json(told.plain())
         return
-    submission = signed.submission
+    submission, result = told.signed.submission, told.result
+    pairs: dict[str, object] = {}
+    if told.withdrawal is not None:
+        reason = tables.one_line(told.withdrawal.withdrawal.reason)
+        pairs["withdrawn because"] = reason or "not said"
     print_pairs(
         f"[bold]{escape(entry.method)} {escape(entry.version)}[/] by {escape(entry.submitter)}: "
         f"{entry.status}",
@@ -146,8 +156,11 @@ def show(
             "runs": f"{entry.runs:,} with {entry.steps:,} steps in all",
             "training": submission.training.library or "not said",
             "statement": submission.statement or "none",
+            **pairs,
         },
     )
+    if told.withheld:
+        out().print(f"[yellow]scores withheld[/]: {escape(told.withheld)}", soft_wrap=True)
     if result is None:
         return
     if result.status == "rejected":
@@ -160,6 +173,8 @@ def show(
 
 
 def _profile_table(result: Result) -> Table:
+    from leaderboard.tables import fixed
+
     assert result.scores is not None
     table = Table(title="normalised regret (0 optimal, 1 the constant ½)", title_justify="left")
     table.add_column("")
@@ -174,17 +189,19 @@ def _profile_table(result: Result) -> Table:
         "points of r̃ lost": scores.points,
         **{f"N in OOD {m}" if m else "N in WD": value for m, value in enumerate(scores.profile)},
     }.items():
-        table.add_row(label, *(f"{x:z.4f}" for x in (value.value, value.low, value.high)))
+        table.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
     return table
 
 
 def _class_table(result: Result) -> Table:
+    from leaderboard.tables import fixed
+
     table = Table(title="by class", title_justify="left")
     for name in ("class", "runs", "N₀", "A"):
         table.add_column(name, justify="left" if name == "class" else "right")
     for member in result.classes:
         table.add_row(
-            escape(member.name), str(member.runs), f"{member.wd:.4f}", f"{member.ood:.4f}"
+            escape(member.name), str(member.runs), fixed(member.wd, 4), fixed(member.ood, 4)
         )
     return table
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from leaderboard.result import Estimate
+from leaderboard.tables import fixed
 
 _MARGIN = 3.0  # % of a bar's width at either end, so that a dot at the end is whole
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
@@ -57,11 +58,8 @@ def _ends(values: Iterable[float]) -> tuple[float, float]:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number as text: fixed digits, a true minus sign, no negative zero."""
-    text = f"{value:.{digits}f}"
-    if float(text) == 0.0:
-        text = text.removeprefix("-")
-    return text.replace("-", "\u2212")
+    """A number as the pages show it: as every table does, with a true minus sign."""
+    return fixed(value, digits).replace("-", "\u2212")
 
 
 def reference_lines(scale: Scale, references: Sequence[tuple[str, float]]) -> Markup:

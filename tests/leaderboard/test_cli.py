@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.keys import SigningKey
+from leaderboard.scoring import score_submission
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.spec import ProtocolFile, SuiteFile
@@ -174,6 +175,48 @@ def test_a_board_whose_references_wait_shows_nothing() -> None:
     assert "reference" in fails(2, "rank", "board")
     assert "reference" in fails(2, "site", "board")
     assert not Path("board/site/index.html").exists()
+
+
+def test_show_withholds_scores_until_the_references_are_right_and_says_why() -> None:
+    good("keygen")
+    make_board()
+    id = make_bundle()
+    good("submit", "bundle", "board")
+    with Store.open("board") as store:
+        claims = [store.claim(f"worker {number}") for number in range(3)]
+        assert claims[2] is not None
+        assert claims[2].id == id
+        submission = store.submission(id).submission
+        result = score_submission(store.document, submission, store.object_bytes)
+        assert store.finish(claims[2], result)
+        for claim in claims[:2]:
+            assert claim is not None
+            store.release(claim)
+    shown = good("show", "board", id)
+    assert "scored" in shown
+    assert "reference row 'optimal': waiting" in shown
+    assert "regret" not in shown
+    plain = json.loads(good("show", "board", id, "--json"))
+    assert (plain["status"], plain["result"]) == ("scored", None)
+    assert "'optimal'" in plain["withheld"]
+
+    good("score", "board")
+    assert "WD regret" in good("show", "board", id)
+    plain = json.loads(good("show", "board", id, "--json"))
+    assert plain["result"]["scores"]["wd"]["value"] > 0
+    assert plain["withheld"] == ""
+
+
+def test_show_tells_why_a_submission_was_withdrawn() -> None:
+    good("keygen")
+    make_board()
+    id = make_bundle()
+    good("submit", "bundle", "board")
+    assert "withdrawn" not in good("show", "board", id)
+    good("withdraw", "board", id, "--reason", "a bug in [bold]the wrapper[/]")
+    assert "a bug in [bold]the wrapper[/]" in good("show", "board", id)
+    plain = json.loads(good("show", "board", id, "--json"))
+    assert plain["withdrawal"]["withdrawal"]["reason"] == "a bug in [bold]the wrapper[/]"
 
 
 def test_an_altered_result_ends_with_3_and_is_named() -> None:

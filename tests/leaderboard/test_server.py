@@ -250,6 +250,27 @@ def test_a_submission_is_told_with_its_result(published: tuple[str, dict[str, st
     assert read.id == ids["sac"]
 
 
+def test_scores_are_withheld_until_the_references_are_right(url: str, store: Store) -> None:
+    key = SigningKey.generate()
+    scored = boards.submit(store, key, "PPO", [0.2] * 6)
+    code = ("onnx_op", "node 3: op_type='Loop': must be one of the list.")
+    rejected = boards.submit(store, key, "Broken", None, rejected=code)
+    assert refusal(HTTP.get(url, headers=JSON)) == (503, "not_publishable")
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert (told["status"], told["result"]) == ("scored", None)
+    assert "reference row 'optimal': missing" in told["withheld"]
+    assert "0.2" not in json.dumps(told)
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(rejected)}").json()
+    assert (told["status"], told["result"]["code"]) == ("rejected", "onnx_op")
+
+    for name, level in (("optimal", 0.0), ("constant", 1.0)):
+        own = store.folder.signing_key()
+        boards.submit(store, own, name, [level] * 6, family="reference", spread=0.0)
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert told["result"]["scores"]["profile"][0]["value"] > 0
+    assert told["withheld"] == ""
+
+
 def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]]) -> None:
     answer = HTTP.get(f"{published[0]}/api/submissions/{'0' * 64}")
     assert refusal(answer) == (404, "unknown_submission")
@@ -673,6 +694,8 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
         answer = HTTP.post(path, json=own.plain())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")
     assert refusal(post(url, signed.to_bytes())) == (410, "withdrawn")
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}").json()
+    assert told["withdrawal"] == own.plain()
 
 
 @pytest.mark.parametrize(
