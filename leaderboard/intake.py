@@ -17,12 +17,13 @@ import datetime
 import hashlib
 import os
 import re
+import unicodedata
 from collections.abc import Callable
 
 from leaderboard.artefact.gate import inspect
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle
-from leaderboard.checks import check_submission
+from leaderboard.checks import _UNSAFE_CATEGORIES, check_submission
 from leaderboard.errors import Rejection
 from leaderboard.keys import SigningKey, verifies
 from leaderboard.store import Store
@@ -173,13 +174,20 @@ def withdraw(store: Store, signed: SignedWithdrawal) -> str:
       The submission's id; a second withdrawal changes nothing.
 
     Raises:
-      Rejection: `unknown_submission` or `bad_signature`.
+      Rejection: `unknown_submission`, `unsafe_name` or `bad_signature`.
     """
     id = signed.withdrawal.submission
     if store.entry(id) is None:
         raise Rejection(
             "unknown_submission", f"submission={id}: is not on this board. Check the id."
         )
+    for letter in signed.withdrawal.reason:
+        if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
+            raise Rejection(
+                "unsafe_name",
+                f"reason: holds {letter!a}: must hold no control characters but line breaks. "
+                "Remove it.",
+            )
     store.withdraw(signed)
     return id
 

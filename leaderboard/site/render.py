@@ -114,7 +114,8 @@ METRICS = (
         "D",
         "OOD decay D",
         "what is lost on the way out",
-        "D = A − N₀: how much of what was learned inside is lost outside. 0 is no loss.",
+        "D = A − N₀: how much of what was learned inside is lost outside. 0 is no loss, "
+        "and less is a gain.",
         (("optimal", 0.0), ("constant", 0.0)),
     ),
 )
@@ -221,6 +222,7 @@ class Pages:
         """
         entry = self._by_id[id]
         signed, result = self._documents(id)
+        withdrawal = self.store.withdrawal(id)
         submission = signed.submission
         digits = hex_of(id)
         scores = result.scores if result is not None else None
@@ -243,6 +245,7 @@ class Pages:
             s=submission,
             result=result,
             status=entry.status,
+            reason=withdrawal.withdrawal.reason if withdrawal is not None else "",
             reference=entry.reference,
             received=entry.received,
             sequence=entry.sequence,

@@ -256,6 +256,17 @@ def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
     assert code_of(lambda: intake.withdraw(store, board)) == "bad_signature"
 
 
+@pytest.mark.parametrize("letter", ["\x1b", "\x00", "\r", "\u202e", "\u2028"])
+def test_a_reason_holds_no_characters_that_steer_whoever_reads_it(
+    store: Store, key: SigningKey, letter: str
+) -> None:
+    signed = put_submission(store, key)
+    unsafe = intake.withdrawal_of(signed.id, key, f"a bug{letter}[2J")
+    assert code_of(lambda: intake.withdraw(store, unsafe)) == "unsafe_name"
+    assert store.withdrawal(signed.id) is None
+    intake.withdraw(store, intake.withdrawal_of(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+
+
 def test_what_is_not_there_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
     withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key)
     assert code_of(lambda: intake.withdraw(store, withdrawal)) == "unknown_submission"

@@ -13,6 +13,7 @@ import pytest
 
 from leaderboard.board import hex_of
 from leaderboard.errors import BoardError, NotPublishable
+from leaderboard.intake import withdrawal_of
 from leaderboard.keys import SigningKey
 from leaderboard.site import STATIC, Pages, content_type, render, write_site
 from leaderboard.store import Store
@@ -237,6 +238,24 @@ def test_the_page_of_a_submission_says_what_became_of_it(kind, board, pages, sit
     else:
         assert "Withdrawn by its submitter" in words
     assert has_result == (kind != "waiting")
+
+
+def test_the_page_of_a_withdrawn_submission_gives_its_reason_as_text(tmp_path):
+    key = SigningKey.generate()
+    with boards.create(tmp_path / "board", classes=1) as store:
+        id = boards.submit(store, key, "PPO", [0.2] * 6)
+        assert "The reason given" not in Page(Pages(store).submission(id)).words
+        store.withdraw(withdrawal_of(id, key, boards.HOSTILE))
+        page = Page(Pages(store).submission(id))
+    assert f"The reason given: {boards.HOSTILE}" in page.words
+
+
+def test_latex_has_no_negative_zero(tmp_path):
+    with boards.create(tmp_path / "board", classes=1) as store:
+        boards.submit(store, SigningKey.generate(), "Near", [4e-7, *[0.0] * 5], spread=0.0)
+        pages = Pages(store)
+        assert any(entry.scores.decay.value < 0 for entry in pages.entries)
+        assert "-0.000" not in pages.read("board.tex").decode()
 
 
 def test_runs_that_were_started_and_not_listed_are_shown(board, pages):
