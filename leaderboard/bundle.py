@@ -107,6 +107,12 @@ class Bundle:
                 "artefact_missing",
                 f"{ARTEFACTS}/{name}: is not in the bundle. Put it there, or make the bundle anew.",
             )
+        if len(data) > MAX_ARTEFACT_BYTES:
+            raise Rejection(
+                "too_large",
+                f"{ARTEFACTS}/{name}: must be at most {MAX_ARTEFACT_BYTES:,} bytes. Submit a "
+                "smaller network.",
+            )
         if sizes != {len(data)} or _digest_of(data) != digest:
             raise Rejection(
                 "artefact_digest",
@@ -206,7 +212,8 @@ def make_bundle(
         check_runs(suite.suite, made)
         return made
 
-    submission([None] * len(listed))  # what is wrong without the policies is told before exporting
+    # What is wrong whatever the policies are, is told before they are exported.
+    SignedSubmission.read(submission(_smallest(listed)).signed(key).to_bytes())
     with _made_whole(folder, force) as temporary:
         artefacts = []
         for done, run in enumerate(listed, start=1):
@@ -354,6 +361,14 @@ def _cut(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
+def _smallest(listed: list[_Listed]) -> list[Artefact | None]:
+    """What stands for the policies, one of its own for each, until there are any."""
+    return [
+        None if run.policy is None else Artefact(sha256=f"sha256:{number:064x}", size=1)
+        for number, run in enumerate(listed)
+    ]
+
+
 def _put_artefact(run: _Listed, bundle: Path) -> Artefact | None:
     """Write a run's policy into the bundle, by its hash."""
     if run.policy is None:
@@ -452,13 +467,13 @@ def _sync(folder: Path) -> None:
 
 
 def _read_plain(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | None:
-    """A plain file inside a folder; None where it, or the folder, is missing.
+    """A plain file inside a folder, up to a byte above the limit; None where there is none.
 
     Opened part by part and without following links, so that nothing outside the folder is read,
     whoever changes it meanwhile; and without waiting, so that a pipe is refused and not read.
 
     Raises:
-      Rejection: `artefact_path` where a part is a link or no plain file; `too_large`.
+      Rejection: `artefact_path` where a part is a link or no plain file.
     """
     name = "/".join(parts)
     refused = Rejection(
@@ -484,13 +499,7 @@ def _read_plain(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | Non
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise refused
         with open(handle, "rb", closefd=False) as stream:
-            data = stream.read(limit + 1)
-    if len(data) > limit:
-        raise Rejection(
-            "too_large",
-            f"{name}: must be at most {limit:,} bytes. Submit a smaller network, or fewer runs.",
-        )
-    return data
+            return stream.read(limit + 1)
 
 
 def _digest_of(data: bytes) -> str:

@@ -23,9 +23,18 @@ import unicodedata
 from collections import Counter
 
 from leaderboard.board import BoardDocument
-from leaderboard.errors import Rejection
+from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring import refuse_countless
-from leaderboard.submission import Submission
+from leaderboard.submission import (
+    MAX_ARTEFACT_BYTES,
+    MAX_BYTES,
+    Artefact,
+    Method,
+    Run,
+    SignedSubmission,
+    Submission,
+    Submitter,
+)
 from sme_registry.spec import Suite
 
 MINUTES_AHEAD = 10
@@ -127,6 +136,49 @@ def check_runs(suite: Suite, submission: Submission) -> None:
                 "Train on it, or list a failed run with artefact null, which scores 1.",
             )
     _check_started(submission, Counter(class_of[run.spec] for run in submission.runs))
+
+
+def refuse_unsubmittable(board: BoardDocument) -> None:
+    """Refuse a board whose suite needs more runs than a submission can list.
+
+    Needed is a run on each instance, and in each class as many as ranking needs.
+
+    Raises:
+      BoardError: they do not fit into the bytes of a submission.
+    """
+    needed = sum(max(len(one.instances), board.runs_to_rank) for one in board.suite.classes)
+    most = most_runs(board)
+    if needed > most:
+        raise BoardError(
+            f"suite={board.suite_name}: an entry would need {needed:,} runs, one on each instance "
+            f"and {board.runs_to_rank} in each class to be ranked: must be at most {most}, which "
+            f"the {MAX_BYTES:,} bytes of a submission hold. Make a board of fewer classes or "
+            "instances, or one that ranks with fewer runs."
+        )
+
+
+def most_runs(board: BoardDocument) -> int:
+    """How many runs a submission to a board can list, with ample numbers and short texts."""
+    digest = board.suite.digest
+    run = Run(
+        spec=digest,
+        seed=10**6,
+        steps=10**7,
+        artefact=Artefact(sha256=digest, size=MAX_ARTEFACT_BYTES),
+    )
+    submission = Submission(
+        suite=board.suite_reference,
+        method=Method(name="x" * 20, version="1.0", family="x" * 20, knowledge="generic"),
+        submitter=Submitter(name="x" * 20, key=board.key),
+        created="2026-01-01T00:00:00Z",
+        runs=(run,),
+        runs_started={member.name: 100 for member in board.suite.classes},
+    )
+    one, two = (
+        len(SignedSubmission(submission=each, signature="0" * 128).to_bytes())
+        for each in (submission, submission.model_copy(update={"runs": (run, run)}))
+    )
+    return 1 + (MAX_BYTES - one) // (two - one)
 
 
 def _check_suite(board: BoardDocument, submission: Submission) -> None:

@@ -152,8 +152,8 @@ class SignedSubmission(StrictModel):
         if len(text) > MAX_BYTES:
             raise Rejection(
                 "too_large",
-                f"{FILE}: {len(text):,} bytes: must be at most {MAX_BYTES:,}. "
-                "List fewer runs or shorten the texts.",
+                f"{FILE}: must be at most {MAX_BYTES:,} bytes. "
+                "List fewer runs, or shorten the texts.",
             )
         try:
             plain = parse_json(text, FILE)

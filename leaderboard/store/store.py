@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Self
 
 from leaderboard.board import BoardDocument, Folder
+from leaderboard.checks import refuse_unsubmittable
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.keys import SigningKey, verifies
 from leaderboard.result import Result
@@ -144,6 +145,7 @@ class Store:
             raise BoardError(
                 f"suite={suite_name}: two classes share an instance. Change one of their seeds."
             )
+        refuse_unsubmittable(document)
         path = Path(path)
         # Made beside and renamed, so that no folder ever holds half a board.
         making = Folder(temporary_beside(path.absolute()))

@@ -99,7 +99,12 @@ def test_a_changed_submission_is_refused(bundle):
 def test_a_submission_above_the_limit_is_not_read_to_its_end(bundle):
     with (bundle.folder / "submission.json").open("r+b") as stream:
         stream.truncate(2**40)  # a hole: reading it whole would never end
-    refused("too_large", f"at most {MAX_BYTES:,} bytes", Bundle.read, bundle.folder)
+    refused(
+        "too_large",
+        f"^too_large: submission.json: must be at most {MAX_BYTES:,} bytes. List fewer runs",
+        Bundle.read,
+        bundle.folder,
+    )
 
 
 def test_an_artefact_that_no_run_names_is_refused(bundle):
@@ -137,7 +142,12 @@ def test_an_artefact_above_the_limit_is_not_read_to_its_end(bundle):
     with artefact_path(bundle).open("r+b") as stream:
         stream.truncate(2**40)
     digest = bundle.signed.submission.runs[0].artefact.sha256
-    refused("too_large", f"at most {MAX_ARTEFACT_BYTES:,} bytes", bundle.artefact, digest)
+    refused(
+        "too_large",
+        f"at most {MAX_ARTEFACT_BYTES:,} bytes. Submit a smaller network.",
+        bundle.artefact,
+        digest,
+    )
 
 
 def replaced_by_link(path, target):
@@ -377,9 +387,18 @@ def test_what_the_board_would_refuse_is_refused_before_exporting(
     assert seen == []
 
 
-def test_a_submission_of_too_many_runs_is_refused(tmp_path, table):
-    rows = [row(spec, None, seed) for spec in SUITE.instances for seed in range(200)]
-    nothing_is_left(tmp_path, Rejection, "too_large: submission.json", rewritten(table, rows))
+@pytest.mark.parametrize("policy", [None, "seed0.onnx"])
+def test_a_submission_of_too_many_runs_is_refused_before_exporting(tmp_path, table, policy):
+    rows = [row(spec, policy, seed) for spec in SUITE.instances for seed in range(200)]
+    seen = []
+    nothing_is_left(
+        tmp_path,
+        Rejection,
+        "too_large: submission.json: .* List fewer runs",
+        rewritten(table, rows),
+        progress=lambda *counts: seen.append(counts),
+    )
+    assert seen == []
 
 
 def test_a_bundle_that_is_there_is_replaced_only_when_told(tmp_path, table, bundle):

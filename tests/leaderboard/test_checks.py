@@ -7,11 +7,12 @@ import datetime
 import pytest
 
 from leaderboard.board import BoardDocument, Limits
-from leaderboard.checks import check_submission
-from leaderboard.errors import Rejection
-from leaderboard.submission import Submission
+from leaderboard.checks import check_submission, most_runs, refuse_unsubmittable
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.store import Store
+from leaderboard.submission import MAX_BYTES, SignedSubmission, Submission
 from sme_registry import EvaluationProtocol
-from sme_registry.spec import Suite
+from sme_registry.spec import Suite, SuiteFile, catalogue
 
 SETTING = {"state_dim": 2, "action_dim": 1}
 SUITE = Suite.parse(
@@ -245,6 +246,48 @@ def test_an_artefact_above_the_boards_limit_is_refused():
         "runs.2.artefact.size=1,001: must be at most 1,000 bytes",
         runs=[*RUNS[:2], run(B0, 0, policy(3, size=1001))],
     )
+
+
+def board_of(instances, **fields):
+    suite = Suite.parse(
+        {"classes": [{"name": "A", "setting": SETTING, "seeds": list(range(instances))}]}
+    )
+    return BOARD.model_copy(update={"suite": suite, **fields})
+
+
+def signed_runs(board, count, **changes):
+    """The bytes of a submission with so many runs, all alike but for the seed."""
+    runs = [
+        {"spec": A0, "seed": number, "steps": 10**6, "artefact": policy(number, 10**6)}
+        for number in range(count)
+    ]
+    made = submission(runs=runs, **changes)
+    return SignedSubmission(submission=made, signature="0" * 128).to_bytes()
+
+
+def test_the_most_runs_of_a_submission_fit_and_a_tenth_more_do_not():
+    most = most_runs(BOARD)
+    assert most == pytest.approx(200, abs=20)  # as docs/leaderboard.md says
+    assert len(signed_runs(BOARD, most)) <= MAX_BYTES < len(signed_runs(BOARD, most + most // 10))
+
+
+def test_a_board_that_nobody_could_submit_to_is_refused(tmp_path):
+    most = most_runs(BOARD)
+    refuse_unsubmittable(board_of(most))
+    with pytest.raises(BoardError, match=rf"suite=two-v1: .* {most + 1} runs.*at most {most},"):
+        refuse_unsubmittable(board_of(most + 1))
+    with pytest.raises(BoardError, match="and 300 in each class to be ranked"):
+        refuse_unsubmittable(board_of(1, runs_to_rank=300))
+    with pytest.raises(BoardError, match="would need 260 runs"):
+        Store.create(
+            tmp_path / "board",
+            title="The paper's",
+            suite_name="paper-ablations-v1",
+            suite=catalogue.find(SuiteFile, "paper-ablations-v1").suite,
+            protocol_name="paper-v1",
+            protocol=EvaluationProtocol(),
+        )
+    assert not list(tmp_path.iterdir())
 
 
 FAULTS = [
