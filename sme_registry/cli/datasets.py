@@ -211,7 +211,7 @@ def validate(
     out_folder: Folder = None,
     json: Json = False,
 ) -> None:
-    """Check sets to the last bit: every digest, and every transition again through the task.
+    """Check sets to the last bit: place, digests, and every transition again through the task.
 
     Examples:
 
@@ -220,6 +220,7 @@ def validate(
       sme dataset validate data/sme/*
     """
     from sme_registry.datasets import open_dataset, replay
+    from sme_registry.datasets.minari_file import refuse_misplaced
     from sme_registry.task import materialize
 
     results: list[dict[str, Any]] = []
@@ -227,6 +228,7 @@ def validate(
         result: dict[str, Any] = {"set": name, "valid": True, "error": None}
         try:
             dataset = open_dataset(name, out_folder)
+            refuse_misplaced(dataset, out_folder)
             replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
             result["arrays_digest"] = dataset.record.arrays_digest
         except SMEError as error:

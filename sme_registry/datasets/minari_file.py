@@ -369,22 +369,50 @@ def open_dataset(
     return Dataset(str(metadata.get("dataset_id")), path, record)
 
 
+def refuse_misplaced(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
+    """Raise where a set does not lie where its id says.
+
+    Below the folder its path must be its id, as for Minari; elsewhere its path must end with it.
+
+    Args:
+      dataset: the set.
+      folder: where sets lie; None for Minari's folder.
+
+    Raises:
+      SpecError: it lies elsewhere, so that its id finds another set or none.
+    """
+    # Not resolved: a link in the right place is in the right place.
+    path, place = (
+        Path(os.path.abspath(given)) for given in (dataset.path, datasets_folder(folder))
+    )
+    own = tuple(dataset.id.split("/"))
+    inside = path.is_relative_to(place)
+    if own != (path.relative_to(place).parts if inside else path.parts[-len(own) :]):
+        home = place / dataset.id if inside else f"a folder {dataset.id}"
+        raise SpecError(
+            f"{path}: holds the set {dataset.id}: move or copy it back to {home}, or remove it if "
+            "that is there already. For a set of another name, make it with --name."
+        )
+
+
 def list_datasets(
     folder: str | os.PathLike[str] | None = None,
 ) -> tuple[list[Dataset], dict[Path, str]]:
-    """Every set of ours in a folder, and those that cannot be opened.
+    """Every set of ours in a folder, and those that cannot be opened or do not lie in their place.
 
     Args:
       folder: where sets lie; None for Minari's folder.
 
     Returns:
-      The sets by id, and for each of ours that cannot be opened why.
+      The sets by id, and for each other of ours why it is not one of them.
     """
     place = datasets_folder(folder)
     found, broken = [], {}
     for dataset_id, path in _folders(place):
         try:
-            found.append(open_dataset(path))
+            dataset = open_dataset(path)
+            refuse_misplaced(dataset, place)
+            found.append(dataset)
         except SMEError as error:
             if "is no data set of `sme dataset make`" not in str(error):
                 broken[place / dataset_id] = str(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from typer.testing import CliRunner
@@ -140,6 +141,23 @@ def test_validate_says_which_set_is_wrong_and_still_checks_the_others(tmp_path):
     result = sme("validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json")
     assert result.exit_code == 2
     assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
+
+
+def test_a_copy_under_another_name_is_not_listed_and_not_valid(tmp_path):
+    good("make", "Default", "-n", "50")
+    own = "sme/Default-v1-nu50-seed0-v0"
+    shutil.copytree(tmp_path / "minari" / own, tmp_path / "minari/sme/Copy-v0")
+    listed = good("list")
+    assert listed.stdout.count(own) == 1
+    told = " ".join(listed.stderr.split())
+    assert "not listed:" in told
+    back = tmp_path / "minari" / own
+    assert f"sme/Copy-v0: holds the set {own}: move or copy it back to {back}, or" in told
+    assert [found["id"] for found in json.loads(good("list", "--json").stdout)] == [own]
+    for name in ("sme/Copy-v0", "minari/sme/Copy-v0"):
+        assert f"Copy-v0: holds the set {own}" in refused("validate", name)
+    shutil.copytree(tmp_path / "minari" / own, tmp_path / "backup" / own)
+    good("validate", own, f"minari/{own}", f"backup/{own}")
 
 
 def test_a_broken_set_is_told_of_beside_the_list(tmp_path):

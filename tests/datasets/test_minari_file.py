@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import nullcontext
 from pathlib import Path
 
 import h5py
@@ -416,6 +417,47 @@ class TestAChangedSet:
         with pytest.raises(MalformedDocumentError, match="Minari can open it"):
             open_dataset(NAME, copied)
         assert list_datasets(copied) == ([], {})
+
+
+class TestAMisplacedSet:
+    """One whose folder is not where its id says: its id finds another set, or none."""
+
+    @pytest.fixture(params=["sme/copy-v0", "other/tests-v0", "tests-v0", "my/sme/tests-v0"])
+    def misplaced(self, request, copied):
+        shutil.copytree(copied / NAME, copied / request.param)
+        return request.param
+
+    def test_is_not_listed_as_minari_does_not_list_it(self, misplaced, copied, monkeypatch):
+        found, broken = list_datasets(copied)
+        assert [dataset.path for dataset in found] == [copied / NAME]
+        assert list(broken) == [copied / misplaced]
+        told = f"holds the set {NAME}: move or copy it back to {copied / NAME}, or remove it"
+        assert told in broken[copied / misplaced]
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
+        with pytest.warns(UserWarning, match=f"does not match id '{NAME}'"):
+            assert list(minari.list_local_datasets()) == [NAME]
+
+    def test_is_still_opened_and_is_refused_by_whatever_name_it_is_given(
+        self, misplaced, copied, monkeypatch
+    ):
+        monkeypatch.chdir(copied / misplaced)
+        for given in (misplaced, copied / misplaced, ".", "data"):
+            with pytest.raises(SpecError, match=f"holds the set {NAME}"):
+                minari_file.refuse_misplaced(open_dataset(given, copied), copied)
+
+    def test_outside_the_folder_of_sets_is_known_by_the_end_of_its_path(self, copied, tmp_path):
+        for place, right in [("a/sme/tests-v0", True), ("mine", False), ("sme/copy-v0", False)]:
+            shutil.copytree(copied / NAME, tmp_path / place)
+            dataset, told = open_dataset(tmp_path / place), f"back to a folder {NAME}"
+            with nullcontext() if right else pytest.raises(SpecError, match=told):
+                minari_file.refuse_misplaced(dataset, copied)
+
+    def test_a_link_in_the_right_place_is_in_the_right_place(self, copied, tmp_path):
+        (copied / NAME).rename(tmp_path / "elsewhere")
+        (copied / NAME).symlink_to(tmp_path / "elsewhere")
+        found, broken = list_datasets(copied)
+        assert [dataset.id for dataset in found] == [NAME]
+        assert not broken
 
 
 def test_a_set_that_is_not_there_names_the_nearest(shelf):
