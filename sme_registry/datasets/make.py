@@ -66,7 +66,7 @@ def make_dataset(
     Raises:
       UnknownNameError, SpecError: no such task or protocol, or a field outside its range.
       OptionError: a name that Minari refuses, too small a sub-cube, a full disk.
-      NameTakenError: there is a set of this name.
+      NameTakenError: there is a set of this name; says whether it is the same one.
       PolicyError: a policy cannot be used.
       ResourceLimitError: the set would not fit in memory.
       MissingDependencyError: Minari with its HDF5 extra is not installed.
@@ -95,7 +95,7 @@ def make_dataset(
     dataset_id = minari_file.checked_id(default_id(recipe) if name is None else name)
     place = minari_file.datasets_folder(folder)
     # Known now, rather than after the work.
-    minari_file.refuse_existing(place / dataset_id, place, force)
+    minari_file.refuse_existing(place / dataset_id, place, recipe, force)
 
     task = materialize(recipe.spec)
     made = collect(recipe, task, policies, progress=progress)

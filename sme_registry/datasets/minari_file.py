@@ -237,8 +237,14 @@ def checked_id(dataset_id: str) -> str:
     return dataset_id
 
 
-def refuse_existing(target: Path, folder: Path, force: bool) -> None:
+def refuse_existing(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
     """Raise where a set cannot be put in its place.
+
+    Args:
+      target: its place.
+      folder: where sets lie.
+      recipe: of the set, beside which an error puts that of a set that is there.
+      force: replace a set of ours.
 
     Raises:
       NameTakenError: something is there, and either `force` is not given or it is no set of ours.
@@ -254,8 +260,8 @@ def refuse_existing(target: Path, folder: Path, force: bool) -> None:
         return
     if not force:
         raise NameTakenError(
-            f"{target}: is there already. Give another --name or --out, or --force to replace it "
-            "(in Python force=True)."
+            f"{target}: is there already{_beside(target, recipe)}. Give another --name or --out, "
+            "or --force to replace it (in Python force=True)."
         )
     try:
         ours = KEY in read_json(target / "data" / METADATA)
@@ -266,6 +272,24 @@ def refuse_existing(target: Path, folder: Path, force: bool) -> None:
             f"{target}: is there already and is no data set of this package, so it is not "
             "replaced. Give another --name or --out, or remove it yourself."
         )
+
+
+def _beside(target: Path, recipe: DatasetRecipe) -> str:
+    """How a set that is there compares with one that is asked for: its id alone tells too little.
+
+    Nothing where what is there cannot be opened.
+    """
+    try:
+        there = open_dataset(target).recipe
+    except SMEError:
+        return ""
+    if there.digest != recipe.digest:
+        return f", of another recipe: {'; '.join(there.differences(recipe))}"
+    if any(
+        behaviour.kind == "policy" and behaviour.sha256 is None for behaviour in there.behaviours
+    ):
+        return ", of the same recipe as far as the name of a policy without a file tells"
+    return ", and is the same set"
 
 
 def write(
@@ -292,7 +316,7 @@ def write(
     """
     require_minari()
     target = folder / checked_id(dataset_id)
-    refuse_existing(target, folder, force)
+    refuse_existing(target, folder, record.recipe, force)
     metadata = _metadata(dataset_id, record)
     content = _hdf5(transitions, record)
     # As Minari counts them: in MB, of the files as they are then.

@@ -139,6 +139,29 @@ class DatasetRecipe(Document):
             b.weight * (1.0 - (1.0 / 3.0 if b.nu is None else b.nu / 6.0)) for b in self.behaviours
         )
 
+    def differences(self, asked: DatasetRecipe) -> list[str]:
+        """The fields in which another recipe differs: `transitions 100, asked for 200`."""
+        return _differences("", self.plain(), asked.plain())
+
+
+def _differences(path: str, own: Any, asked: Any) -> list[str]:
+    """The leaves in which plain data differ, each by its whole path: `spec.complexity 1, …`."""
+    if isinstance(own, dict) and isinstance(asked, dict):
+        pairs = {name: (own.get(name), asked.get(name)) for name in {**own, **asked}}
+    elif isinstance(own, list) and isinstance(asked, list) and len(own) == len(asked):
+        pairs = {str(index): pair for index, pair in enumerate(zip(own, asked, strict=True))}
+    elif own == asked:
+        return []
+    elif isinstance(own, list) and isinstance(asked, list):
+        return [f"{path} of {len(own)} entries, asked for {len(asked)}"]
+    else:
+        return [f"{path} {show(own)}, asked for {show(asked)}"]
+    return [
+        line
+        for name, (left, right) in pairs.items()
+        for line in _differences(f"{path}.{name}".lstrip("."), left, right)
+    ]
+
 
 def behaviour_of(what: Any, weight: float = 1.0, action_range: str | None = None) -> Behaviour:
     """A behaviour given as a person writes it.

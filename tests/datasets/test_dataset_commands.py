@@ -126,7 +126,15 @@ def test_bad_input_is_one_line_and_makes_nothing(arguments, message, tmp_path):
 
 def test_a_set_that_is_there_is_kept_unless_told():
     good("make", "Default", "-n", "50")
-    assert "is there already" in refused("make", "Default", "-n", "60")
+    assert "is there already, and is the same set. Give" in refused("make", "Default", "-n", "50")
+    for asked, said in [
+        (["-n", "60"], "transitions 50, asked for 60."),
+        (["-n", "50", "--coverage", "0"], "coverage None, asked for 0.0."),
+        (["-n", "60", "--protocol", "quick-v1"], "transitions 50, asked for 60; protocol.states"),
+    ]:
+        message = refused("make", "Default", *asked)
+        assert f"is there already, of another recipe: {said}" in message
+        assert "--force to replace it" in message
     good("make", "Default", "-n", "60", "--force")
     assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
 

@@ -252,9 +252,22 @@ class TestNames:
 class TestAnExistingSet:
     def test_is_refused_and_left_as_it_is(self, copied):
         before = (copied / NAME / "data" / "main_data.hdf5").read_bytes()
-        with pytest.raises(NameTakenError, match=r"is there already. Give another --name"):
+        with pytest.raises(NameTakenError, match=r"is there already, of another .*--name"):
             make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
         assert (copied / NAME / "data" / "main_data.hdf5").read_bytes() == before
+
+    def test_of_a_function_is_the_same_as_far_as_its_name_tells(self, tmp_path):
+        def act(observations):
+            return observations[:, :4]
+
+        for words in ("", "of the same recipe as far as the name of a policy without a file tells"):
+            with pytest.raises(NameTakenError, match=words) if words else nullcontext():
+                make_dataset("Default", mix=[(act, 1.0)], transitions=10, folder=tmp_path)
+
+    def test_that_cannot_be_opened_is_refused_without_a_comparison(self, copied):
+        edited(copied, lambda data: data["sme"].update(recipe_digest="sha256:" + "0" * 64))
+        with pytest.raises(NameTakenError, match=r"is there already\. Give another --name"):
+            make_dataset("Default", transitions=10, name=NAME, folder=copied)
 
     def test_is_replaced_when_told_so(self, copied):
         make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied, force=True)

@@ -40,6 +40,32 @@ def test_a_recipe_survives_its_json():
     assert DatasetRecipe.parse(made.plain()) == made
 
 
+def test_the_fields_in_which_recipes_differ_are_named_with_both_values():
+    assert recipe().differences(recipe()) == []
+    asked = recipe(transitions=200, spec={"complexity": 10}, coverage=-0.2, protocol={"seed": 1})
+    assert recipe().differences(asked) == [
+        "spec.complexity 1, asked for 10",
+        "transitions 50000, asked for 200",
+        "coverage None, asked for -0.2",
+        "protocol.seed 0, asked for 1",
+    ]
+
+
+def test_behaviours_that_differ_are_named_by_their_place_or_their_number():
+    halves = recipe(behaviours=weights(0.5, 0.5))
+    assert halves.differences(recipe(behaviours=weights(0.5, 0.25, 0.25))) == [
+        "behaviours of 2 entries, asked for 3"
+    ]
+    assert halves.differences(recipe(behaviours=weights(0.25, 0.75))) == [
+        "behaviours.0.weight 0.5, asked for 0.25",
+        "behaviours.1.weight 0.5, asked for 0.75",
+    ]
+    file = {"kind": "policy", "policy": "x", "sha256": "sha256:" + "0" * 64}
+    named = recipe(behaviours=[{"kind": "policy", "policy": "x"}])
+    (line,) = named.differences(recipe(behaviours=[file]))
+    assert line.startswith("behaviours.0.sha256 None, asked for 'sha256:000")
+
+
 @pytest.mark.parametrize("nu", [-0.01, 1.01, float("nan"), float("inf"), "0.5", True])
 def test_nu_outside_zero_to_one_is_refused(nu):
     with pytest.raises(SpecError, match=r"nu=.*must be .*\[0, 1\]"):
