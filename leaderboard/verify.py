@@ -2,6 +2,9 @@
 
 In this order, so that the first row named is the one to look at: the log's chain and signatures,
 each entry's document, what the log does not name, the artefacts, the numbers, the index.
+
+Entries cut off the log's end leave no trace in it, nor does a log that the board itself wrote and
+signed anew. Both show where the digest of an entry was kept elsewhere: `contains`.
 """
 
 from __future__ import annotations
@@ -58,6 +61,8 @@ class VerifyReport:
 
     Attributes:
       entries: of the log.
+      log_sequence, log_digest: of its last entry; kept elsewhere, the digest tells later whether
+        the log was cut or written anew.
       unlogged: submissions and withdrawals whose process was killed before it logged them;
         nobody is shown them.
       rows: of the index, equal to those of one made anew; 0 where there is no index.
@@ -65,6 +70,8 @@ class VerifyReport:
     """
 
     entries: int
+    log_sequence: int
+    log_digest: str
     submissions: int
     withdrawals: int
     results: int
@@ -75,7 +82,12 @@ class VerifyReport:
 
 
 def verify(
-    path: str | Path, *, rescore: int = 0, seed: int = 0, progress: Progress | None = None
+    path: str | Path,
+    *,
+    rescore: int = 0,
+    seed: int = 0,
+    contains: str | None = None,
+    progress: Progress | None = None,
 ) -> VerifyReport:
     """Verify everything about a board; writes nothing.
 
@@ -83,6 +95,7 @@ def verify(
       path: the board's folder.
       rescore: how many submissions, drawn at random from those scored, to score anew.
       seed: of the draw.
+      contains: digest of an entry that the log had once; None where none was kept.
       progress: called with the rows done and the rows in all.
 
     Returns:
@@ -91,10 +104,11 @@ def verify(
     Raises:
       TamperedError: has the first altered row, such as `results/….json`.
       BoardError: the folder holds no board.
-      OptionError: `rescore` is negative.
+      OptionError: `rescore` is negative, or `contains` is no digest.
     """
     if rescore < 0:
         raise OptionError(f"rescore={rescore}: must be at least 0. Leave it out for none.")
+    kept = None if contains is None else _digest_of_entry(contains)
     folder = Folder(path)
     folder.read()
     document = read_document(folder, folder.board, BoardDocument)
@@ -102,11 +116,17 @@ def verify(
     with contextlib.closing(Index.empty(None, folder, document)) as fresh:
         log = Log(folder, document.key)
         _verify_opening(folder, document, log)
-        _follow(log, fresh, count)
+        found = _follow(log, fresh, count, kept)
         with Store.open(path, read_only=True) as store:
             with store.still():
-                _follow(log, fresh, count)  # what came meanwhile
+                found |= _follow(log, fresh, count, kept)  # what came meanwhile
                 _verify_numbering(folder, fresh)
+                if kept is not None and not found:
+                    raise TamperedError(
+                        "log",
+                        f"holds no entry of digest {kept}. If that was an entry of this board's, "
+                        "its log was cut or written anew since",
+                    )
                 unlogged = _verify_nothing_unlogged(folder, fresh)
                 rows = _verify_index(folder, document, log, fresh)
             _verify_signatures(folder, fresh)
@@ -120,6 +140,8 @@ def verify(
         entries = fresh.entries()
         return VerifyReport(
             entries=fresh.head.sequence + 1,
+            log_sequence=fresh.head.sequence,
+            log_digest=fresh.head.digest,
             submissions=len(entries),
             withdrawals=sum(entry.status == "withdrawn" for entry in entries),
             results=results,
@@ -164,14 +186,27 @@ def _verify_opening(folder: Folder, document: BoardDocument, log: Log) -> None:
         raise TamperedError("board.key", "is not the key that board.json names")
 
 
-def _follow(log: Log, fresh: Index, count: _Counter) -> None:
-    """Chain, signatures and documents, from where `fresh` is to the end."""
+def _digest_of_entry(text: str) -> str:
+    try:
+        return f"sha256:{hex_of(text)}"
+    except ValueError:
+        raise OptionError(
+            f"contains={text!r:.90}: must be 'sha256:' and 64 hex digits. Copy it from what "
+            "`sme-leaderboard verify` or the board's log page said then."
+        ) from None
+
+
+def _follow(log: Log, fresh: Index, count: _Counter, kept: str | None) -> bool:
+    """Chain, signatures and documents, from where `fresh` is to the end; whether it has `kept`."""
+    found = False
     head = fresh.head
     while log.has(head.sequence + 1):
         entry = log.read_after(head)
         fresh.apply(entry)
         head = entry.head
+        found |= head.digest == kept
         count.one_more()
+    return found
 
 
 def _verify_numbering(folder: Folder, fresh: Index) -> None:

@@ -232,15 +232,22 @@ def verify(
         int, typer.Option(min=0, help="Score so many submissions anew, drawn at random.")
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Of that draw.")] = 0,
+    contains: Annotated[
+        str | None,
+        typer.Option(metavar="DIGEST", help="Of an entry that the log had when you noted it."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
 ) -> None:
     """Check every signature, hash, chain link and aggregate; name the first row that is altered.
 
-    Exit code 3 where something is.
+    Exit code 3 where something is. Entries cut off the log's end leave no trace in what is left:
+    keep the digest that is printed, and give it with --contains the next time.
 
     Examples:
 
       sme-leaderboard verify board --rescore 3
+
+      sme-leaderboard verify board --contains sha256:3f2a…
     """
     from dataclasses import asdict
 
@@ -248,8 +255,13 @@ def verify(
 
     meter = Meter("verifying", 1, console=err(), unit="rows", shown=not json)
     with meter:
-        report = verify_board(board, rescore=rescore, seed=seed, progress=meter.of)
+        report = verify_board(
+            board, rescore=rescore, seed=seed, contains=contains, progress=meter.of
+        )
     if json:
         print_json(asdict(report))
         return
-    print_pairs("[green]Whole[/]: every row is as it was signed.", asdict(report))
+    pairs = asdict(report)
+    last, digest = pairs.pop("log_sequence"), pairs.pop("log_digest")
+    print_pairs("[green]Whole[/]: every row is as it was signed.", pairs)
+    out().print(f"The log's last entry, {last}, has the digest\n{digest}", soft_wrap=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from leaderboard.board import Folder
+from leaderboard.board import Folder, hex_of
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.keys import SigningKey
 from leaderboard.result import Result
@@ -97,8 +97,12 @@ def resign(board: Path, key: SigningKey, start: int = 1) -> None:
 def test_a_whole_board_is_whole_and_counted(board):
     seen = []
     report = verify(board, rescore=5, progress=lambda done, total: seen.append((done, total)))
+    with Store.open(board, read_only=True) as store:
+        head = store.head
     assert report == VerifyReport(
         entries=9,
+        log_sequence=8,
+        log_digest=head.digest,
         submissions=4,
         withdrawals=1,
         results=3,
@@ -123,6 +127,38 @@ def test_a_board_without_its_private_key_or_its_index_is_verified_all_the_same(b
     Folder(board).index.unlink()
     assert verify(board).rows == 0
     assert not Folder(board).index.exists()
+
+
+def test_a_log_cut_at_its_end_is_found_out_by_a_digest_that_was_kept(board):
+    """As where a board was cloned without its index: the rest of the log is in order."""
+    kept = verify(board).log_digest
+    folder = Folder(board)
+    first = LogEntry.parse(json.loads(folder.log_entry(0).read_text()))
+    last = LogEntry.parse(json.loads(folder.log_entry(8).read_text()))
+    for digest in (kept, hex_of(kept), first.digest):
+        assert verify(board, contains=digest).entries == 9
+    folder.log_entry(8).unlink()
+    folder.submission(last.subject).unlink()
+    folder.index.unlink()
+    cut = verify(board)
+    assert (cut.log_sequence, cut.results) == (7, 3)  # which nobody can tell from the rest
+    assert found(board, contains=kept) == "log"
+    assert verify(board, contains=first.digest) == cut
+
+
+def test_a_log_that_the_board_wrote_anew_is_found_out_by_a_digest_that_was_kept(board):
+    kept = verify(board).log_digest
+    folder = Folder(board)
+    alter(folder.log_entry(8), lambda plain: plain.update({"time": "2126-11-21T09:30:00Z"}))
+    resign(board, folder.signing_key())
+    assert verify(board).entries == 9
+    assert found(board, contains=kept) == "log"
+
+
+def test_a_digest_that_is_none_is_refused(board):
+    for text in ("", "3f2a", "sha256:" + "x" * 64):
+        with pytest.raises(OptionError, match="contains="):
+            verify(board, contains=text)
 
 
 def test_no_board_is_no_tampering(tmp_path):
