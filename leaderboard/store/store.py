@@ -239,9 +239,10 @@ class Store:
 
         Raises:
           Rejection: `too_large` or `artefact_digest`.
-          BoardError: it cannot be written.
+          BoardError: it cannot be written, or the board's key is not here.
         """
         self._refuse_read_only()
+        self._signing_key()  # or no submission could follow, and the artefact would be left over
         size = 0
 
         def counted() -> Iterator[bytes]:
@@ -639,7 +640,20 @@ class Store:
 
     def _record(self, event: Event, subject: str, path: Path, document: StrictModel) -> None:
         """What every write is, in a turn: the document's file, the log entry, the rows."""
+        key = self._signing_key()
+        index = self._opened
+        write_document(path, document)
+        entry = self._log.append(key, index.head, event, subject, digest_of(document))
+        index.apply(entry)
+
+    def _signing_key(self) -> SigningKey:
         if self._key is None:
+            if not self.folder.key.exists():
+                raise BoardError(
+                    f"{self.folder.path}: this board's key is not here, so it takes nothing in. "
+                    f"Copy it with its {self.folder.key.name} from where it is kept, or make a "
+                    "board of your own with `sme-leaderboard init`."
+                )
             key = self.folder.signing_key()
             if key.public != self.document.key:
                 raise BoardError(
@@ -647,10 +661,7 @@ class Store:
                     f"{self.document.key[:16]}…. Restore that one."
                 )
             self._key = key
-        index = self._opened
-        write_document(path, document)
-        entry = self._log.append(self._key, index.head, event, subject, digest_of(document))
-        index.apply(entry)
+        return self._key
 
     def _finish(self, result: Result) -> None:
         self._record("result", result.submission, self.folder.result(result.submission), result)
