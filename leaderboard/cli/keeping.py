@@ -74,19 +74,19 @@ def score(
     from leaderboard.store import Store
 
     with Store.open(board) as store:
-        waiting = store.waiting()
+        entries = store.entries()
+    before = {entry.id for entry in entries if entry.status != "waiting"}
+    waiting = len(entries) - len(before)
     if not waiting:
         out().print("Nothing waits to be scored.")
         return
     with Meter("scoring", waiting, console=err(), unit="submissions") as meter:
         run_scorers(board, workers, progress=meter.of)
     with Store.open(board, read_only=True) as store:
-        entries = store.entries()
-    counts = {
-        status: sum(entry.status == status for entry in entries)
-        for status in ("scored", "rejected", "waiting", "withdrawn")
-    }
-    out().print(", ".join(f"{count} {status}" for status, count in counts.items() if count) + ".")
+        now = [entry.status for entry in store.entries() if entry.id not in before]
+    counts = {name: now.count(name) for name in ("scored", "rejected", "waiting", "withdrawn")}
+    said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    out().print(f"{said}." + (f" Done before: {len(before)}." if before else ""))
 
 
 def site(

@@ -96,6 +96,7 @@ def test_from_a_key_to_a_page() -> None:
     assert good("submit", "bundle", "board").strip() == id
     assert good("submit", "bundle", "board").strip() == id  # twice is once
     assert good("score", "board").strip() == "3 scored."
+    assert good("score", "board").strip() == "Nothing waits to be scored."
 
     ranking = json.loads(good("rank", "board", "--json"))
     text = json.dumps(ranking)
@@ -225,6 +226,39 @@ def test_an_altered_result_ends_with_3_and_is_named() -> None:
     path = sorted(Path("board/results").iterdir())[0]
     path.write_text(path.read_text().replace('"wd"', '"dw"', 1))
     assert path.name in fails(3, "verify", "board")
+
+
+def test_the_digest_that_verify_prints_is_found_in_the_log_later() -> None:
+    make_board()
+    kept = json.loads(good("verify", "board", "--json"))["log_digest"]
+    assert kept in good("verify", "board")
+    good("score", "board")
+    assert "Whole" in good("verify", "board", "--contains", kept)
+    assert "cut or written anew" in " ".join(
+        fails(3, "verify", "board", "--contains", "sha256:" + "0" * 64).split()
+    )
+    assert "contains=" in fails(2, "verify", "board", "--contains", "3f2a")
+
+
+def test_score_says_what_it_did_itself() -> None:
+    good("keygen")
+    make_board()
+    assert good("score", "board").strip() == "2 scored."
+    make_bundle()
+    good("submit", "bundle", "board")
+    assert good("score", "board").strip() == "1 scored. Done before: 2."
+
+
+def test_a_board_without_its_key_takes_nothing_in_and_says_so() -> None:
+    good("keygen")
+    make_board()
+    make_bundle()
+    Path("board/board.key").unlink()
+    before = sorted(Path("board/objects").rglob("*"))
+    said = fails(2, "submit", "bundle", "board")
+    assert "this board's key is not here" in " ".join(said.split())
+    assert "keygen" not in said
+    assert sorted(Path("board/objects").rglob("*")) == before
 
 
 def test_the_index_comes_back_from_the_files() -> None:

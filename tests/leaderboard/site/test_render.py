@@ -172,6 +172,21 @@ def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
     assert "Ranked only where" not in pages["index.html"].words
 
 
+def test_the_method_page_says_how_failures_and_intervals_count(pages):
+    words = pages["method.html"].words
+    assert "every metric: N₀ = A = D = slope = 1, and 100 points" in words
+    assert "gains nothing" not in words
+    assert "symmetric: θ ± the longer arm" in words
+    assert "best value there is" not in pages["decay.html"].words  # D may be negative
+
+
+def test_the_log_page_says_what_a_kept_digest_is_good_for(pages, board):
+    words = pages["log.html"].words
+    assert "verify BOARD --contains DIGEST" in words
+    assert "Entries cut off the end leave none" in words
+    assert board[0].head[1] in words
+
+
 def rows_of(text):
     """Rank, method, and the whole row's words, of each row of the board."""
     table = text[text.index('<table class="board"') : text.index("</table>")]
