@@ -46,8 +46,8 @@ def make(
         list[str] | None,
         typer.Option(
             metavar="WHO:WEIGHT",
-            help="In place of --nu, repeatable: nu=0.5:0.7, random:0.1, policy=model.zip:0.2. "
-            "The weights add up to 1.",
+            help="In place of --nu, repeatable: nu=0.5:0.7, random:0.1, policy=model.zip:0.2 "
+            "(or an .onnx). The weights add up to 1.",
         ),
     ] = None,
     transitions: Annotated[

@@ -47,8 +47,8 @@ def make_dataset(
       nu: ν in [0, 1] of the mixture that acts: 0 is the optimum, 1 the worst. 0.5 where neither
         this nor `mix` is given.
       mix: several behaviour policies in place of `nu`: pairs of who acts (ν as a number; "random";
-        or a policy: a callable, a Stable-Baselines3 model, the path of its .zip) and its share of
-        the transitions; the shares add up to 1.
+        or a policy: a callable, a Stable-Baselines3 model, the path of its .zip or of an .onnx)
+        and its share of the transitions; the shares add up to 1.
       transitions: N, exactly so many; the last episode of each behaviour is cut, a truncation.
       seed: of the starts, each α, ã and random actions, in [0, 2⁵³); not the task's.
       coverage: ε in (−1, 0]: keep only transitions acted in {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}, so that

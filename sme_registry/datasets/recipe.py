@@ -167,7 +167,8 @@ def behaviour_of(what: Any, weight: float = 1.0, action_range: str | None = None
     """A behaviour given as a person writes it.
 
     Args:
-      what: ν as a number; "random"; or a policy: a callable, a model, or the path of a .zip.
+      what: ν as a number; "random"; or a policy: a callable, a model, or the path of a .zip
+        or an .onnx.
       weight: its share.
       action_range: of a policy's actions; None for its own.
 
@@ -191,7 +192,7 @@ def behaviour_of(what: Any, weight: float = 1.0, action_range: str | None = None
     else:
         raise SpecError(
             f"behaviour={show(what)}: must be ν in [0, 1], 'random', or a policy: a callable, "
-            "a Stable-Baselines3 model, or the path of its .zip."
+            "a Stable-Baselines3 model, or the path of its .zip or of an .onnx."
         )
     if fields["kind"] == "policy":
         fields["action_range"] = action_range
@@ -210,5 +211,5 @@ def sha256_of(path: Path) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise PolicyError(
-            f"{path}: cannot be read: {reason}. Give the path of a saved model (.zip)."
+            f"{path}: cannot be read: {reason}. Give the path of a saved model (.zip or .onnx)."
         ) from None

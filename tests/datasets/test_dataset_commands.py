@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -97,6 +98,34 @@ def test_a_trained_policys_zip_acts_and_is_recorded_by_its_digest(tmp_path):
     assert "valid" in good("validate", "sme/ppo-v0").stdout
 
 
+def test_a_trained_policys_onnx_acts_as_its_zip_does(tmp_path):
+    for package in ("onnx", "onnxruntime"):
+        pytest.importorskip(package)
+    from stable_baselines3 import TD3
+
+    import sme_registry
+    from leaderboard.cli import app as leaderboard
+    from sme_registry.datasets.recipe import sha256_of
+
+    env = sme_registry.make("Default", action_range="symmetric")
+    TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu").save(tmp_path / "mine.zip")
+    exported = CliRunner().invoke(leaderboard, ["export-sb3", "mine.zip", "-o", "mine.onnx"])
+    assert exported.exit_code == 0, exported.output
+    sets = {}
+    for suffix in ("zip", "onnx"):
+        good("make", "Default", "--mix", f"policy=mine.{suffix}:1", "-n", "60",
+             "--name", f"sme/{suffix}-v0")  # fmt: skip
+        sets[suffix] = open_dataset(f"sme/{suffix}-v0")
+    assert "valid" in good("validate", "sme/onnx-v0").stdout
+    (behaviour,) = sets["onnx"].recipe.behaviours
+    assert behaviour.policy == "mine"
+    assert behaviour.sha256 == sha256_of(tmp_path / "mine.onnx")
+    # A later step doubles a difference in the last bit; the first few are the same to rounding.
+    one, other = (made.transitions().actions[:5] for made in sets.values())
+    np.testing.assert_allclose(one, other, atol=1e-5)
+    assert np.ptp(one) > 0.01
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -107,6 +136,7 @@ def test_a_trained_policys_zip_acts_and_is_recorded_by_its_digest(tmp_path):
         (["--mix", "nu=x:1"], "must be nu=NU:WEIGHT"),
         (["--mix", "random"], "must be nu=NU:WEIGHT"),
         (["--mix", "policy=no.zip:1"], "no.zip: cannot be read: No such file"),
+        (["--mix", "policy=no.onnx:1"], "Give the path of a saved model (.zip or .onnx)"),
         (["--nu", "0.5", "--mix", "random:1"], "give one of the two"),
         (["--name", "a.b-v0"], "name='a.b-v0': must be [namespace/]name-v<number>"),
         (["--coverage", "0.2"], "coverage=0.2: must be"),
