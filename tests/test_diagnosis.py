@@ -500,7 +500,9 @@ def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Pat
         of_cell(tmp_path, "")
     assert "say which cell" in refused("diagnose", tmp_path)
     (tmp_path / "models" / f"{keys[2]}.zip").unlink()
-    assert "--keep-models" in refused("diagnose", tmp_path, "--cell", keys[2])
+    without = refused("diagnose", tmp_path, "--cell", keys[2])
+    assert "What has finished is not run again" in without
+    assert "in a new folder, with --keep-models" in without
     (tmp_path / "cells" / f"{keys[1]}.json").write_text("{}")
     assert "no result of a cell" in refused("diagnose", tmp_path, "--cell", keys[1])
 

@@ -421,7 +421,10 @@ def run(
         bool, typer.Option("--retry", help="Also run the cells that failed before.")
     ] = False,
     keep_models: Annotated[
-        bool, typer.Option("--keep-models", help="Keep the trained models, in FOLDER/models.")
+        bool,
+        typer.Option(
+            "--keep-models", help="Keep the models that are trained now, in FOLDER/models."
+        ),
     ] = False,
     steps: Steps = None,
     seeds: Seeds = None,

@@ -184,7 +184,8 @@ def of_cell(study: str | Path, key: str) -> Subject:
         path = study / "models" / f"{found[0].stem}.zip"
         if not path.exists():
             raise OptionError(
-                f"cell={key!r}: its model was not kept. Run the study with --keep-models."
+                f"cell={key!r}: its model was not kept. What has finished is not run again: run "
+                "the study in a new folder, with --keep-models."
             )
         model = load_sb3(path)
     policy = actor(model, cell.spec, action_range=None if callable(model) else cell.action_range)

@@ -99,7 +99,7 @@ def run_cell(
             evaluation=book.evaluation_seconds,
             steps_per_second=book.steps / learning if book.steps else 0.0,
         ),
-        versions=_versions(cell.uses),
+        versions=versions_for(cell.uses),
     )
 
 
@@ -211,8 +211,8 @@ def _save(learner: Learner, path: Path) -> None:
         write_atomically(path, archive.getvalue())
 
 
-def _versions(uses: str) -> dict[str, str]:
-    """What the numbers depend on; of another package's algorithm, that package too."""
+def versions_for(uses: str) -> dict[str, str]:
+    """What is installed of what the numbers depend on; another package's algorithm's, too."""
     versions = installed_versions()
     package = uses.partition(":")[0].partition(".")[0]
     with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):

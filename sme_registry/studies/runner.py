@@ -6,6 +6,7 @@ lock of a cell decides who runs it, its file that it is done.
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 from collections import Counter
@@ -20,12 +21,12 @@ from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.spec import Cell, PlannedCell, StudyFile
 from sme_registry.studies.algorithms import find_algorithm, reference_name
 from sme_registry.studies.board import Board, title
-from sme_registry.studies.cell import run_cell
+from sme_registry.studies.cell import run_cell, versions_for
 from sme_registry.studies.estimate import Estimator, Span, makespan
 from sme_registry.studies.executors import Executor, InProcess, OnRay, Outcome, Processes, RunCell
 from sme_registry.studies.ledger import Ledger, Lock
 from sme_registry.studies.offline import offline_name
-from sme_registry.studies.result import CellFailure
+from sme_registry.studies.result import CellFailure, CellResult
 from sme_registry.studies.scaling import selected
 from sme_registry.terminal.progress import duration
 from sme_registry.training.algorithms import ALGORITHMS, refuse_without_dependencies
@@ -189,7 +190,8 @@ def run_study(
       jobs: cells at once; None for one on each core, of this machine or of the cluster.
       ray: "local", or the address of a Ray cluster.
       retry_failed: also run the cells that have failed before.
-      keep_models: keep the trained models of the cells that are run now.
+      keep_models: keep the trained models of the cells that are run now; says how many have
+        finished without, which are not run again.
       only: `class=GLOB`, `algorithm=GLOB`: the cells to run now; see `scaling.selected`.
       progress: whether to show anything.
       console: where to; None for standard error.
@@ -216,7 +218,7 @@ def run_study(
     before = ledger.plan_file()
     if before is None or before != plan_file:
         ledger.write_plan(plan_file)
-    job = _Run(plan_file, ledger, planned, retry_failed, runs_on, console, progress)
+    job = _Run(plan_file, ledger, planned, retry_failed, keep_models, runs_on, console, progress)
     job.announce(before)
     try:
         job.go()
@@ -257,6 +259,39 @@ def _refuse_unknown_algorithms(cells: Iterable[Cell]) -> None:
             find_algorithm(uses)
 
 
+def _without_model(results: Iterable[CellResult], ledger: Ledger) -> Iterator[str]:
+    """What to say of reused results that have no model, which asking for models does not make."""
+    lacking = sum(
+        # A cell that did not learn by acting never leaves a model.
+        result.online_regret is not None and not ledger.model_path(result.key).exists()
+        for result in results
+    )
+    if lacking:
+        yield (
+            f"{lacking:,} of the finished cells have no model and are not run again: for their "
+            "models, run the plan in a new folder."
+        )
+
+
+def _of_other_versions(results: Iterable[CellResult]) -> Iterator[str]:
+    """What to say of reused results that were made with other versions than are installed."""
+    installed = functools.cache(versions_for)
+    count, found = 0, set[str]()
+    for result in results:
+        now = installed(result.cell.uses)
+        others = {
+            f"{package} {version} (here {now[package]})"
+            for package, version in result.versions.items()
+            if now.get(package, version) != version
+        }
+        count, found = count + bool(others), found | others
+    if count:
+        yield (
+            f"{count:,} of the reused results were made with other versions than are installed: "
+            f"{', '.join(sorted(found))}. For all of one make, run the plan in a new folder."
+        )
+
+
 class _Run:
     """One driver at work on a folder."""
 
@@ -266,6 +301,7 @@ class _Run:
         ledger: Ledger,
         planned: dict[str, PlannedCell],
         retry_failed: bool,
+        keep_models: bool,
         executor: Executor,
         console: Console,
         shown: bool,
@@ -275,6 +311,9 @@ class _Run:
         results = ledger.results(planned)
         self._failures = ledger.failures(planned.keys() - results.keys())
         self.finished = len(results)
+        self._notes = list(_of_other_versions(results.values()))
+        if keep_models:
+            self._notes += _without_model(results.values(), ledger)
         self._estimator = Estimator(results.values())
         self._waiting = {
             key: cell
@@ -307,6 +346,8 @@ class _Run:
             at_once = self._executor.workers
             parts.append(f"{at_once} at once, about {duration(self.left())}")
         self._board.say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
+        for note in self._notes:
+            self._board.say(note)
 
     def go(self) -> None:
         """Run everything that waits."""

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -359,6 +360,45 @@ def test_models_are_kept_where_that_is_asked_for(executor: str, study: Path) -> 
     quick(file, kept, executor=executor, run=cells.modelled, keep_models=True)
     for key in keys(file):
         assert Ledger(kept).model_path(key).read_bytes() == key.encode()
+
+
+def test_asking_for_models_too_late_says_how_many_there_are_not(study: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    learner = {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 8, "batch_size": 8}}
+    file = small_file(seeds=2, algorithms=[learner, "constant"], steps=8)
+    _, said = quick(file, study, only=["algorithm=PPO"])
+    assert "no model" not in said
+    status, said = quick(file, study, keep_models=True)
+    assert status.count("done") == 4
+    assert "2 of the finished cells have no model and are not run again" in said
+    assert "a new folder" in said
+    assert not (study / "models").exists()
+    kept = study.with_name("kept")
+    quick(file, kept, keep_models=True)
+    _, said = quick(file, kept, keep_models=True)  # a reference never has a model
+    assert "4 finished before" in said
+    assert "no model" not in said
+
+
+def test_results_of_other_versions_are_reused_and_said_to_be(study: Path) -> None:
+    file = small_file(seeds=3)
+    quick(file, study)
+    ledger = Ledger(study)
+    for planned, numpy in zip(file.plan.cells, ("1.0.0", "1.0.1"), strict=False):
+        result = ledger.result(planned.cell.digest)
+        assert result is not None
+        versions = {**result.versions, "numpy": numpy, "of a package that is not installed": "1"}
+        ledger.write(result.model_copy(update={"versions": versions}))
+    status, said = quick(file, study)
+    assert status.count("done") == 3
+    here = f"(here {np.__version__})"
+    assert (
+        "2 of the reused results were made with other versions than are installed: "
+        f"numpy 1.0.0 {here}, numpy 1.0.1 {here}."
+    ) in " ".join(said.split())
+    fresh = study.with_name("fresh")
+    quick(file, fresh)
+    assert "other versions" not in quick(file, fresh)[1]
 
 
 def test_a_result_of_another_cell_is_a_failure(study: Path) -> None:
