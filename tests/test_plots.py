@@ -61,6 +61,13 @@ def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
+def test_no_two_of_many_lines_look_alike_and_ten_are_told_apart_in_grey():
+    colours, markers = plots.COLOURS, plots.MARKERS
+    looks = {(colours[i % len(colours)], markers[i % len(markers)]) for i in range(56)}
+    assert len(looks) == 56
+    assert len(set(markers)) == len(markers) >= 10
+
+
 @pytest.mark.parametrize("ending", plots.FORMATS)
 def test_the_same_figure_is_the_same_file(tmp_path, report, ending):
     first, second = tmp_path / f"1.{ending}", tmp_path / f"2.{ending}"

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,15 @@ def _regret_wd(regions: Sequence[RegionReport]) -> float:
 
 def _regret_ood(regions: Sequence[RegionReport]) -> float:
     return float(np.mean([region.normalised_regret for region in regions[1:]]))
+
+
+def learnt_from(results: Iterable[Run]) -> dict[str, tuple[float, int] | None]:
+    """Each algorithm's data: ν and how many transitions; None where it learns from no data set."""
+    return {
+        run.planned.algorithm: None if data is None else (data.nu, data.transitions)
+        for run in results
+        for data in [run.result.offline]
+    }
 
 
 def window(evaluations: int) -> int:
@@ -221,6 +230,7 @@ class _Study:
             self._places.setdefault(run.place, []).append(run)
         self._groups, self._classes, self._algorithms = groups, classes, algorithms
         self._digest, self._draws = digest, draws
+        self._learnt_from = learnt_from(runs)
 
     def curves(self) -> Iterator[Curve]:
         """Median and quartiles over runs, smoothed."""
@@ -357,8 +367,12 @@ class _Study:
             yield Profile(group.name, algorithm, metric.key, fewest, THRESHOLDS, found)
 
     def improvements(self) -> Iterator[Improvement]:
-        """Every pair of algorithms."""
-        pairs = list(itertools.combinations(self._algorithms, 2))
+        """Every pair of algorithms, but for those that learnt from different data."""
+        pairs = [
+            pair
+            for pair in itertools.combinations(self._algorithms, 2)
+            if len({self._learnt_from[name] for name in pair} - {None}) < 2
+        ]
         for group, metric, (first, second) in itertools.product(
             self._groups, REGRET_METRICS, pairs
         ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import re
 import shutil
 from html.parser import HTMLParser
@@ -22,6 +23,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.cli.app import app
 from sme_registry.studies.report import write_report
+from sme_registry.studies.report.figures import pictures
 
 SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF"}
 FIGURES = {
@@ -196,8 +198,6 @@ def test_the_words_say_when_there_is_nothing_to_contrast(finished: Path):
 
 
 def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
-    import dataclasses
-
     levels = tuple(
         dataclasses.replace(level, value=0.97)
         if (level.class_name, level.metric) == ("default", "regret_wd")
@@ -209,13 +209,32 @@ def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
 
 
 def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis):
-    import dataclasses
-
     text = comparison(analysis)
     assert "scores highest" in text
     blurred = tuple(dataclasses.replace(r, low=0.1, high=0.9) for r in analysis.improvements)
     text = comparison(dataclasses.replace(analysis, improvements=blurred))
     assert "leaves open which of the two is better" in text
+
+
+def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):
+    levels = tuple(  # the worst is in the last panel, and far above the others
+        dataclasses.replace(level, value=1.7, low=1.5, high=1.9)
+        if (level.class_name, level.algorithm) == ("plane", "Alpha")
+        else level
+        for level in analysis.levels
+    )
+    found, _ = pictures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
+    assert len(figures) == len(found) == len(FIGURES)
+    for picture, figure in zip(found, figures, strict=True):
+        for axes in figure.axes:
+            (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+            for line in axes.lines:
+                if line.get_transform() == axes.transData:
+                    for x, y in line.get_xydata():
+                        assert left <= x <= right, picture.name
+                        assert bottom <= y <= top, picture.name
+    bottoms = {axes.get_ylim()[0] for axes in figures[2].axes}
+    assert (found[2].name, bottoms) == ("regret-wd", {0.0})
 
 
 def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):

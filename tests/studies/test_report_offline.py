@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sme_registry.spec import StudyFile
-from sme_registry.studies.analysis import analyse
+from sme_registry.studies.analysis import ALL, CURVES, analyse
 from sme_registry.studies.cell import run_cell
 from sme_registry.studies.ledger import Ledger
 from sme_registry.studies.report.exports import number
 from sme_registry.studies.result import CellResult, OfflineScores
-from sme_registry.studies.tables import Analysis
+from sme_registry.studies.tables import Analysis, Curve
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import write_report
+from sme_registry.studies.report.figures import pictures
 from sme_registry.studies.report.offline import (
     offline_data,
     offline_pictures,
@@ -152,6 +155,42 @@ def test_of_few_runs_nothing_is_called_shown(
     (picture,) = offline_pictures(few, ("svg",))
     assert ("there is no interval" in picture.caption) == (runs < 4)
     assert ("bootstrap intervals of the mean" in picture.caption) == (runs == 4)
+
+
+def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
+    pairs = {(row.first, row.second) for row in analysis.improvements if row.group == ALL}
+    learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
+    assert pairs == learners
+
+
+def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
+    analysis: Analysis, figures: list[Any]
+) -> None:
+    names = [f"BC ({i})" for i in range(10)]
+    steps = np.arange(1.0, 4.0)
+    curves = tuple(
+        Curve(c, name, measure, steps, *[steps + i] * 3, 1, 1)
+        for i, name in enumerate(names)
+        for c in CLASSES
+        for measure in CURVES
+    )
+    run = analysis.results[0]
+    results = tuple(
+        dataclasses.replace(run, planned=run.planned.model_copy(update={"algorithm": name}))
+        for name in names
+    )
+    many = dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names), results=results, curves=curves,
+        contrasts=(), profiles=(),
+    )  # fmt: skip
+    found, _ = pictures(many, ("svg",), {})
+    assert found[-1].name == "learning-curves-complexity"
+    figure = figures[-1]
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title() for axes in shown if axes.get_title()] == names
+    assert [axes.get_xlabel() for axes in shown if axes.get_xlabel()] == ["gradient steps"] * 10
+    assert len({round(axes.get_position().x0, 6) for axes in shown}) == 4
+    assert len({axes.get_ylim() for axes in shown}) == 1  # of all learners, not of a row
 
 
 def test_the_report_has_it_first_and_in_every_format(

@@ -34,8 +34,9 @@ from sme_registry.studies.analysis import (
     METRICS,
     REGRET_METRICS,
     SEVERAL,
+    learnt_from,
 )
-from sme_registry.studies.tables import ENOUGH_RUNS, Analysis, Group, Run
+from sme_registry.studies.tables import ENOUGH_RUNS, Analysis, Curve, Group, Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +129,7 @@ class _Drawer:
         }
         references = [name for name in analysis.algorithms if name not in self._looks]
         for i, name in enumerate(references):
-            self._looks[name] = _Look(GREY, "x+*1"[i % 4], _DASHES[1 + i % 4])
+            self._looks[name] = _Look(GREY, "x+12"[i % 4], _DASHES[1 + i % 4])
         self._axis_groups = [group for group in analysis.groups if group.axis]
 
     def learning_curves(self) -> Iterator[Picture | str]:
@@ -137,6 +138,7 @@ class _Drawer:
             yield "No learning curves: the plan has no evaluations while training."
             return
         curves = {(c.class_name, c.algorithm, c.measure): c for c in self._analysis.curves}
+        data = learnt_from(self._analysis.results)
         for group in self._axis_groups or self._analysis.groups:
             names = [
                 a
@@ -146,37 +148,32 @@ class _Drawer:
             if not names:
                 continue
             colours = dict(zip(group.classes, shades(len(group.classes)), strict=True))
-            size = (min(WIDTH, 1.2 + 2.6 * len(names)), 5.0)
+            across = min(4, len(names))
+            down = math.ceil(len(names) / across)
+            size = (min(WIDTH, 1.2 + 2.6 * across), 0.6 + 4.4 * down)
             with drawing(size, self._formats) as (figure, files):
-                panels = figure.subplots(
-                    len(CURVES), len(names), squeeze=False, sharey="row", sharex="col"
-                )
-                for row, measure in zip(panels, CURVES, strict=True):
-                    for axes, name in zip(row, names, strict=True):
-                        for index, class_name in enumerate(group.classes):
-                            curve = curves.get((class_name, name, measure))
-                            if curve is None:
-                                continue
-                            colour = colours[class_name]
-                            axes.fill_between(
-                                curve.steps, curve.low, curve.high, color=colour, alpha=0.13,
-                                linewidth=0,
-                            )  # fmt: skip
-                            every = max(1, len(curve.steps) // 6)
-                            axes.plot(
-                                curve.steps, curve.median, color=colour, linewidth=1.6,
-                                linestyle=_DASHES[index % len(_DASHES)],
-                                marker=MARKERS[index % len(MARKERS)], markersize=4,
-                                markevery=(index * every // len(group.classes), every),
-                            )  # fmt: skip
-                    row[0].set_ylabel(CURVES[measure])
-                for axes, name in zip(panels[0], names, strict=True):
-                    axes.set_title(literal(name))
-                for axes in panels[-1]:
-                    axes.set_xlabel("environment steps")
-                    axes.set_xlim(left=0)
-                    axes.locator_params(axis="x", nbins=4)
-                    axes.xaxis.set_major_formatter(_steps)
+                panels = figure.subplots(len(CURVES) * down, across, squeeze=False)
+                # [algorithm, measure]: an algorithm's panels stand one below the other
+                stacks = np.concatenate([block.T for block in np.split(panels, down)])
+                for axes in stacks[len(names) :].ravel():
+                    axes.set_visible(False)
+                for index, (stack, name) in enumerate(zip(stacks, names, strict=False)):
+                    for axes, first, measure in zip(stack, stacks[0], CURVES, strict=True):
+                        if axes is not first:
+                            axes.sharey(first)
+                        if axes is not stack[-1]:
+                            axes.sharex(stack[-1])
+                            axes.tick_params(labelbottom=False)
+                        axes.tick_params(labelleft=index % across == 0)
+                        if index % across == 0:
+                            axes.set_ylabel(CURVES[measure])
+                        own = {c: curves.get((c, name, measure)) for c in group.classes}
+                        self._lines(axes, own, colours)
+                    stack[0].set_title(literal(name))
+                    stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
+                    stack[-1].set_xlim(left=0)
+                    stack[-1].locator_params(axis="x", nbins=4)
+                    stack[-1].xaxis.set_major_formatter(_steps)
                 handles = [
                     panels[0][0].plot(
                         [], [], color=colours[c], linewidth=1.6, markersize=4,
@@ -194,7 +191,7 @@ class _Drawer:
                 f"Learning curves: {group.name}",
                 "Median over runs, with the interquartile range as a band"
                 + (f", averaged over {window} evaluations" if window > 1 else "")
-                + ". Top: return in hundredths of what the optimum earns. Bottom: exact regret of "
+                + ". Above: return in hundredths of what the optimum earns. Below: exact regret of "
                 "a step, 0 for the optimum.",
                 files,
             )
@@ -263,7 +260,7 @@ class _Drawer:
                 axes.plot(
                     [row.similarity for row in own], [row.decay_points for row in own],
                     color=look.colour, marker=look.marker, markersize=4, alpha=0.55,
-                    markeredgewidth=0.8 if look.marker in "x+1" else 0.0, linestyle="none",
+                    markeredgewidth=0.8 if look.marker in "x+12" else 0.0, linestyle="none",
                     label=literal(name),
                 )  # fmt: skip
             axes.axhline(0.0, color=GREY, linewidth=1.0)
@@ -378,8 +375,8 @@ class _Drawer:
                 )
                 axes.set_title(literal(group.name), fontsize=9)
                 axes.set_xlim(-0.5, len(group.classes) - 0.5)
-                axes.set_ylim(bottom=0.0)
                 axes.grid(visible=False, axis="x")
+            panels[0][0].set_ylim(bottom=0.0)  # of all, once all is drawn: it ends autoscaling
             for row in panels:
                 row[0].set_ylabel("normalised regret")
             extra = [
@@ -482,7 +479,10 @@ class _Drawer:
         """Every pair of algorithms."""
         rows = [row for row in self._analysis.improvements if row.group == ALL]
         if not rows:
-            return "No comparison of algorithms: there are not two with runs on the same classes."
+            return (
+                "No comparison of algorithms: there are not two with runs on the same classes, "
+                "nor with the same data where they learn from data."
+            )
         pairs = list(dict.fromkeys((row.first, row.second) for row in rows))
         with drawing((WIDTH, 1.0 + 0.26 * max(3, len(pairs))), self._formats) as (figure, files):
             panels = figure.subplots(1, 2, sharey=True)
@@ -508,7 +508,10 @@ class _Drawer:
             "improvement",
             "Probability of improvement",
             "How probably a run of the first algorithm beats a run of the second on a class drawn "
-            "at random, with its 95 % interval: ½ where neither is better.",
+            "at random, with its 95 % interval: ½ where neither is better."
+            + (
+                " Who learnt from different data is not compared." if self._analysis.offline else ""
+            ),
             files,
         )
 
@@ -582,6 +585,24 @@ class _Drawer:
             files,
             is_map=True,
         )
+
+    def _lines(
+        self, axes: Axes, curves: Mapping[str, Curve | None], colours: Mapping[str, Any]
+    ) -> None:
+        """An algorithm's learning curves, one a class; None where it has none."""
+        for index, (class_name, curve) in enumerate(curves.items()):
+            if curve is None:
+                continue
+            colour = colours[class_name]
+            axes.fill_between(
+                curve.steps, curve.low, curve.high, color=colour, alpha=0.13, linewidth=0
+            )
+            every = max(1, len(curve.steps) // 6)
+            axes.plot(
+                curve.steps, curve.median, color=colour, linewidth=1.6,
+                linestyle=_DASHES[index % len(_DASHES)], marker=MARKERS[index % len(MARKERS)],
+                markersize=4, markevery=(index * every // len(curves), every),
+            )  # fmt: skip
 
     def _marks(
         self,
