@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sme_registry.cli import names, study_report
-from sme_registry.errors import OptionError
+from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.files import read_json
 from sme_registry.spec import (
     PlannedCell,
@@ -177,9 +177,32 @@ def new(
         data = read_json(source) if names.is_path(source) else _find(source).plain()
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.sealed(data, source, **{**({} if named else {"name": path.stem}), **own})
+    # What is only not installed here may be where the plan is run.
+    _tell_of_algorithms(
+        (algorithm.uses for algorithm in file.plan.algorithms), MissingDependencyError
+    )
     file.write(path)
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     err().print(f"[dim]sme study plan {escape(str(path))}  says what it takes[/]", soft_wrap=True)
+
+
+def _tell_of_algorithms(uses: Iterable[str], told: type[SMEError]) -> None:
+    """Say which algorithms could not be run here.
+
+    Args:
+      uses: of a plan's algorithms.
+      told: the kind of error that is a line on standard error; others are raised.
+    """
+    from sme_registry.studies.runner import refuse_unknown_algorithm
+
+    lines: dict[str, None] = {}
+    for one in dict.fromkeys(uses):
+        try:
+            refuse_unknown_algorithm(one)
+        except told as error:
+            lines[str(error)] = None  # one that several have is said once
+    for line in lines:
+        err().print(f"[yellow]could not be run here:[/] {escape(line)}", soft_wrap=True)
 
 
 def _refuse_beside_from(context: typer.Context) -> None:
@@ -307,6 +330,7 @@ def plan(
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
+    _tell_of_algorithms((cell.cell.uses for cell in planned), SMEError)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
     spans = [estimator.seconds(cell) for cell in waiting]

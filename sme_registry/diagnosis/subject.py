@@ -167,7 +167,6 @@ def of_cell(study: str | Path, key: str) -> Subject:
             f"{found[0]}: is no result of a cell ({type(error).__name__}: {error}). Remove it and "
             "run the study again."
         ) from None
-    _refuse_teams(cell.spec)
     plan: dict[str, JsonValue] = {
         "algorithm": cell.uses,
         "hyperparameters": cell.hyperparameters,

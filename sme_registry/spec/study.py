@@ -20,10 +20,18 @@ from sme_registry.spec.document import (
     explained,
 )
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.sme_spec import Setting, SMESpec
 from sme_registry.spec.suite import SuiteClass
 
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
+
+
+def _refuse_team(setting: Setting, field: str) -> None:
+    if setting.team is not None:
+        raise explained(
+            f"{field}.team: must be null: a study's cells are one agent's tasks, and this one is "
+            f"for {len(setting.team.agents)}. Remove it, and train teams with `sme train`."
+        )
 
 
 class StudyAlgorithm(StrictModel):
@@ -64,6 +72,11 @@ class Cell(Document):
     evaluation_episodes: Integer
     protocol: EvaluationProtocol
 
+    @model_validator(mode="after")
+    def _one_agent(self) -> Self:
+        _refuse_team(self.spec, "spec")
+        return self
+
 
 class PlannedCell(StrictModel):
     """A cell and its place in the plan."""
@@ -99,7 +112,7 @@ class StudyPlan(Document):
     protocol: EvaluationProtocol = EvaluationProtocol()
 
     @model_validator(mode="after")
-    def _names_differ(self) -> Self:
+    def _can_be_run(self) -> Self:
         for field in ("classes", "algorithms"):
             names = [member.name for member in getattr(self, field)]
             for name in names:
@@ -107,6 +120,8 @@ class StudyPlan(Document):
                     raise explained(
                         f"{field}: the name {name!r} is given twice. Rename one of them."
                     )
+        for i, member in enumerate(self.classes):
+            _refuse_team(member.setting, f"classes.{i}.setting")
         return self
 
     @property

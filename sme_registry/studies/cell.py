@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from sme_registry.errors import OptionError, PolicyError, SpecError
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -56,16 +56,10 @@ def run_cell(
     Raises:
       UnknownNameError, OptionError, MissingDependencyError: the algorithm cannot be found, or takes
         other hyperparameters; or the model cannot be written.
-      SpecError: the task is a team's.
       ResourceLimitError: the task would not fit in memory.
       PolicyError: the learner's actions cannot be used, or it stopped early.
     """
     begun = time.thread_time()
-    if cell.spec.team is not None:
-        raise SpecError(
-            f"team: a study's cells are one agent's tasks, and this one is for "
-            f"{len(cell.spec.team.agents)}. Train teams with `sme train`."
-        )
     told = progress or (lambda done, total: None)
     learner = offline_name(cell.uses)
     if learner is not None:

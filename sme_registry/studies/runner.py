@@ -212,7 +212,8 @@ def run_study(
     console = console or Console(stderr=True)
     planned = {cell.cell.digest: cell for cell in selected(plan_file.plan.cells, only)}
     if run is run_cell:
-        _refuse_unknown_algorithms(cell.cell for cell in planned.values())
+        for uses in dict.fromkeys(cell.cell.uses for cell in planned.values()):
+            refuse_unknown_algorithm(uses)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     before = ledger.plan_file()
@@ -244,19 +245,21 @@ def _executor(
     raise UnknownNameError(f"executor={executor!r}: must be one of {', '.join(EXECUTORS)}.")
 
 
-def _refuse_unknown_algorithms(cells: Iterable[Cell]) -> None:
-    """Find what is to be trained before anything runs, so that a typo is one error and not many.
+def refuse_unknown_algorithm(uses: str) -> None:
+    """Find what is to be run before anything runs, so that a typo is one error and not many.
+
+    Args:
+      uses: of a plan's algorithm, of any kind.
 
     Raises:
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
-    for uses in dict.fromkeys(cell.uses for cell in cells):
-        if reference_name(uses) is not None or offline_name(uses) is not None:
-            continue
-        if uses.casefold() in (name.casefold() for name in ALGORITHMS):
-            refuse_without_dependencies()  # importing them takes seconds
-        else:
-            find_algorithm(uses)
+    if reference_name(uses) is not None or offline_name(uses) is not None:
+        return
+    if uses.casefold() in (name.casefold() for name in ALGORITHMS):
+        refuse_without_dependencies()  # importing them takes seconds
+    else:
+        find_algorithm(uses)
 
 
 def _without_model(results: Iterable[CellResult], ledger: Ledger) -> Iterator[str]:

@@ -227,8 +227,8 @@ def test_episodes_may_end_early() -> None:
 
 def test_what_cannot_be_run_is_refused() -> None:
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match="one agent's tasks"):
-        run_cell(cell(spec=team))
+    with pytest.raises(SpecError, match=r"spec\.team: must be null: .* this one is for 2"):
+        Cell.parse({**cell().plain(), "spec": team.plain()})
     with pytest.raises(OptionError, match="has none"):
         run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
     with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):

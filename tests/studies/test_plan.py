@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -297,6 +298,12 @@ class TestCommands:
             (("new", "x.json", "-t", "Default"), "--algorithm"),
             (("new", "x.json", "-t", "Default", "-a", "PPO", "-a", "PPO"), "given twice"),
             (("new", "x.json", "-t", "Default", "-a", "PPO", "--seeds", "0"), "seeds=0"),
+            (("new", "x.json", "-t", "Team2", "-a", "PPO"), "classes.0.setting.team: must be null"),
+            (("new", "x.json", "--suite", "teams", "-a", "PPO"), "train teams with `sme train`"),
+            (("new", "x.json", "-t", "Default", "-a", "PP0"), "Did you mean 'PPO'"),
+            (("new", "x.json", "-t", "Default", "-a", "nomod:foo"), "No module named 'nomod'"),
+            (("new", "x.json", "-t", "Default", "-a", "reference:liner"), "Did you mean 'linear'"),
+            (("new", "x.json", "-t", "Default", "-a", "offline:bcc"), "Did you mean 'bc'"),
         ],
     )
     def test_bad_input_is_one_line_and_writes_nothing(
@@ -304,6 +311,30 @@ class TestCommands:
     ) -> None:
         assert words in refused(*arguments)
         assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path: Path) -> None:
+    theirs = [{"name": name, "uses": "theirs:make"} for name in ("one", "other")]
+    small_file(algorithms=["constant", *theirs]).write(tmp_path / "p.json")
+    result = sme("plan", "p.json", "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["algorithms"] == ["constant", "one", "other"]
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("could not be run here: uses='theirs:make': cannot be imported")
+    assert sme("plan", "p.json", "--only", "algorithm=constant").stderr == ""
+    assert "theirs:make" in refused("run", "p.json", "-f", "s")
+    assert "theirs:make" in refused("new", "n.json", "--from", "p.json")
+
+
+def test_a_plan_is_written_where_the_learners_are_not_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    result = sme("new", "n.json", "-t", "Default", "-a", "PPO", "-a", "TD3")
+    assert result.exit_code == 0
+    told = "could not be run here: training: Stable-Baselines3 is not installed"
+    assert result.stderr.count(told) == 1
+    assert [one.uses for one in StudyFile.read("n.json").plan.algorithms] == ["PPO", "TD3"]
 
 
 def test_a_plan_with_a_changed_digest_is_refused(tmp_path: Path) -> None:
