@@ -167,6 +167,65 @@ def test_the_words_name_what_each_learner_was_made_to_suffer_from(analysis: Anal
     assert beta.headline.startswith("Beta is broken most by reward interval k: on k-25")
 
 
+def contrasted(analysis: Analysis, *changes: tuple[str, str, dict[str, Any]]) -> Analysis:
+    """With other contrasts of Alpha, each by its class and metric."""
+    rows = {(r.class_name, r.algorithm, r.metric): r for r in analysis.contrasts}
+    for class_name, metric, fields in changes:
+        at = class_name, "Alpha", metric
+        rows[at] = dataclasses.replace(rows[at], **fields)
+    return dataclasses.replace(analysis, contrasts=tuple(rows.values()))
+
+
+ALONE = {"low": None, "high": None, "pairs": 1}
+
+
+def test_the_words_name_what_looks_worse_than_what_is_certain(analysis: Analysis):
+    alpha, _ = findings(
+        contrasted(
+            analysis,
+            ("complexity-10", "regret_wd", {"change": 1.06, **ALONE}),
+            ("complexity-10", "regret_ood", {"change": 1.01, **ALONE}),
+        )
+    )
+    assert alpha.headline.startswith("Alpha is broken by minimum reward r_min: on r_min-0_5")
+    larger = "Larger still, but not certain: complexity L (complexity-10: +{}, a single pair"
+    assert larger.format("1.06") in alpha.headline
+    assert "the worst" not in alpha.points[0]
+    assert not any("Not shown" in point and "complexity-10" in point for point in alpha.points)
+    (outside,) = (point for point in alpha.points if point.startswith("Out of distribution"))
+    assert "the same property makes it worse: minimum reward r_min" in outside
+    assert larger.format("1.01") in outside
+    assert "most" not in alpha.headline + outside
+
+
+def test_an_axis_with_a_class_that_is_shown_still_has_its_open_ones_listed(analysis: Analysis):
+    alpha, _ = findings(
+        contrasted(
+            analysis,
+            ("k-25", "regret_wd", {"change": 0.05, "low": 0.02, "high": 0.08}),
+            ("complexity-10", "regret_wd", {"axis": "k", "change": 0.1, **ALONE}),
+        )
+    )
+    (still_open,) = (point for point in alpha.points if point.startswith("Not shown"))
+    assert "reward interval k (complexity-10: +0.10, a single pair, no interval)" in still_open
+
+
+def test_nothing_is_called_the_worst_beside_what_has_no_interval(analysis: Analysis):
+    assert "the worst" in findings(analysis)[0].points[0]
+    alone = contrasted(analysis, ("complexity-10", "regret_wd", {"change": 0.01, **ALONE}))
+    sure = findings(alone)[0].points[0]
+    assert "no interval rules it out of complexity L (complexity-10: +0.01, a single pair" in sure
+
+
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [(0.95, "is about where the constant"), (1.25, "is worse than the constant")],
+)
+def test_the_words_say_where_a_broken_policy_ends_up(analysis: Analysis, level: float, words: str):
+    ended = contrasted(analysis, ("r_min-0_5", "regret_wd", {"level": level}))
+    assert f"At {level:.2f} it {words} action ½" in " ".join(findings(ended)[0].points)
+
+
 def test_the_words_say_when_runs_are_few(analysis: Analysis):
     beta = findings(analysis)[1]
     assert "an indication, not a finding" in beta.points[0]
@@ -186,7 +245,26 @@ def test_the_words_claim_nothing_from_one_run(finished: Path):
     cut = without(finished, lambda p: p.run > 0)
     for finding in findings(cut):
         assert finding.headline.startswith("No class has been shown")
-        assert "no proof of the contrary" in finding.headline
+        assert finding.headline.endswith("That is no proof of the contrary.")
+        rows = [
+            row for row in cut.contrasts
+            if (row.algorithm, row.metric) == (finding.algorithm, "regret_wd")
+        ]  # fmt: skip
+        most = max(rows, key=lambda row: row.change)
+        assert finding.points[-1] == (
+            "A single pair of runs has no interval; the largest change of such a pair is "
+            f"+{most.change:.2f} ({most.class_name})."
+        )
+        assert not any("upper end" in point for point in finding.points)
+
+
+def test_the_words_keep_upper_ends_apart_from_changes_without_one(finished: Path):
+    cut = without(finished, lambda p: p.run > 0)
+    ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
+    alpha, _ = findings(contrasted(cut, ("k-25", "regret_wd", ends)))
+    assert alpha.headline.endswith("the intervals say what is still possible.")
+    assert alpha.points[-2] == "The largest upper end is +0.04."
+    assert alpha.points[-1].startswith("A single pair of runs has no interval")
 
 
 def test_the_words_say_when_there_is_nothing_to_contrast(finished: Path):
@@ -214,6 +292,18 @@ def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis)
     blurred = tuple(dataclasses.replace(r, low=0.1, high=0.9) for r in analysis.improvements)
     text = comparison(dataclasses.replace(analysis, improvements=blurred))
     assert "leaves open which of the two is better" in text
+
+
+def test_the_comparison_says_who_was_trained_for_longer(analysis: Analysis):
+    assert "trained for" not in comparison(analysis)
+
+    def longer(run: Any) -> Any:
+        cell = run.planned.cell.model_copy(update={"steps": 4000})
+        return dataclasses.replace(run, planned=run.planned.model_copy(update={"cell": cell}))
+
+    results = tuple(longer(r) if r.planned.algorithm == "Alpha" else r for r in analysis.results)
+    text = comparison(dataclasses.replace(analysis, results=results))
+    assert text.startswith("Alpha was trained for 4,000 steps, Beta for 40. Over the 5 classes")
 
 
 def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):

@@ -23,6 +23,7 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report import write_report
 from sme_registry.studies.report.figures import pictures
+from sme_registry.studies.report.findings import comparison
 from sme_registry.studies.report.offline import (
     offline_data,
     offline_pictures,
@@ -161,6 +162,15 @@ def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
     pairs = {(row.first, row.second) for row in analysis.improvements if row.group == ALL}
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
     assert pairs == learners
+    text = comparison(analysis)
+    for nu in ("0", "0.5"):
+        assert f"of those on 1,000 transitions of ν = {nu}, BC ({nu}) scores highest" in text
+        assert f"A run of it beats one of IQL ({nu})" in text
+    assert text.count("A run of it beats") == 2
+
+
+def test_the_words_say_what_the_names_stand_for(analysis: Analysis) -> None:
+    assert "BC (0) learnt from data of ν = 0. The behaviour policy" in offline_words(analysis)[0]
 
 
 def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(

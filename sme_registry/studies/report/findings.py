@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from sme_registry.studies.analysis import ALL, AXES
-from sme_registry.studies.tables import ENOUGH_RUNS, Analysis, Contrast
+from sme_registry.studies.analysis import ALL, AXES, learnt_from
+from sme_registry.studies.tables import ENOUGH_RUNS, Aggregate, Analysis, Contrast
 
 WD, OOD = "regret_wd", "regret_ood"
 _NOT_LEARNT = 0.9  # of the constant's regret: nothing to speak of was learnt
@@ -74,27 +74,38 @@ def caveats(analysis: Analysis) -> list[str]:
 
 
 def comparison(analysis: Analysis) -> str:
-    """Which algorithm does best over all classes, and whether that is settled."""
+    """Which does best over all classes of those with equal data, and whether that is settled."""
+    data = learnt_from(analysis.results)
     rows = [
         row
         for row in analysis.aggregates
         if (row.group, row.metric, row.statistic) == (ALL, WD, "iqm")
         and row.algorithm in analysis.learners
     ]
-    if len(rows) < 2:
-        return ""
+    said = [_budgets(analysis, [row.algorithm for row in rows])]
+    for equal in dict.fromkeys(data[row.algorithm] for row in rows):
+        own = [row for row in rows if data[row.algorithm] == equal]
+        if len(own) > 1:
+            said.append(_best(analysis, own, equal))
+    return " ".join(filter(None, said))
+
+
+def _best(analysis: Analysis, rows: Sequence[Aggregate], data: tuple[float, int] | None) -> str:
+    """Which of some algorithms does best."""
     best = max(rows, key=lambda row: row.value)
+    among = f"of those on {data[1]:,} transitions of ν = {data[0]:g}, " if data else ""
     text = (
         f"Over the {best.classes} {_plural(best.classes, 'class', 'classes')} where all have runs, "
-        f"{best.algorithm} scores highest within distribution: {best.value:.2f}"
+        f"{among}{best.algorithm} scores highest within distribution: {best.value:.2f}"
         f"{_interval(best.low, best.high)}, where 1 is the optimum and 0 the constant ½."
     )
+    names = {row.algorithm for row in rows}
     for row in analysis.improvements:
         pair = {row.first, row.second}
         if (row.group, row.metric) != (ALL, WD) or best.algorithm not in pair:
             continue
         other = (pair - {best.algorithm}).pop()
-        if other not in analysis.learners:
+        if other not in names:
             continue
         value, low, high = row.value, row.low, row.high
         if row.first == other:
@@ -109,6 +120,19 @@ def comparison(analysis: Analysis) -> str:
             f"{_interval(low, high)}{sure}."
         )
     return text
+
+
+def _budgets(analysis: Analysis, algorithms: Sequence[str]) -> str:
+    """How long each of some algorithms was trained, where that differs."""
+    steps = {run.planned.algorithm: run.planned.cell.steps for run in analysis.results}
+    alike: dict[int, list[str]] = {}
+    for name in algorithms:
+        alike.setdefault(steps[name], []).append(name)
+    if len(alike) < 2:
+        return ""
+    (first, names), *others = alike.items()
+    text = f"{_and(names)} {_plural(len(names), 'was', 'were')} trained for {first:,} steps"
+    return text + "".join(f", {_and(names)} for {count:,}" for count, names in others) + "."
 
 
 def _finding(analysis: Analysis, algorithm: str) -> Finding:
@@ -132,18 +156,29 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
     if not worse:
         better = [row for row in rows if row.verdict == "better"]
         found = f"; {_listed(analysis, better)} lower it" if better else ""
+        ends = [row.high for row in rows if row.high is not None]
+        still = ": the intervals say what is still possible" if ends else ""
         headline = (
             f"No class has been shown to make {algorithm} worse within distribution{found}. "
-            "That is no proof of the contrary: the intervals say what is still possible."
+            f"That is no proof of the contrary{still}."
         )
-        points.append(f"The largest upper end is {_signed(max(map(_upper, rows)))}.")
+        if ends:
+            points.append(f"The largest upper end is {_signed(max(ends))}.")
+        alone = [row for row in rows if row.high is None]
+        if alone:
+            most = max(alone, key=lambda row: row.change)
+            points.append(
+                "A single pair of runs has no interval; the largest change of such a pair is "
+                f"{_signed(most.change)} ({most.class_name})."
+            )
         return Finding(algorithm, headline, tuple(points))
     top = max(worse, key=lambda row: row.change)
+    larger = _larger(rows, top)
     headline = (
-        f"{algorithm} is {_verb(top.change)} by {_property(analysis, top)}: on {top.class_name} "
-        f"its normalised regret within distribution goes from {top.base:.2f} to {top.level:.2f}, a "
-        f"change of {_signed(top.change)} (95 % interval {_signed(top.low)} to "
-        f"{_signed(top.high)}, {top.pairs} pairs of runs)."
+        f"{algorithm} is {_verb(top.change, most=not larger)} by {_property(analysis, top)}: on "
+        f"{top.class_name} its normalised regret within distribution goes from {top.base:.2f} to "
+        f"{top.level:.2f}, a change of {_signed(top.change)} (95 % interval {_signed(top.low)} to "
+        f"{_signed(top.high)}, {top.pairs} pairs of runs).{_uncertain(analysis, larger)}"
     )
     points += [_certainty(analysis, top, rows), _severity(analysis, top)]
     others = [row for row in _worst_of_each_axis(worse) if row.axis != top.axis]
@@ -155,8 +190,9 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
         points.append(
             f"There are indications, no more, that it is made worse by {_listed(analysis, few)}."
         )
-    shown = {row.axis for row in worse}
-    still_open = [row for row in _worst_of_each_axis(rows) if row.axis not in shown]
+    still_open = [
+        row for row in _worst_of_each_axis(rows) if row.verdict != "worse" and row not in larger
+    ]
     if still_open:
         points.append(
             f"Not shown to make it worse: {_listed(analysis, still_open)}. Where an interval is "
@@ -165,18 +201,31 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
     outside = [row for row in _rows(analysis, algorithm, OOD) if row.verdict == "worse"]
     if outside:
         far = max(outside, key=lambda row: row.change)
+        larger = _larger(_rows(analysis, algorithm, OOD), far)
+        costs = "makes it worse" if larger else "costs it most"
         if far.axis == top.axis:
-            text = "Out of distribution the same property costs it most"
+            text = f"Out of distribution the same property {costs}"
         else:
-            text = f"Out of distribution it is {_property(analysis, far)} that costs it most"
-        points.append(f"{text}: {_listed(analysis, [far])}.")
+            text = f"Out of distribution it is {_property(analysis, far)} that {costs}"
+        points.append(f"{text}: {_listed(analysis, [far])}.{_uncertain(analysis, larger)}")
     return Finding(algorithm, headline, tuple(filter(None, points)))
+
+
+def _larger(rows: Iterable[Contrast], top: Contrast) -> list[Contrast]:
+    """What costs more than the largest change that is certain, of each axis its worst."""
+    return _worst_of_each_axis(row for row in rows if row.change > top.change)
+
+
+def _uncertain(analysis: Analysis, larger: Sequence[Contrast]) -> str:
+    return f" Larger still, but not certain: {_listed(analysis, larger)}." if larger else ""
 
 
 def _severity(analysis: Analysis, top: Contrast) -> str:
     """Where the policies end up, between the references."""
     level = analysis.level(top.class_name, top.algorithm, WD)
     linear = level.linear if level is not None else None
+    if top.level > 2.0 - _NOT_LEARNT:
+        return f"At {top.level:.2f} it is worse than the constant action ½, which scores 1."
     if top.level >= _NOT_LEARNT:
         return f"At {top.level:.2f} it is about where the constant action ½ is, which scores 1."
     if linear is None:
@@ -202,15 +251,15 @@ def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> s
             f"How sure? Not very: {top.pairs} pairs of runs are few, and this is an indication, "
             f"not a finding. {ENOUGH_RUNS} or more would settle more."
         )
-    rivals = [
+    rivals = _worst_of_each_axis(
         row
-        for row in _worst_of_each_axis(rows, by_upper=True)
-        if row.axis != top.axis and _upper(row) >= (top.low or 0.0)
-    ]
+        for row in rows
+        if row.axis != top.axis and (row.high is None or row.high >= (top.low or 0.0))
+    )
     if rivals:
         return (
             "How sure? That it hurts, its interval shows. That nothing else hurts more is not "
-            f"settled: the intervals of {_listed(analysis, rivals)} reach as far."
+            f"settled: no interval rules it out of {_listed(analysis, rivals)}."
         )
     if len({row.axis for row in rows}) == 1:
         return "How sure? That it hurts, its interval shows; no other axis was varied."
@@ -224,16 +273,12 @@ def _rows(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
     return [row for row in analysis.contrasts if (row.algorithm, row.metric) == (algorithm, metric)]
 
 
-def _worst_of_each_axis(rows: Iterable[Contrast], *, by_upper: bool = False) -> list[Contrast]:
+def _worst_of_each_axis(rows: Iterable[Contrast]) -> list[Contrast]:
     """For each axis the class that costs most, dearest axis first."""
     found: dict[str, Contrast] = {}
-    for row in sorted(rows, key=_upper if by_upper else lambda row: row.change, reverse=True):
+    for row in sorted(rows, key=lambda row: row.change, reverse=True):
         found.setdefault(row.axis or row.class_name, row)
     return list(found.values())
-
-
-def _upper(row: Contrast) -> float:
-    return row.change if row.high is None else row.high
 
 
 def _listed(analysis: Analysis, rows: Sequence[Contrast]) -> str:
@@ -266,10 +311,9 @@ def _differing(analysis: Analysis, class_name: str) -> list[str]:
     return [name for name in AXES if info.setting[name] != base.setting[name] and name != info.axis]
 
 
-def _verb(change: float) -> str:
-    if change >= _BROKEN:
-        return "broken most"
-    return "hurt most" if change >= _HURT else "hurt most, though little,"
+def _verb(change: float, *, most: bool) -> str:
+    verb = "broken" if change >= _BROKEN else "hurt"
+    return f"{verb}{' most' if most else ''}{'' if change >= _HURT else ', though little,'}"
 
 
 def _interval(low: float | None, high: float | None) -> str:
@@ -282,6 +326,12 @@ def _signed(value: float | None) -> str:
         return "?"
     text = f"{value:+.2f}"
     return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
+
+
+def _and(names: Sequence[str]) -> str:
+    """`PPO, TD3 and SAC`."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _plural(count: int, one: str, many: str = "") -> str:

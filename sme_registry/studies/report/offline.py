@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
+from sme_registry.studies.analysis import learnt_from
 from sme_registry.studies.report.exports import Data, Printed, number, table_of
 from sme_registry.studies.report.figures import WIDTH, Picture
 from sme_registry.studies.tables import (
@@ -204,7 +205,7 @@ def offline_words(analysis: Analysis) -> list[str]:
     """What the numbers say, a sentence or a few for each question; nothing without such cells."""
     if not analysis.offline:
         return []
-    said = [_of_the_data(analysis)]
+    said = [_of_the_names(analysis), _of_the_data(analysis)]
     for name in _learners(analysis):
         said += [_of_learner(analysis, name), *_of_depth(analysis, name)]
     runs = [row.runs for row in analysis.offline]
@@ -222,6 +223,18 @@ def offline_words(analysis: Analysis) -> list[str]:
             f"{_NEAR:g} of r̃."
         )
     return said
+
+
+def _of_the_names(analysis: Analysis) -> str:
+    """What an algorithm of such a plan is."""
+    name, (nu, _) = next(
+        (name, data) for name, data in learnt_from(analysis.results).items() if data
+    )
+    return (
+        f"An algorithm here is a learner with its data: {name} learnt from data of ν = "
+        f"{nu:g}. The behaviour policy that makes them takes (1 − α) a* + α ã, with α drawn from "
+        "U(0, ν) at each step and ã of a second network."
+    )
 
 
 def _of_the_data(analysis: Analysis) -> str:
