@@ -322,7 +322,8 @@ def _refuse_other_specs(listed: list[_Listed], suite: SuiteFile) -> None:
         raise Rejection(
             "unknown_spec",
             f"runs: {', '.join(strangers[:5])}{more}: must be on one of the {len(known)} instances "
-            f"of {suite.versioned_name}. Leave them out, or name the suite that they are of.",
+            f"of {suite.versioned_name} (`sme show {suite.name}`). Leave them out, or name the "
+            "suite that they are of.",
         )
 
 

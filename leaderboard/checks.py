@@ -124,7 +124,8 @@ def check_runs(suite: Suite, submission: Submission) -> None:
             raise Rejection(
                 "unknown_spec",
                 f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
-                f"{len(class_of)} instances. Train on those, or submit to the board of its suite.",
+                f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
+                "or submit to the board of its suite.",
             )
     _check_duplicates(submission)
     ran = {run.spec for run in submission.runs}

@@ -199,7 +199,7 @@ def never_listed(
             raise Rejection(
                 "unknown_spec",
                 f"runs.{index}.spec={run.spec}: must be an instance of {board.suite_name}. "
-                "Take the digests from the suite's file.",
+                f"`sme show {board.suite_name}` lists them.",
             )
         listed[instances[run.spec][0]] += 1
     for name, count in listed.items():

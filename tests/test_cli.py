@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from typer.testing import CliRunner, Result
 import sme_registry
 from sme_registry import EvaluationReport, SMESpec, load
 from sme_registry.cli import app
-from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, Suite, SuiteFile, catalogue
 from sme_registry.task.certify import certify
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
@@ -176,8 +177,33 @@ class TestShow:
         assert "complexity=10" in good("show", "core").stdout
         assert "epsilons" in good("show", "paper-v1").stdout
         shown = json.loads(good("show", "smoke", "--json").stdout)
-        assert shown == catalogue.find(SuiteFile, "smoke").plain()
         assert json.loads(good("show", shown["digest"], "--json").stdout) == shown
+        shown.pop("derived")
+        assert shown == catalogue.find(SuiteFile, "smoke").plain()
+
+    def test_a_suite_lists_its_instances_by_names_to_train_by(self) -> None:
+        file = catalogue.find(SuiteFile, "core")
+        listed = json.loads(good("show", "core", "--json").stdout)["derived"]["instances"]
+        assert listed == [
+            {"class": member.name, "seed": spec.seed, "digest": spec.digest}
+            for member in file.suite.classes
+            for spec in member.instances
+        ]
+        text = good("show", "core").stdout
+        short = re.findall(r"\d+ │ (sha256:[0-9a-f]{12}) │", text)
+        assert [load(name) for name in short] == list(file.suite.instances)
+        assert f"sme train {short[0]}" in text
+
+    def test_the_instances_of_a_suite_outside_the_catalogue_are_listed_too(
+        self, tmp_path: Path
+    ) -> None:
+        plain = catalogue.find(SuiteFile, "smoke").plain()
+        plain["suite"]["classes"] = [{**plain["suite"]["classes"][0], "seeds": [7777]}]
+        suite = Suite.parse(plain["suite"])
+        (tmp_path / "mine.json").write_text(json.dumps({**plain, "digest": suite.digest}))
+        text = good("show", "mine.json").stdout
+        assert f"7777 │ {suite.instances[0].digest[:19]} │" in text
+        assert "sme train" not in text
 
     def test_an_instance_of_a_suite_is_found_by_its_digest(self) -> None:
         spec = catalogue.find(SuiteFile, "core").suite.instances[-1]

@@ -111,11 +111,13 @@ def new(
 ) -> None:
     """Make a submission from trained runs, and sign it.
 
+    There must be a run on each instance of the suite; `sme show smoke` lists them.
+
     Examples:
 
-      sme train SME/Default-v1 --algorithm TD3 --seed 0 --out runs/td3-0
+      sme train sha256:dfe78aa6aba8 --algorithm TD3 --seed 0
 
-      sme-leaderboard new td3 --runs 'runs/td3-*' --method TD3 --submitter "A Lab" --suite mine.json
+      sme-leaderboard new td3 --runs 'runs/*-TD3-*' --method TD3 --submitter "A Lab"
     """
     from leaderboard.bundle import make_bundle
 

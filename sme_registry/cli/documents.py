@@ -28,7 +28,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.resolve import resolve, with_fingerprint
+from sme_registry.spec.resolve import known_specs, resolve, with_fingerprint
 from sme_registry.terminal.output import err, mark, out, print_json, print_pairs
 
 Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
@@ -66,6 +66,9 @@ _SCHEMAS: dict[Schema, type[BaseModel]] = {
     Schema.study: StudyPlan,
     Schema.study_file: StudyFile,
 }
+
+
+_SHORT = len("sha256:") + 12  # of a digest, enough to name a task by
 
 
 def list_(
@@ -207,6 +210,8 @@ def show(
 ) -> None:
     """One task, suite or protocol: its fields, its digest, and what follows from them.
 
+    Of a suite, the instances of each class: `sme train` takes their digests.
+
     Examples:
 
       sme show Default
@@ -214,6 +219,8 @@ def show(
       sme show mine.json --json
 
       sme show sha256:66e9b7a9a266
+
+      sme show smoke --json | jq -r '.derived.instances[].digest'
 
       sme show --json-schema env-file > env-file.schema.json
     """
@@ -232,10 +239,10 @@ def show(
         _show_task(found, json)
         return
     document = getattr(found, found.content)
-    if json:
+    if isinstance(found, SuiteFile):
+        _show_suite(found, json)
+    elif json:
         print_json(found.plain())
-    elif isinstance(document, Suite):
-        _show_suite(cast(SuiteFile, found))
     elif isinstance(found, StudyFile):
         out().print(_study_table([found]))
         out().print(f"{found.digest}\nIts runs and what they take: sme study plan {escape(name)}")
@@ -360,21 +367,37 @@ def _ranges(channels: list[int]) -> str:
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 
-def _show_suite(file: SuiteFile) -> None:
+def _show_suite(file: SuiteFile, json: bool) -> None:
+    if json:
+        instances = [
+            {"class": member.name, "seed": spec.plain()["seed"], "digest": spec.digest}
+            for member in file.suite.classes
+            for spec in member.instances
+        ]
+        print_json({**file.plain(), "derived": {"instances": instances}})
+        return
     default = SMESpec().plain()
     table = Table(
         title=_title(file), caption=file.digest, title_justify="left", caption_justify="left"
     )
     table.add_column("class", no_wrap=True)
-    table.add_column("differs from the default in")
-    table.add_column("seeds")
+    table.add_column("differs from the default in", overflow="fold")
+    table.add_column("seed", justify="right", no_wrap=True)
+    table.add_column("instance", no_wrap=True)
     for member in file.suite.classes:
         changed = {k: v for k, v in member.setting.plain().items() if v != default[k]}
-        seeds = ", ".join(map(str, member.seeds))
         if member.setting.team is not None:
             changed["team"] = _team_in_words(member.setting.team)
-        table.add_row(member.name, escape(", ".join(f"{k}={v}" for k, v in changed.items())), seeds)
+        table.add_row(
+            member.name,
+            escape(", ".join(f"{k}={v}" for k, v in changed.items())),
+            "\n".join(str(seed) for seed in member.seeds),
+            "\n".join(spec.digest[:_SHORT] for spec in member.instances),
+        )
     out().print(table)
+    first = file.suite.instances[0].digest
+    if first in known_specs():  # those of a file outside the catalogue have no name to train by
+        out().print(f"To train on an instance: sme train {first[:_SHORT]}", soft_wrap=True)
 
 
 def _title(file: Envelope) -> str:

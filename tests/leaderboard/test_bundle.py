@@ -318,7 +318,8 @@ def test_runs_on_other_specs_are_named(tmp_path, table):
     nothing_is_left(
         tmp_path,
         Rejection,
-        rf"unknown_spec: .*runs.json, run 0 \({name}\).* and 2 more: .* 3 instances of two-v1",
+        rf"unknown_spec: .*runs.json, run 0 \({name}\).* and 2 more: .* 3 instances "
+        r"of two-v1 \(`sme show two`\)",
         rewritten(table, rows),
     )
 

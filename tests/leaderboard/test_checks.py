@@ -181,7 +181,8 @@ def test_a_run_on_another_spec_is_refused():
     stranger = "sha256:" + "1" * 64
     refused(
         "unknown_spec",
-        f"runs.3.spec={stranger}: must be the digest of one of the suite's 3 instances",
+        f"runs.3.spec={stranger}: must be the digest of one of the suite's 3 instances "
+        r"\(`sme show two-v1`\)",
         runs=[*RUNS, run(stranger)],
     )
 
