@@ -541,7 +541,7 @@ class _Drawer:
         if not grids:
             return (
                 "No maps of the plane: they need trained models, which a run with --keep-models "
-                f"keeps.{problem}"
+                f"in a new folder keeps.{problem}"
             )
         classes = list(dict.fromkeys(place[0] for place in grids))
         names = list(dict.fromkeys(place[1] for place in grids))
