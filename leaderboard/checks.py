@@ -2,7 +2,8 @@
 
 What the schema cannot know. In this order, the first that fails is told:
 
-    unsafe_name      names, texts and links hold only characters that are safe to show
+    unsafe_name      names, texts and links hold only characters that are safe to show, and no
+                     name passes for the board's own
     unknown_suite    it is of this board's suite and track
     schema           its time is a time
     stale_time       and near the board's
@@ -58,7 +59,7 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
     Raises:
       Rejection: the first of this module's codes that fits, in its order.
     """
-    check_names(submission)
+    check_names(submission, board.key)
     _check_suite(board, submission)
     _check_time(submission.created, at, board.limits.age_days)
     check_runs(board.suite, submission)
@@ -71,8 +72,12 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             )
 
 
-def check_names(submission: Submission) -> None:
-    """Refuse what would be unsafe to show: markup, formulas, control characters.
+def check_names(submission: Submission, board_key: str | None = None) -> None:
+    """Refuse what would be unsafe to show: markup, formulas, control characters, the board's names.
+
+    Args:
+      submission: the submission.
+      board_key: whose submissions alone may be called so; None where the board is not known yet.
 
     Raises:
       Rejection: `unsafe_name`.
@@ -89,6 +94,16 @@ def check_names(submission: Submission) -> None:
                 "unsafe_name",
                 f"{field}={name!a}: must begin with a letter or digit, and hold letters "
                 "a–z, digits, single spaces and '._+-()' only. Rename it.",
+            )
+    for field, name, reserved in (
+        ("submitter.name", submission.submitter.name, "the board"),
+        ("method.family", method.family, "reference"),
+    ):
+        if _folded(name) == reserved and submission.submitter.key != board_key:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: is what the board's own reference rows are called: must be "
+                "another name. Rename it.",
             )
     if submission.code is not None and not _LINK.fullmatch(submission.code):
         raise Rejection(
@@ -109,6 +124,11 @@ def check_names(submission: Submission) -> None:
                     f"{field}: holds {letter!a}: must hold no control characters but line "
                     "breaks. Remove it.",
                 )
+
+
+def _folded(name: str) -> str:
+    """A name without what a reader overlooks: case, width of letters, spaces."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def check_runs(suite: Suite, submission: Submission) -> None:
@@ -184,7 +204,7 @@ def most_runs(board: BoardDocument) -> int:
 
 def _check_suite(board: BoardDocument, submission: Submission) -> None:
     expected = board.suite_reference
-    if submission.suite.digest != expected.digest:
+    if submission.suite != expected:
         raise Rejection(
             "unknown_suite",
             f"suite={submission.suite.name}, {submission.suite.digest}: must be "

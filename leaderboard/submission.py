@@ -9,15 +9,23 @@ A bundle is the folder that is submitted: `submission.json` (a `SignedSubmission
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
 
 from leaderboard.errors import Rejection
 from leaderboard.keys import PublicKey, Signature, SigningKey, verifies
 from sme_registry.errors import MalformedDocumentError, SpecError
 from sme_registry.files import parse_json, to_json
-from sme_registry.spec import Digest, Document, Integer, Name, SchemaVersion, StrictModel
+from sme_registry.spec import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    SchemaVersion,
+    StrictModel,
+    explained,
+)
 
 FILE = "submission.json"
 ARTEFACTS = "artefacts"
@@ -130,6 +138,18 @@ class Submission(Document):
     runs_started: dict[Name, _Count]
     training: Training = Training()
     statement: _Text = ""
+
+    @field_validator("code", mode="wrap")
+    @classmethod
+    def _link(cls, value: Any, read: ValidatorFunctionWrapHandler) -> str | None:
+        try:
+            link: str | None = read(value)
+        except ValidationError:
+            raise explained(
+                f"code={value!r:.80}: must be an https:// link of at most 300 characters, none "
+                "of them a space. Leave it out where there is none."
+            ) from None
+        return link
 
     def signed(self, key: SigningKey) -> SignedSubmission:
         """This submission with its signature; the key must be the submitter's."""

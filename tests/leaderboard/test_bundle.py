@@ -372,7 +372,14 @@ def test_a_path_that_is_no_run_is_refused(tmp_path, path):
     [
         ({"method": "<b>"}, Rejection, "unsafe_name: method.name"),
         ({"submitter": ""}, SpecError, "submitter.name=''"),
-        ({"code": "http://plain.org"}, SpecError, "code='http://plain.org'"),
+        (
+            {"code": "http://plain.org"},
+            SpecError,
+            "code='http://plain.org': must be an https:",
+        ),
+        ({"code": 3}, SpecError, "code=3: must be an https:// link"),
+        ({"code": "https://a b"}, SpecError, "code='https://a b': must be an https:// link"),
+        ({"code": "https://" + "a" * 293}, SpecError, "code='https://a+: must be .* at most 300"),
         ({"runs_started": {"C": 1}}, Rejection, "missing_run: runs_started.C"),
         ({"runs_started": {"A": 1}}, Rejection, "missing_run: runs_started.A=1"),
         ({"knowledge": "all"}, SpecError, "knowledge='all'"),

@@ -7,12 +7,14 @@ import datetime
 import pytest
 
 from leaderboard.board import BoardDocument, Limits
-from leaderboard.checks import check_submission, most_runs, refuse_unsubmittable
+from leaderboard.checks import check_names, check_submission, most_runs, refuse_unsubmittable
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.intake import submit_references
 from leaderboard.store import Store
 from leaderboard.submission import MAX_BYTES, SignedSubmission, Submission
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite, SuiteFile, catalogue
+from tests.leaderboard.conftest import tiny_board
 
 SETTING = {"state_dim": 2, "action_dim": 1}
 SUITE = Suite.parse(
@@ -118,6 +120,38 @@ def test_a_plain_name_passes(field, name):
     accepted(**{field: name})
 
 
+@pytest.mark.parametrize(
+    ("field", "name"),
+    [
+        ("submitter__name", "the board"),
+        ("submitter__name", "The Board"),
+        ("method__family", "reference"),
+        ("method__family", "REFERENCE"),
+    ],
+)
+def test_what_the_boards_own_rows_are_called_is_the_boards_alone(field, name):
+    match = f"{field.replace('__', '.')}='{name}': is what the board's own"
+    refused("unsafe_name", match, **{field: name})
+    with pytest.raises(Rejection, match=match):
+        check_names(submission(**{field: name}))
+    accepted(**{field: name, "submitter__key": BOARD.key})
+    accepted(**{field: f"{name} 2"})
+
+
+def test_a_reference_row_signed_by_another_key_is_refused(tmp_path):
+    with tiny_board(tmp_path / "board") as store:
+        for id in submit_references(store):
+            own = store.submission(id).submission
+            check_submission(store.document, own, datetime.datetime.now(datetime.UTC))
+            for field in ("submitter.name", "method.family"):
+                plain = own.plain()
+                plain["submitter"]["key"] = "cd" * 32
+                if field == "method.family":
+                    plain["submitter"]["name"] = "A Lab"
+                with pytest.raises(Rejection, match=f"^unsafe_name: {field}"):
+                    check_names(Submission.parse(plain), store.document.key)
+
+
 TEXTS = ("training__library", "training__hyperparameters", "training__hardware", "statement")
 
 
@@ -150,8 +184,9 @@ def test_another_suite_is_refused():
     refused("unknown_suite", "suite=two-v1, sha256:000.*: must be two-v1, sha256:", suite=other)
 
 
-def test_a_suite_is_known_by_its_digest_and_not_by_its_name():
-    accepted(suite={"name": "renamed", "digest": SUITE.digest})
+def test_a_suite_by_another_name_is_refused():
+    other = {"name": "three-v1", "digest": SUITE.digest}
+    refused("unknown_suite", "suite=three-v1, sha256:.*: must be two-v1, sha256:", suite=other)
 
 
 @pytest.mark.parametrize("created", ["2026-11-07T12:00:00Z", "2026-11-21T12:10:00Z"])
