@@ -45,6 +45,9 @@ _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
 # Control and format characters (those that turn the direction of writing are among the latter),
 # surrogates, and separators of lines and paragraphs.
+THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
+"""The submitter and the family of the board's own reference rows, and of nobody else's."""
+
 _UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
@@ -96,8 +99,8 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
                 "a–z, digits, single spaces and '._+-()' only. Rename it.",
             )
     for field, name, reserved in (
-        ("submitter.name", submission.submitter.name, "the board"),
-        ("method.family", method.family, "reference"),
+        ("submitter.name", submission.submitter.name, THE_BOARD),
+        ("method.family", method.family, REFERENCE_FAMILY),
     ):
         if _folded(name) == reserved and submission.submitter.key != board_key:
             raise Rejection(
@@ -117,13 +120,22 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
         ("training.hardware", training.hardware),
         ("statement", submission.statement),
     ):
-        for letter in text:
-            if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
-                raise Rejection(
-                    "unsafe_name",
-                    f"{field}: holds {letter!a}: must hold no control characters but line "
-                    "breaks. Remove it.",
-                )
+        check_text(field, text)
+
+
+def check_text(field: str, text: str) -> None:
+    """Refuse a text of several lines that holds what could disguise what is shown beside it.
+
+    Raises:
+      Rejection: `unsafe_name`.
+    """
+    for letter in text:
+        if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}: holds {letter!a}: must hold no control characters but line breaks. "
+                "Remove it.",
+            )
 
 
 def _folded(name: str) -> str:

@@ -25,7 +25,7 @@ CODES = {
     "unknown_spec": "a run's spec digest is no instance of the suite",
     "duplicate_run": "a run, or an artefact within one spec, is listed twice",
     "missing_run": "an instance of the suite has no run, or runs_started is below the runs listed",
-    "unsafe_name": "a name or path holds characters that are not allowed",
+    "unsafe_name": "a name or path holds characters that are not allowed, or is the board's own",
     "unknown_submission": "no submission of this id is on the board",
     "withdrawn": "the submission was withdrawn by its submitter",
     "quota": "the key's, or the board's, quota is used up",

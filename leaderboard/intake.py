@@ -17,13 +17,12 @@ import datetime
 import hashlib
 import os
 import re
-import unicodedata
 from collections.abc import Callable
 
 from leaderboard.artefact.gate import inspect
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle
-from leaderboard.checks import _UNSAFE_CATEGORIES, check_submission
+from leaderboard.checks import REFERENCE_FAMILY, THE_BOARD, check_submission, check_text
 from leaderboard.errors import Rejection
 from leaderboard.keys import SigningKey, verifies
 from leaderboard.store import Store
@@ -181,13 +180,7 @@ def withdraw(store: Store, signed: SignedWithdrawal) -> str:
         raise Rejection(
             "unknown_submission", f"submission={id}: is not on this board. Check the id."
         )
-    for letter in signed.withdrawal.reason:
-        if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
-            raise Rejection(
-                "unsafe_name",
-                f"reason: holds {letter!a}: must hold no control characters but line breaks. "
-                "Remove it.",
-            )
+    check_text("reason", signed.withdrawal.reason)
     store.withdraw(signed)
     return id
 
@@ -405,8 +398,8 @@ def _reference(
     submission = Submission(
         track=store.document.track,
         suite=store.document.suite_reference,
-        method=Method(name=name, version="1", family="reference", knowledge=knowledge),
-        submitter=Submitter(name="the board", key=key.public),
+        method=Method(name=name, version="1", family=REFERENCE_FAMILY, knowledge=knowledge),
+        submitter=Submitter(name=THE_BOARD, key=key.public),
         created=utc(opened),
         runs=tuple(runs),
         runs_started=started,

@@ -84,9 +84,14 @@ def refuse_unpublishable(entries: list[EntryRow]) -> None:
         found = [row.scores for row in rows if row.status == "scored" and row.scores is not None]
         if not found:
             status = rows[-1].status if rows else "missing"
+            advice = (
+                "Make the board anew, with `sme-leaderboard init`: a rejection is for good"
+                if status == "rejected"
+                else "Run `sme-leaderboard score` on the board"
+            )
             raise NotPublishable(
                 f"reference row {name!r}: {status}: must be scored before anything of this board "
-                "is shown. Run `sme-leaderboard score` on the board."
+                f"is shown. {advice}."
             )
         for scores in found:
             for what, value, expected in _to_hold(scores, regret):

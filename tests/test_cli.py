@@ -194,6 +194,13 @@ class TestShow:
         assert [load(name) for name in short] == list(file.suite.instances)
         assert f"sme train {short[0]}" in text
 
+    def test_the_digests_of_a_suite_are_lines_for_a_loop_of_the_shell(self) -> None:
+        lines = good("show", "smoke", "--digests").stdout.splitlines()
+        suite = catalogue.find(SuiteFile, "smoke").suite
+        assert lines == [spec.digest for spec in suite.instances]
+        for other in (("Default",), ("smoke", "--json")):
+            assert "--digests: is for a suite" in refused("show", *other, "--digests")
+
     def test_the_instances_of_a_suite_outside_the_catalogue_are_listed_too(
         self, tmp_path: Path
     ) -> None:

@@ -273,7 +273,13 @@ def submit(
 
 def withdraw(
     board: BoardOrUrl,
-    id: Annotated[str, typer.Argument(metavar="ID", help="The submission's id.")],
+    id: Annotated[
+        str,
+        typer.Argument(
+            metavar="ID",
+            help="The submission's id; of a board's folder, its beginning is enough.",
+        ),
+    ],
     reason: Annotated[str, typer.Option(help="Shown on its page.")] = "",
     key: KeyFile = default_key(),  # noqa: B008 - a path, the same at each call
 ) -> None:

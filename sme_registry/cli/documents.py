@@ -207,6 +207,10 @@ def show(
         Schema | None,
         typer.Option("--json-schema", help="Print the JSON Schema of a kind of document instead."),
     ] = None,
+    digests: Annotated[
+        bool,
+        typer.Option("--digests", help="Of a suite, only its instances' digests, a line each."),
+    ] = False,
 ) -> None:
     """One task, suite or protocol: its fields, its digest, and what follows from them.
 
@@ -220,7 +224,7 @@ def show(
 
       sme show sha256:66e9b7a9a266
 
-      sme show smoke --json | jq -r '.derived.instances[].digest'
+      for task in $(sme show smoke --digests); do sme train $task; done
 
       sme show --json-schema env-file > env-file.schema.json
     """
@@ -235,12 +239,17 @@ def show(
             "NAME: missing: must be a name, a path or a digest, as in `sme show Default`."
         )
     found = names.find_any(name)
+    if digests and (json or not isinstance(found, SuiteFile)):
+        raise OptionError("--digests: is for a suite, and without --json. Leave one of them out.")
     if isinstance(found, SMESpec | EnvFile):
         _show_task(found, json)
         return
     document = getattr(found, found.content)
     if isinstance(found, SuiteFile):
-        _show_suite(found, json)
+        if digests:
+            out().print("\n".join(spec.digest for spec in found.suite.instances), soft_wrap=True)
+        else:
+            _show_suite(found, json)
     elif json:
         print_json(found.plain())
     elif isinstance(found, StudyFile):
