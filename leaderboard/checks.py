@@ -25,7 +25,6 @@ from collections import Counter
 
 from leaderboard.board import BoardDocument
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.scoring import refuse_countless
 from leaderboard.submission import (
     MAX_ARTEFACT_BYTES,
     MAX_BYTES,
@@ -35,8 +34,12 @@ from leaderboard.submission import (
     SignedSubmission,
     Submission,
     Submitter,
+    refuse_countless,
 )
 from sme_registry.spec import Suite
+
+THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
+"""The submitter and the family of the board's own reference rows, and of nobody else's."""
 
 MINUTES_AHEAD = 10
 
@@ -45,9 +48,6 @@ _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
 # Control and format characters (those that turn the direction of writing are among the latter),
 # surrogates, and separators of lines and paragraphs.
-THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
-"""The submitter and the family of the board's own reference rows, and of nobody else's."""
-
 _UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 

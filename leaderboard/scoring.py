@@ -13,7 +13,7 @@ to make a new policy for each attempt. What is held at once is one artefact and 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 
 import numpy as np
@@ -23,7 +23,7 @@ from leaderboard.board import BoardDocument
 from leaderboard.errors import Rejection
 from leaderboard.result import METRICS, ClassScore, Estimate, Result, RunScore, Scores
 from leaderboard.statistics import run_metrics
-from leaderboard.submission import Submission
+from leaderboard.submission import Submission, refuse_countless
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport
@@ -31,9 +31,6 @@ from sme_registry.statistics import aggregate, iqm, stratified_bootstrap
 
 Progress = Callable[[int, int], None]
 Instances = dict[str, tuple[str, SMESpec]]
-
-MAX_RUNS = 10_000
-"""Runs counted in all. `runs_started` may say any number, and each costs a line of the result."""
 
 ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
 """Oracle-like: A at most the first, or N₀ at most the second and |D| at most the third."""
@@ -53,23 +50,6 @@ def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str
     """
     text = f"{protocol_digest}\n{spec_digest}\n{artefact_digest}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
-
-
-def refuse_countless(started: Mapping[str, int]) -> None:
-    """Refuse more runs than a result can hold.
-
-    Args:
-      started: how many, by class.
-
-    Raises:
-      Rejection: `schema`.
-    """
-    if sum(started.values()) > MAX_RUNS:
-        raise Rejection(
-            "schema",
-            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
-            "Count the runs of this version of the method only.",
-        )
 
 
 def score_submission(

@@ -43,6 +43,7 @@ from leaderboard.scorer import run_scorers
 from leaderboard.site import Pages, content_type
 from leaderboard.store import Store
 from leaderboard.submission import MAX_BYTES, SignedSubmission
+from leaderboard.told import told
 from sme_registry.errors import MissingDependencyError, SMEError
 from sme_registry.terminal.interrupts import hear, starting_deaf
 
@@ -269,7 +270,7 @@ class _Served:
             raise Rejection(
                 "unknown_submission", f"submission={id}: is not on this board. Check the id."
             )
-        return tables.told(self._store, entry).plain()
+        return told(self._store, entry).plain()
 
     async def post_withdrawal(self, request: Request) -> Response:
         text = await _document(request, "withdrawal")

@@ -9,6 +9,7 @@ A bundle is the folder that is submitted: `submission.json` (a `SignedSubmission
 from __future__ import annotations
 
 import datetime
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
@@ -31,6 +32,8 @@ FILE = "submission.json"
 ARTEFACTS = "artefacts"
 MAX_BYTES = 64 * 2**10
 MAX_ARTEFACT_BYTES = 8 * 2**20
+MAX_RUNS = 10_000
+"""Runs counted in all. `runs_started` may say any number, and each costs a line of the result."""
 
 Track = Literal["open"]  # sealed seasons will be another
 Knowledge = Literal["generic", "family", "oracle"]
@@ -232,3 +235,20 @@ def utc(moment: datetime.datetime) -> str:
 def now() -> str:
     """The present moment as documents write it."""
     return utc(datetime.datetime.now(datetime.UTC))
+
+
+def refuse_countless(started: Mapping[str, int]) -> None:
+    """Refuse more runs than a result can hold.
+
+    Args:
+      started: how many, by class.
+
+    Raises:
+      Rejection: `schema`.
+    """
+    if sum(started.values()) > MAX_RUNS:
+        raise Rejection(
+            "schema",
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
+            "Count the runs of this version of the method only.",
+        )

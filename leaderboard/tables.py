@@ -1,6 +1,4 @@
-"""A ranking as JSON, CSV or LaTeX, and what may be told of one submission.
-
-Each file of a ranking says what it is of: suite, protocol, log and date.
+"""A ranking as JSON, CSV or LaTeX. Each file says what it is of: suite, protocol, log and date.
 
 What submitters wrote is made harmless: a cell of text that a spreadsheet would take for a formula
 begins with an apostrophe, and what LaTeX would take for a command is shown as it was written.
@@ -10,16 +8,14 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
 from typing import Any
 
 from leaderboard.board import BoardDocument
-from leaderboard.errors import NotPublishable
-from leaderboard.ranking import Metric, RankedRow, refuse_unpublishable
-from leaderboard.result import METRICS, Estimate, Result
-from leaderboard.store import EntryRow, Store
-from leaderboard.submission import SignedSubmission, SignedWithdrawal, now
+from leaderboard.ranking import Metric, RankedRow
+from leaderboard.result import METRICS, Estimate
+from leaderboard.submission import now
 from sme_registry.files import to_json as plain_to_json
+from sme_registry.terminal import fixed
 
 Head = tuple[int, str]
 
@@ -40,49 +36,6 @@ _LATEX = {
     "|": r"\textbar{}",
     '"': r"\textquotedbl{}",
 }
-
-
-@dataclass(frozen=True)
-class Told:
-    """What may be told of one submission.
-
-    Attributes:
-      entry: its row.
-      signed: as it was signed.
-      result: None where there is none, or where its scores are withheld.
-      withheld: why they are; empty where they are not.
-      withdrawal: None where it stands.
-    """
-
-    entry: EntryRow
-    signed: SignedSubmission
-    result: Result | None
-    withheld: str
-    withdrawal: SignedWithdrawal | None
-
-    def plain(self) -> dict[str, Any]:
-        """The same as plain data."""
-        return {
-            "id": self.entry.id,
-            "status": self.entry.status,
-            "received": self.entry.received,
-            **self.signed.plain(),
-            "result": self.result and self.result.plain(),
-            "withheld": self.withheld,
-            "withdrawal": self.withdrawal and self.withdrawal.plain(),
-        }
-
-
-def told(store: Store, entry: EntryRow) -> Told:
-    """What may be told of a submission: its scores only where the board shows any number."""
-    result = store.result(entry.id)
-    withheld = ""
-    if result is not None and result.scores is not None:
-        try:
-            refuse_unpublishable(store.entries())
-        except NotPublishable as error:
-            result, withheld = None, str(error)
-    return Told(entry, store.submission(entry.id), result, withheld, store.withdrawal(entry.id))
 
 
 def to_json(
@@ -184,11 +137,6 @@ def to_latex(
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"
-
-
-def fixed(value: float, digits: int = 3) -> str:
-    """A number as every table shows it: fixed digits, and no negative zero."""
-    return f"{value:z.{digits}f}"
 
 
 def _of(board: BoardDocument, head: Head, date: str | None) -> dict[str, Any]:

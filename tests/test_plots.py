@@ -28,22 +28,6 @@ def report():
     return evaluate(half, PLANE, PROTOCOL, name=r"a $\frac$ name")
 
 
-@pytest.fixture
-def figures(monkeypatch):
-    """Every figure drawn in a test, as it was when it was saved."""
-    from matplotlib.figure import Figure
-
-    drawn = []
-    save = Figure.savefig
-
-    def saving(figure, *args, **kw):
-        drawn.append(figure)
-        return save(figure, *args, **kw)
-
-    monkeypatch.setattr(Figure, "savefig", saving)
-    return drawn
-
-
 EPISODES = [{"step": 100 * (i + 1), "mean_regret": 1.0 - i / 50} for i in range(50)]
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from leaderboard.cli.options import BoardFolder
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
-from sme_registry.terminal import Meter, err, out, print_json, print_pairs
+from sme_registry.terminal import Meter, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:
     from leaderboard.ranking import RankedRow
@@ -70,8 +70,6 @@ def rank(
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
-    from leaderboard.tables import fixed
-
     reasons = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
     table = Table(
@@ -108,8 +106,6 @@ def ranks(first: int, last: int | None) -> str:
 
 
 def _interval(value: Estimate) -> str:
-    from leaderboard.tables import fixed
-
     if value.low == value.high:  # of one run in each class nothing is known of its spread
         return fixed(value.value)
     return f"{fixed(value.value)} ({fixed(value.low)} to {fixed(value.high)})"
@@ -130,19 +126,20 @@ def show(
 
       sme-leaderboard show board 3f2a
     """
-    from leaderboard import tables
     from leaderboard.store import Store
+    from leaderboard.tables import one_line
+    from leaderboard.told import told
 
     with Store.open(board, read_only=True) as store:
         entry = find_entry(store, id)
-        told = tables.told(store, entry)
+        about = told(store, entry)
     if json:
-        print_json(told.plain())
+        print_json(about.plain())
         return
-    submission, result = told.signed.submission, told.result
+    submission, result = about.signed.submission, about.result
     pairs: dict[str, object] = {}
-    if told.withdrawal is not None:
-        reason = tables.one_line(told.withdrawal.withdrawal.reason)
+    if about.withdrawal is not None:
+        reason = one_line(about.withdrawal.withdrawal.reason)
         pairs["withdrawn because"] = reason or "not said"
     print_pairs(
         f"[bold]{escape(entry.method)} {escape(entry.version)}[/] by {escape(entry.submitter)}: "
@@ -159,8 +156,8 @@ def show(
             **pairs,
         },
     )
-    if told.withheld:
-        out().print(f"[yellow]scores withheld[/]: {escape(told.withheld)}", soft_wrap=True)
+    if about.withheld:
+        out().print(f"[yellow]scores withheld[/]: {escape(about.withheld)}", soft_wrap=True)
     if result is None:
         return
     if result.status == "rejected":
@@ -173,8 +170,6 @@ def show(
 
 
 def _profile_table(result: Result) -> Table:
-    from leaderboard.tables import fixed
-
     assert result.scores is not None
     table = Table(title="normalised regret (0 optimal, 1 the constant ½)", title_justify="left")
     table.add_column("")
@@ -194,8 +189,6 @@ def _profile_table(result: Result) -> Table:
 
 
 def _class_table(result: Result) -> Table:
-    from leaderboard.tables import fixed
-
     table = Table(title="by class", title_justify="left")
     for name in ("class", "runs", "N₀", "A"):
         table.add_column(name, justify="left" if name == "class" else "right")

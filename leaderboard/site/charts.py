@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from markupsafe import Markup, escape
 
 from leaderboard.result import Estimate
-from leaderboard.tables import fixed
+from sme_registry.terminal import fixed
 
 _MARGIN = 3.0  # % of a bar's width at either end, so that a dot at the end is whole
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)

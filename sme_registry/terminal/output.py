@@ -60,3 +60,8 @@ def print_pairs(title: str, pairs: dict[str, object]) -> None:
 def mark(outcome: str) -> str:
     """An outcome in its colour."""
     return _MARKS[outcome]
+
+
+def fixed(value: float, digits: int = 3) -> str:
+    """A number as every table shows it: fixed digits, and no negative zero."""
+    return f"{value:z.{digits}f}"

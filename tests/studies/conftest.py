@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,19 +24,3 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cell, error = gaps[0].cell, "ValueError: <b>bad</b>"
     ledger.write(CellFailure(key=cell.digest, cell=cell, error=error, traceback="", versions={}))
     return folder
-
-
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Every figure drawn in a test, as it was when it was saved."""
-    from matplotlib.figure import Figure
-
-    drawn = []
-    save = Figure.savefig
-
-    def saving(figure: Figure, *args: Any, **kw: Any) -> Any:
-        drawn.append(figure)
-        return save(figure, *args, **kw)
-
-    monkeypatch.setattr(Figure, "savefig", saving)
-    return drawn
