@@ -31,7 +31,7 @@ STEPS = 20
 def transitions() -> Transitions:
     recipe = {"spec": SPEC, "behaviours": [{"kind": "mixture", "nu": 0.5}], "transitions": 20_000}
     torch.set_num_threads(1)
-    return collect(DatasetRecipe.parse(recipe, "data set"), materialize(SPEC))
+    return collect(DatasetRecipe.from_dict(recipe, "data set"), materialize(SPEC))
 
 
 def td3(transitions: Transitions) -> Callable[[int], None]:

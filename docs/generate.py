@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from leaderboard.errors import CODES
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, ProtocolFile, SuiteFile
 from sme_registry.spec.catalogue import entries
 

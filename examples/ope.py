@@ -98,7 +98,7 @@ def policies(spec: sme_registry.SMESpec) -> dict[str, Policy]:
 def judge(spec: sme_registry.SMESpec, nu: float, seed: int, rows: int) -> dict[str, list[float]]:
     """For each policy: FQE's estimate, the exact value, and its 95 % interval over starts."""
     behaviour = {"kind": "mixture", "nu": nu}
-    recipe = DatasetRecipe.parse(
+    recipe = DatasetRecipe.from_dict(
         {"spec": spec, "behaviours": [behaviour], "transitions": rows, "seed": seed}, "data set"
     )
     fqe = FittedQ(collect(recipe, sme_registry.materialize(spec)), seed)

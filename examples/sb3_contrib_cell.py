@@ -23,7 +23,7 @@ from typing import Any
 from sme_registry import SMEError, load
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.study import Cell
-from sme_registry.studies.cell import run_cell
+from sme_registry.studies.engine.cell import run_cell
 
 ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
     "PPO": ("PPO", {}),

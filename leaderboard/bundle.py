@@ -27,11 +27,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from leaderboard.artefact.gate import inspect
-from leaderboard.board import hex_of
-from leaderboard.checks import check_names, check_runs
-from leaderboard.errors import Rejection
-from leaderboard.keys import SigningKey
-from leaderboard.submission import (
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.checks import check_names, check_runs
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import (
     ARTEFACTS,
     FILE,
     MAX_ARTEFACT_BYTES,
@@ -43,9 +42,10 @@ from leaderboard.submission import (
     Training,
     now,
 )
+from leaderboard.errors import Rejection
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError, SMEError, SpecError
-from sme_registry.files import read_json, write_atomically
+from sme_registry.io import read_json, write_atomically
 from sme_registry.spec import Integer, StrictModel, SuiteFile
 from sme_registry.training import RunRecord
 
@@ -182,7 +182,7 @@ def make_bundle(
     facts = _facts(records) if training is None else training
 
     def submission(artefacts: Sequence[Artefact | None]) -> Submission:
-        made = Submission.parse(
+        made = Submission.from_dict(
             {
                 "suite": {"name": suite.versioned_name, "digest": suite.digest},
                 "method": {
@@ -294,7 +294,7 @@ def _table(path: Path, suite: SuiteFile) -> list[_Listed]:
     listed = []
     for index, plain in enumerate(rows):
         source = f"{path}, run {index}"
-        row = _Row.parse(plain, source)
+        row = _Row.from_dict(plain, source)
         policy = None if row.policy is None else path.parent / row.policy
         if policy is not None and policy.suffix not in (".onnx", ".zip"):
             raise SpecError(

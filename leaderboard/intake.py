@@ -22,11 +22,9 @@ from collections.abc import Callable
 from leaderboard.artefact.gate import inspect
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle
-from leaderboard.checks import REFERENCE_FAMILY, THE_BOARD, check_submission, check_text
-from leaderboard.errors import Rejection
-from leaderboard.keys import SigningKey, verifies
-from leaderboard.store import Store
-from leaderboard.submission import (
+from leaderboard.documents.checks import REFERENCE_FAMILY, THE_BOARD, check_submission, check_text
+from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.submission import (
     MAX_BYTES,
     Artefact,
     Knowledge,
@@ -40,8 +38,10 @@ from leaderboard.submission import (
     now,
     utc,
 )
+from leaderboard.errors import Rejection
+from leaderboard.store import Store
 from sme_registry.errors import MalformedDocumentError, SpecError
-from sme_registry.files import parse_json
+from sme_registry.io import parse_json
 from sme_registry.spec import SMESpec
 
 UPLOAD_MINUTES = 10
@@ -197,7 +197,7 @@ def read_withdrawal(text: bytes) -> SignedWithdrawal:
             f"withdrawal: {len(text):,} bytes: must be at most {MAX_BYTES:,}. Shorten the reason.",
         )
     try:
-        return SignedWithdrawal.parse(parse_json(text, "withdrawal"), "withdrawal")
+        return SignedWithdrawal.from_dict(parse_json(text, "withdrawal"), "withdrawal")
     except MalformedDocumentError as error:
         raise Rejection("not_json", str(error)) from None
     except SpecError as error:

@@ -21,7 +21,7 @@ from sme_registry.compiled import engine
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.evaluation.report import LABELS
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.spec import SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize

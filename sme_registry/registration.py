@@ -94,7 +94,7 @@ def register(spec: SMESpec, name: str) -> str:
             f"{env_id!r} stands for another spec ({resolve(env_id).digest[:19]}…). Choose another "
             "name: a released id never changes its numbers."
         )
-    _register(env_id, spec.plain(), spec.team is not None)
+    _register(env_id, spec.to_dict(), spec.team is not None)
     registered[env_id] = spec
     return env_id
 
@@ -150,14 +150,14 @@ def save(
     from sme_registry.task import fingerprint, materialize
 
     spec = as_spec(spec)
-    file = EnvFile.parse(
+    file = EnvFile.from_dict(
         {
             "name": Path(path).stem.removesuffix("-v1") if name is None else name,
             "description": description,
             "tags": tags,
-            "spec": spec.plain(),
+            "spec": spec.to_dict(),
             "digest": spec.digest,
-            "fingerprint": fingerprint.take(materialize(spec)).plain(),
+            "fingerprint": fingerprint.take(materialize(spec)).to_dict(),
         },
         str(path),
     )
@@ -191,7 +191,7 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
         id=content_id(resolved),
         entry_point=_ENTRY_POINT,
         vector_entry_point=_VECTOR_ENTRY_POINT,
-        kwargs={"spec": resolved.plain(), **kwargs},
+        kwargs={"spec": resolved.to_dict(), **kwargs},
     )
 
 

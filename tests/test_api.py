@@ -97,7 +97,7 @@ class TestRegister:
         first = sme_registry.register(spec, "ApiAgain")
         count = len(gymnasium.registry)
         for name in ("ApiAgain", "ApiAgain-v1", "SME/ApiAgain-v1"):
-            assert sme_registry.register(spec.plain(), name) == first
+            assert sme_registry.register(spec.to_dict(), name) == first
         assert sme_registry.register(SMESpec(), "Default") == "SME/Default-v1"
         assert len(gymnasium.registry) == count
 

@@ -93,7 +93,7 @@ class TestList:
         assert [entry["name"] for entry in entries] == expected
         for entry in entries:
             if entry["kind"] == "env":
-                assert SMESpec.parse(entry["spec"]).digest == entry["digest"]
+                assert SMESpec.from_dict(entry["spec"]).digest == entry["digest"]
 
     def test_tables_name_every_environment_suite_and_protocol(self) -> None:
         text = good("list").stdout
@@ -128,7 +128,7 @@ class TestShow:
         shown = json.loads(good("show", name, "--json").stdout)
         assert shown["name"] == "Default-v1"
         assert shown["digest"] == load("Default").digest
-        assert SMESpec.parse(shown["spec"]) == load("Default")
+        assert SMESpec.from_dict(shown["spec"]) == load("Default")
 
     def test_derived_facts_are_those_of_the_environment(self) -> None:
         facts = json.loads(good("show", "Interval25", "--json").stdout)["derived"]
@@ -179,7 +179,7 @@ class TestShow:
         shown = json.loads(good("show", "smoke", "--json").stdout)
         assert json.loads(good("show", shown["digest"], "--json").stdout) == shown
         shown.pop("derived")
-        assert shown == catalogue.find(SuiteFile, "smoke").plain()
+        assert shown == catalogue.find(SuiteFile, "smoke").to_dict()
 
     def test_a_suite_lists_its_instances_by_names_to_train_by(self) -> None:
         file = catalogue.find(SuiteFile, "core")
@@ -204,9 +204,9 @@ class TestShow:
     def test_the_instances_of_a_suite_outside_the_catalogue_are_listed_too(
         self, tmp_path: Path
     ) -> None:
-        plain = catalogue.find(SuiteFile, "smoke").plain()
+        plain = catalogue.find(SuiteFile, "smoke").to_dict()
         plain["suite"]["classes"] = [{**plain["suite"]["classes"][0], "seeds": [7777]}]
-        suite = Suite.parse(plain["suite"])
+        suite = Suite.from_dict(plain["suite"])
         (tmp_path / "mine.json").write_text(json.dumps({**plain, "digest": suite.digest}))
         text = good("show", "mine.json").stdout
         assert f"7777 │ {suite.instances[0].digest[:19]} │" in text
@@ -214,7 +214,7 @@ class TestShow:
 
     def test_an_instance_of_a_suite_is_found_by_its_digest(self) -> None:
         spec = catalogue.find(SuiteFile, "core").suite.instances[-1]
-        assert json.loads(good("show", spec.digest, "--json").stdout)["spec"] == spec.plain()
+        assert json.loads(good("show", spec.digest, "--json").stdout)["spec"] == spec.to_dict()
 
     def test_the_exported_schema_is_the_models(self) -> None:
         schema = json.loads(good("show", "--json-schema", "spec").stdout)
@@ -389,7 +389,7 @@ class TestValidate:
         assert "8 of 9 files are bad" in result.stderr
 
     def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path: Path) -> None:
-        plain = catalogue.find(SuiteFile, "smoke").plain()
+        plain = catalogue.find(SuiteFile, "smoke").to_dict()
         plain["suite"]["classes"][0]["seeds"] = [77]
         (tmp_path / "suite.json").write_text(json.dumps(plain))
         assert "digest=" in sme("validate", "suite.json").stdout
@@ -403,7 +403,7 @@ class TestValidate:
 class TestCertify:
     def test_a_sound_task_passes_with_its_numbers(self) -> None:
         (made,) = json.loads(good("certify", "Default", "--json").stdout)
-        assert made == {"task": "Default", **certify(load("Default")).plain()}
+        assert made == {"task": "Default", **certify(load("Default")).to_dict()}
         text = good("certify", "Default").stdout
         assert all(check.name in text for check in certify(load("Default")).checks)
 

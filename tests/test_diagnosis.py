@@ -449,7 +449,7 @@ def test_the_command_writes_a_page_its_data_and_its_figures(
 
 
 def test_a_diagnosis_that_was_changed_is_refused(tmp_path: Path) -> None:
-    plain = diagnosed(shrunk, states=256).plain()
+    plain = diagnosed(shrunk, states=256).to_dict()
     plain["spec"]["seed"] = 7
     (tmp_path / "diagnosis.json").write_text(json.dumps(plain))
     with pytest.raises(DigestMismatchError, match="diagnose the run again"):
@@ -460,7 +460,7 @@ def test_the_command_takes_any_policy_with_its_task(tmp_path: Path) -> None:
     options = ("--states", "256", "--episodes", "8", "--json")
     result = sme("diagnose", "linear", "--task", "Default", "--set", "complexity=10", *options)
     assert result.exit_code == 0, result.output
-    found = Diagnosis.parse(json.loads(result.stdout))
+    found = Diagnosis.from_dict(json.loads(result.stdout))
     assert found.spec.complexity == 10
     assert "only linear" in stands_out(found)
     against = sme("diagnose", "linear", "-t", "Default", "--against", "constant", *options)
@@ -472,7 +472,7 @@ def test_the_command_takes_any_policy_with_its_task(tmp_path: Path) -> None:
 
 def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Path) -> None:
     from sme_registry.spec.study import Cell
-    from sme_registry.studies.cell import run_cell
+    from sme_registry.studies.engine.cell import run_cell
 
     cells = [
         Cell(
@@ -485,7 +485,7 @@ def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Pat
     (tmp_path / "cells").mkdir()
     for cell, key in zip(cells, keys, strict=True):
         result = run_cell(cell, model_path=tmp_path / "models" / f"{key}.zip")
-        (tmp_path / "cells" / f"{key}.json").write_text(json.dumps(result.plain()))
+        (tmp_path / "cells" / f"{key}.json").write_text(json.dumps(result.to_dict()))
     linear = of_cell(tmp_path, keys[0][:12])
     assert linear.log is not None
     assert linear.log.source == "evaluations"

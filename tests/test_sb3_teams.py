@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from sme_registry.sb3 import SMETeamVecEnv
 
 # Unequal agents that see parts of the state; ends early and late, pays late, teams drift apart.
-UNEQUAL = sme_registry.SMESpec.parse(
+UNEQUAL = sme_registry.SMESpec.from_dict(
     {
         "state_dim": 5, "action_dim": 6, "horizon": 12, "k": 5, "D": 0.2, "r_min": 0.1,
         "complexity": 2, "seed": 4,
@@ -30,7 +30,7 @@ UNEQUAL = sme_registry.SMESpec.parse(
         ]},
     }
 )  # fmt: skip
-SHARED = UNEQUAL.derive(team={**UNEQUAL.plain()["team"], "reward": "team"}, D=0.1)
+SHARED = UNEQUAL.derive(team={**UNEQUAL.to_dict()["team"], "reward": "team"}, D=0.1)
 # Many a last step is terminated and truncated at once, or either alone.
 BOTH = UNEQUAL.derive(horizon=2, D=0.5)
 

@@ -457,7 +457,7 @@ def test_durations_are_in_words(seconds: float, words: str) -> None:
     assert duration(seconds) == words
 
 
-TEAM = SMESpec.parse(
+TEAM = SMESpec.from_dict(
     {
         "state_dim": 3, "action_dim": 3, "horizon": 20, "seed": 5,
         "team": {"agents": [{"action_dim": 1, "observes": [0, 2]}, {"action_dim": 2}]},
@@ -537,7 +537,7 @@ def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run: TrainingRe
 
 
 def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
-    spec = SMESpec.parse(
+    spec = SMESpec.from_dict(
         {"state_dim": 1, "action_dim": 2, "horizon": 25, "seed": 2,
          "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
     )  # fmt: skip

@@ -28,7 +28,7 @@ from leaderboard.artefact.gate import inspect
 from sme_registry import SMESpec
 from sme_registry.errors import MissingDependencyError, PolicyError, SMEError
 from sme_registry.evaluation import load_sb3
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.training import RunRecord
 
 if TYPE_CHECKING:

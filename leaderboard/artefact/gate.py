@@ -34,8 +34,8 @@ from leaderboard.artefact.wire import (
     signed,
     varints,
 )
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
-from leaderboard.submission import MAX_ARTEFACT_BYTES
 
 IR_VERSIONS = range(4, 14)  # before 4 every tensor had to be an input, too
 OPSETS = range(13, 24)

@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard.board import Folder
 from leaderboard.cli import keeping, reading
+from leaderboard.documents.board import Folder
+from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
-from leaderboard.keys import SigningKey
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, Suite, SuiteFile
 from sme_registry.terminal import err, out
@@ -53,9 +53,9 @@ def demo(
     for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)  # what resists is named by who writes next
 
-    setting = record.spec.plain()
+    setting = record.spec.to_dict()
     seed = setting.pop("seed")
-    suite = Suite.parse({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
+    suite = Suite.from_dict({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
     file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
     protocol: EvaluationProtocol = record.protocol
 

@@ -70,7 +70,7 @@ def score(
 
       sme-leaderboard score board --workers 2
     """
-    from leaderboard.scorer import run_scorers
+    from leaderboard.scoring.worker import run_scorers
     from leaderboard.store import Store
 
     with Store.open(board) as store:
@@ -101,8 +101,8 @@ def site(
 
       sme-leaderboard site board --out public
     """
-    from leaderboard.site import write_site
     from leaderboard.store import Store
+    from leaderboard.web.site import write_site
 
     target = board / "site" if out_folder is None else out_folder
     with Store.open(board, read_only=True) as store:
@@ -134,8 +134,8 @@ def serve(
         raise MissingDependencyError(
             "serve: FastAPI and uvicorn are needed. Run `pip install 'sme-registry[leaderboard]'`."
         )
-    from leaderboard import server
-    from leaderboard.board import Folder
+    from leaderboard.documents.board import Folder
+    from leaderboard.web import app as server
 
     Folder(board).read()  # what is no board is refused before anything listens
     server.serve(board, host=host, port=port, workers=workers)

@@ -16,8 +16,8 @@ from sme_registry.errors import OptionError
 from sme_registry.terminal import Meter, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:
-    from leaderboard.ranking import RankedRow
-    from leaderboard.result import Estimate, Result
+    from leaderboard.documents.result import Estimate, Result
+    from leaderboard.scoring.ranking import RankedRow
     from leaderboard.store import EntryRow, Store
 
 Metric = Literal["wd", "ood", "decay"]
@@ -49,7 +49,8 @@ def rank(
 
       sme-leaderboard rank board --csv > ranking.csv
     """
-    from leaderboard import ranking, tables
+    from leaderboard import exports
+    from leaderboard.scoring import ranking
     from leaderboard.store import Store
 
     if json + csv + latex > 1:
@@ -60,11 +61,11 @@ def rank(
         rows = ranking.ranking(entries, metric)
         document, head = store.document, store.head[:2]
     if json:
-        sys.stdout.write(tables.to_json(rows, metric, document, head))
+        sys.stdout.write(exports.to_json(rows, metric, document, head))
     elif csv:
-        sys.stdout.write(tables.to_csv(rows, metric, document, head))
+        sys.stdout.write(exports.to_csv(rows, metric, document, head))
     elif latex:
-        sys.stdout.write(tables.to_latex(rows, metric, document, head))
+        sys.stdout.write(exports.to_latex(rows, metric, document, head))
     else:
         out().print(_ranking_table(rows, metric, document.suite_name))
 
@@ -126,15 +127,15 @@ def show(
 
       sme-leaderboard show board 3f2a
     """
+    from leaderboard.exports import one_line
+    from leaderboard.public_view import told
     from leaderboard.store import Store
-    from leaderboard.tables import one_line
-    from leaderboard.told import told
 
     with Store.open(board, read_only=True) as store:
         entry = find_entry(store, id)
         about = told(store, entry)
     if json:
-        print_json(about.plain())
+        print_json(about.to_dict())
         return
     submission, result = about.signed.submission, about.result
     pairs: dict[str, object] = {}
@@ -244,7 +245,7 @@ def verify(
     """
     from dataclasses import asdict
 
-    from leaderboard.verify import verify as verify_board
+    from leaderboard.scoring.verify import verify as verify_board
 
     meter = Meter("verifying", 1, console=err(), unit="rows", shown=not json)
     with meter:

@@ -18,14 +18,14 @@ from leaderboard.cli.options import (
     find_suite_file,
     is_url,
 )
+from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
-from leaderboard.keys import SigningKey
 from sme_registry.errors import OptionError
 from sme_registry.terminal import Meter, err, out, print_json
 
 if TYPE_CHECKING:
-    from leaderboard.result import Result
-    from leaderboard.submission import Knowledge
+    from leaderboard.documents.result import Result
+    from leaderboard.documents.submission import Knowledge
 
 BundleFolder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="The submission's folder.")]
 BoardOrUrl = Annotated[
@@ -196,10 +196,10 @@ def check(
 
       sme-leaderboard check td3 --protocol quick-v1
     """
-    from leaderboard.board import BoardDocument
     from leaderboard.bundle import Bundle
-    from leaderboard.checks import check_submission
-    from leaderboard.scoring import score_submission
+    from leaderboard.documents.board import BoardDocument
+    from leaderboard.documents.checks import check_submission
+    from leaderboard.scoring.score import score_submission
     from sme_registry.evaluation import resolve_protocol
 
     read = Bundle.read(bundle)
@@ -217,7 +217,7 @@ def check(
     with Meter("scoring", len(submission.runs), console=err(), unit="states") as meter:
         result = score_submission(board, submission, read.artefact, progress=meter.of)
     if json:
-        print_json(result.plain())
+        print_json(result.to_dict())
     _refuse_rejected(result)
     if not json:
         _print_scores(result)
@@ -257,9 +257,10 @@ def submit(
 
       sme-leaderboard submit td3 http://127.0.0.1:8000
     """
-    from leaderboard import client, intake
+    from leaderboard import intake
     from leaderboard.bundle import Bundle
     from leaderboard.store import Store
+    from leaderboard.web import client
 
     if is_url(board):
         total = len(Bundle.read(bundle).signed.submission.runs)
@@ -289,9 +290,10 @@ def withdraw(
 
       sme-leaderboard withdraw board 3f2a --reason "a bug in the wrapper"
     """
-    from leaderboard import client, intake
+    from leaderboard import intake
     from leaderboard.cli.reading import find_entry
     from leaderboard.store import Store
+    from leaderboard.web import client
 
     own = SigningKey.read(key)
     if is_url(board):

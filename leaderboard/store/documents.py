@@ -6,11 +6,11 @@ import hashlib
 from pathlib import Path
 from typing import TypeVar
 
-from leaderboard.board import Folder, hex_of
+from leaderboard.documents.board import Folder, hex_of
 from leaderboard.errors import TamperedError
 from leaderboard.store.files import write
 from sme_registry.errors import SMEError
-from sme_registry.files import parse_json, to_json
+from sme_registry.io import parse_json, to_json
 from sme_registry.spec import StrictModel
 
 _Model = TypeVar("_Model", bound=StrictModel)
@@ -18,7 +18,7 @@ _Model = TypeVar("_Model", bound=StrictModel)
 
 def to_bytes(document: StrictModel) -> bytes:
     """A document's file."""
-    return to_json(document.plain()).encode()
+    return to_json(document.to_dict()).encode()
 
 
 def digest_of(document: StrictModel) -> str:
@@ -27,7 +27,7 @@ def digest_of(document: StrictModel) -> str:
 
 
 def write_document(path: Path, document: StrictModel, *, new: bool = False) -> None:
-    """Write a document's file whole or not at all; see `files.whole`."""
+    """Write a document's file whole or not at all; see `files.atomic_file`."""
     write(path, to_bytes(document), new=new)
 
 
@@ -54,7 +54,7 @@ def read_document(
     if digest is not None and hashlib.sha256(data).hexdigest() != hex_of(digest):
         raise TamperedError(where, f"is not the document that the log names, {digest[:19]}…")
     try:
-        document = kind.parse(parse_json(data, where), where)
+        document = kind.from_dict(parse_json(data, where), where)
     except SMEError as error:
         raise TamperedError(where, f"is not what the board wrote: {error}") from None
     if digest is None and to_bytes(document) != data:

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from leaderboard.errors import BoardError
-from sme_registry import files
+from sme_registry import io
 
 
 @contextlib.contextmanager
-def whole(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """`sme_registry.files.whole`, such that the file is still there after a loss of power.
+def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
+    """`sme_registry.io.atomic_file`, such that the file is still there after a loss of power.
 
     Args:
       path: the target; its folder is made where it is missing.
@@ -28,7 +28,7 @@ def whole(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
     """
     try:
         make_folder(path.parent)
-        with files.whole(path, new=new) as stream:
+        with io.atomic_file(path, new=new) as stream:
             os.fchmod(stream.fileno(), 0o644)
             yield stream
         sync_folder(path.parent)
@@ -38,7 +38,7 @@ def whole(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
 
 def write(path: Path, data: bytes, *, new: bool = False) -> None:
     """Write a file whole or not at all; arguments and errors as for `whole`."""
-    with whole(path, new=new) as stream:
+    with atomic_file(path, new=new) as stream:
         stream.write(data)
 
 

@@ -19,12 +19,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from leaderboard.board import BoardDocument, Folder
+from leaderboard.documents.board import BoardDocument, Folder
+from leaderboard.documents.result import METRICS, Estimate, Result, Scores
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.result import METRICS, Estimate, Result, Scores
 from leaderboard.store.documents import digest_of, read_document
 from leaderboard.store.log import EMPTY, Head, LogEntry
-from leaderboard.submission import SignedSubmission, SignedWithdrawal
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]
 

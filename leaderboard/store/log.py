@@ -12,11 +12,11 @@ from typing import Annotated, Literal, NamedTuple
 import rfc8785
 from pydantic import Field
 
-from leaderboard.board import Folder
+from leaderboard.documents.board import Folder
+from leaderboard.documents.keys import Signature, SigningKey, verifies
+from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import TamperedError
-from leaderboard.keys import Signature, SigningKey, verifies
 from leaderboard.store.documents import read_document, write_document
-from leaderboard.submission import UtcTime, now
 from sme_registry.spec import Digest, Document, Integer, SchemaVersion
 
 Event = Literal["opened", "received", "result", "withdrawn"]
@@ -140,12 +140,12 @@ class Log:
             signature="",
         )
         signature = key.sign("log", _digest_without_signature(unsigned))
-        entry = LogEntry.parse({**unsigned.plain(), "signature": signature})
+        entry = LogEntry.from_dict({**unsigned.to_dict(), "signature": signature})
         write_document(self.folder.log_entry(entry.sequence), entry, new=True)
         return entry
 
 
 def _digest_without_signature(entry: LogEntry) -> str:
-    plain = entry.plain()
+    plain = entry.to_dict()
     del plain["signature"]
     return "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()

@@ -7,9 +7,9 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from leaderboard.board import Folder
+from leaderboard.documents.board import Folder
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store.files import unwritable, whole
+from leaderboard.store.files import atomic_file, unwritable
 
 
 class Objects:
@@ -46,7 +46,7 @@ class Objects:
         except OSError as error:
             raise unwritable(path, error) from error
         sha256, size = hashlib.sha256(), 0
-        with whole(path) as stream:
+        with atomic_file(path) as stream:
             for chunk in chunks:
                 size += len(chunk)
                 if size > limit:

@@ -19,19 +19,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
-from leaderboard.board import BoardDocument, Folder
-from leaderboard.checks import refuse_unsubmittable
+from leaderboard.documents.board import BoardDocument, Folder
+from leaderboard.documents.checks import refuse_unsubmittable
+from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.result import Result
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now, utc
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.keys import SigningKey, verifies
-from leaderboard.result import Result
 from leaderboard.store import files
 from leaderboard.store.documents import digest_of, read_document, write_document
 from leaderboard.store.index import BUSY_SECONDS, EntryRow, Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Event, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
-from leaderboard.submission import SignedSubmission, SignedWithdrawal, now, utc
 from sme_registry.errors import UnknownNameError
-from sme_registry.files import TEMPORARY, temporary_beside
+from sme_registry.io import TEMPORARY, temporary_beside
 from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
 
 LEASE_SECONDS = 60.0
@@ -126,7 +126,7 @@ class Store:
           SpecError: a field is wrong.
         """
         key = SigningKey.generate()
-        document = BoardDocument.parse(
+        document = BoardDocument.from_dict(
             {
                 "title": title,
                 "suite_name": suite_name,

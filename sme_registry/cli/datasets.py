@@ -249,7 +249,7 @@ def _summary(dataset: Any) -> dict[str, Any]:
         "id": dataset.id,
         "path": str(dataset.path),
         "bytes": dataset.size_bytes,
-        **dataset.record.plain(),
+        **dataset.record.to_dict(),
     }
 
 

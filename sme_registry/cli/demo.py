@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.terminal.output import err, out
 
 if TYPE_CHECKING:

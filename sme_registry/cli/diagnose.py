@@ -13,7 +13,7 @@ from rich.markup import escape
 from sme_registry.cli import names
 from sme_registry.cli.policies import find_policy
 from sme_registry.errors import OptionError
-from sme_registry.files import to_json, write_atomically
+from sme_registry.io import to_json, write_atomically
 from sme_registry.spec.resolve import resolve
 from sme_registry.terminal.output import err, out, print_json
 
@@ -118,7 +118,7 @@ def diagnose(
         progress=lambda what: err().print(escape(what), style="dim", soft_wrap=True),
     )
     if json:
-        print_json(found.plain())
+        print_json(found.to_dict())
     else:
         from sme_registry.diagnosis.words import terminal
 
@@ -164,5 +164,5 @@ def _write(found: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
         figures = draw(found, folder, subject.log)
     page = write_atomically(folder / _PAGE, markdown(found, [path.name for path in figures]))
     # Last: whoever finds it finds all the others, too.
-    data = write_atomically(folder / _JSON, to_json(found.plain()))
+    data = write_atomically(folder / _JSON, to_json(found.to_dict()))
     return [*figures, page, data]

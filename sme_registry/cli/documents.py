@@ -14,7 +14,7 @@ from rich.table import Table
 
 from sme_registry.cli import names
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -120,7 +120,7 @@ def _summary(kind: str, file: Envelope) -> dict[str, Any]:
     }
     if isinstance(file, EnvFile):
         summary["id"] = f"{catalogue.NAMESPACE}/{file.versioned_name}"
-        summary["spec"] = file.spec.plain()
+        summary["spec"] = file.spec.to_dict()
     return summary
 
 
@@ -251,12 +251,12 @@ def show(
         else:
             _show_suite(found, json)
     elif json:
-        print_json(found.plain())
+        print_json(found.to_dict())
     elif isinstance(found, StudyFile):
         out().print(_study_table([found]))
         out().print(f"{found.digest}\nIts runs and what they take: sme study plan {escape(name)}")
     else:
-        print_pairs(_title(found), {**document.plain(), "digest": found.digest})
+        print_pairs(_title(found), {**document.to_dict(), "digest": found.digest})
 
 
 def _show_task(found: SMESpec | EnvFile, json: bool) -> None:
@@ -267,9 +267,9 @@ def _show_task(found: SMESpec | EnvFile, json: bool) -> None:
         if agents:
             facts["agents"] = agents
         head = {} if isinstance(found, SMESpec) else _summary("env", found)
-        print_json({**head, "spec": spec.plain(), "digest": spec.digest, "derived": facts})
+        print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": facts})
         return
-    fields = spec.plain()
+    fields = spec.to_dict()
     if spec.team is not None:
         fields["team"] = _team_in_words(spec.team)
     print_pairs(spec.content_name if isinstance(found, SMESpec) else _title(found), fields)
@@ -379,13 +379,13 @@ def _ranges(channels: list[int]) -> str:
 def _show_suite(file: SuiteFile, json: bool) -> None:
     if json:
         instances = [
-            {"class": member.name, "seed": spec.plain()["seed"], "digest": spec.digest}
+            {"class": member.name, "seed": spec.to_dict()["seed"], "digest": spec.digest}
             for member in file.suite.classes
             for spec in member.instances
         ]
-        print_json({**file.plain(), "derived": {"instances": instances}})
+        print_json({**file.to_dict(), "derived": {"instances": instances}})
         return
-    default = SMESpec().plain()
+    default = SMESpec().to_dict()
     table = Table(
         title=_title(file), caption=file.digest, title_justify="left", caption_justify="left"
     )
@@ -394,7 +394,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     table.add_column("seed", justify="right", no_wrap=True)
     table.add_column("instance", no_wrap=True)
     for member in file.suite.classes:
-        changed = {k: v for k, v in member.setting.plain().items() if v != default[k]}
+        changed = {k: v for k, v in member.setting.to_dict().items() if v != default[k]}
         if member.setting.team is not None:
             changed["team"] = _team_in_words(member.setting.team)
         table.add_row(
@@ -542,7 +542,7 @@ def _team_fields(
         # The spec refuses far fewer than these; billions would first fill the memory.
         made["team"] = {"agents": [{"action_dim": channels_each}] * min(agents, 2**12)}
     elif reward is not None and origin.team is not None:
-        made["team"] = origin.team.plain()
+        made["team"] = origin.team.to_dict()
     if reward is not None:
         if not isinstance(made.get("team"), dict):
             raise OptionError(f"--team-reward {reward}: of which team? Give --agents or --team.")
@@ -636,7 +636,7 @@ def certify(
         if not json and len(found) > 1:
             _print_line(*certificates[-1])
     if json:
-        print_json([{"task": label, **made.plain()} for label, made in certificates])
+        print_json([{"task": label, **made.to_dict()} for label, made in certificates])
     elif len(found) == 1:
         _print_certificate(*certificates[0])
     if not all(made.passed for _, made in certificates):

@@ -13,7 +13,7 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.files import parse_json, read_json
+from sme_registry.io import parse_json, read_json
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.resolve import refuse_bare_spec, resolve

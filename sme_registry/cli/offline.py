@@ -101,9 +101,9 @@ def train(
             progress=lambda done, total, note: meter.update(done, note),
         )
     if json:
-        report = result.report.plain()
+        report = result.report.to_dict()
         print_json(
-            {"folder": str(out_folder), "training": result.record.plain(), "evaluation": report}
+            {"folder": str(out_folder), "training": result.record.to_dict(), "evaluation": report}
         )
         return
     out().print(_scores(result.record))

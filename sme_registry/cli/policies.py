@@ -7,7 +7,7 @@ from typing import Any
 
 from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES, reference_policy
-from sme_registry.files import imported
+from sme_registry.io import import_object
 from sme_registry.spec import SMESpec
 
 REFERENCES = tuple(POLICIES)
@@ -42,7 +42,7 @@ def find_policy(name: str, spec: SMESpec) -> Any:
 
 
 def _imported(name: str) -> Any:
-    found = imported(name, "policy", PolicyError)
+    found = import_object(name, "policy", PolicyError)
     if not callable(found):
         raise PolicyError(
             f"policy={name!r}: is a {type(found).__name__}: must be a function from observations "

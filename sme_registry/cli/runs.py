@@ -94,7 +94,7 @@ def evaluate(
         )
     written = [] if target is None else [report.write(target), *_figures(report, found, target)]
     if json:
-        print_json(report.plain())
+        print_json(report.to_dict())
     else:
         out().print(report.table())
     _say_where(written)
@@ -214,8 +214,10 @@ def train(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(how_to_go_on(out_folder)) from None
     if json:
-        report = result.report.plain()
-        print_json({"folder": str(out_folder), "run": result.record.plain(), "evaluation": report})
+        report = result.report.to_dict()
+        print_json(
+            {"folder": str(out_folder), "run": result.record.to_dict(), "evaluation": report}
+        )
         return
     out().print(result.report.table())
     out().print(f"everything is in {escape(str(out_folder))}{os.sep}", soft_wrap=True)

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from sme_registry.cli import names, study_report
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec import (
     PlannedCell,
     StudyFile,
@@ -28,8 +28,8 @@ from sme_registry.terminal.output import err, out, print_json
 from sme_registry.terminal.progress import duration
 
 if TYPE_CHECKING:
-    from sme_registry.studies.estimate import Span
-    from sme_registry.studies.runner import StudyStatus
+    from sme_registry.studies.engine.estimate import Span
+    from sme_registry.studies.engine.runner import StudyStatus
 
 _SECONDS_PER_DAY = 86_400
 _LINES_OF_FAILURES = 20
@@ -169,12 +169,12 @@ def new(
             seeds=seeds,
             evaluations=evaluations,
             evaluation_episodes=evaluation_episodes,
-            protocol=resolve_protocol(protocol).plain(),
+            protocol=resolve_protocol(protocol).to_dict(),
         )
-        file = StudyFile.sealed(plan.plain(), str(path), **{"name": path.stem, **own})
+        file = StudyFile.sealed(plan.to_dict(), str(path), **{"name": path.stem, **own})
     else:
         _refuse_beside_from(context)
-        data = read_json(source) if names.is_path(source) else _find(source).plain()
+        data = read_json(source) if names.is_path(source) else _find(source).to_dict()
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.sealed(data, source, **{**({} if named else {"name": path.stem}), **own})
     # What is only not installed here may be where the plan is run.
@@ -193,7 +193,7 @@ def _tell_of_algorithms(uses: Iterable[str], told: type[SMEError]) -> None:
       uses: of a plan's algorithms.
       told: the kind of error that is a line on standard error; others are raised.
     """
-    from sme_registry.studies.runner import refuse_unknown_algorithm
+    from sme_registry.studies.engine.runner import refuse_unknown_algorithm
 
     lines: dict[str, None] = {}
     for one in dict.fromkeys(uses):
@@ -234,7 +234,7 @@ def _made(
     Raises:
       OptionError, SpecError, UnknownNameError: an option is missing or wrong.
     """
-    from sme_registry.studies.scaling import scaled
+    from sme_registry.studies.engine.scaling import scaled
 
     if not classes:
         raise OptionError(
@@ -242,9 +242,9 @@ def _made(
         )
     if not algorithms:
         raise OptionError("--algorithm: missing: what is run? Give for example --algorithm PPO.")
-    plan = StudyPlan.parse(
+    plan = StudyPlan.from_dict(
         {
-            "classes": [member.plain() for member in classes],
+            "classes": [member.to_dict() for member in classes],
             "algorithms": [
                 _algorithm(text, each, len(ranges) > 1) for text in algorithms for each in ranges
             ],
@@ -265,10 +265,10 @@ def _suite_classes(name: str) -> Sequence[SuiteClass]:
 
 def _class(task: str) -> SuiteClass:
     spec = resolve(task)
-    fields = spec.plain()
+    fields = spec.to_dict()
     seed = fields.pop("seed")
     title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
-    return SuiteClass.parse({"name": title, "setting": fields, "seeds": [seed]})
+    return SuiteClass.from_dict({"name": title, "setting": fields, "seeds": [seed]})
 
 
 def _algorithm(text: str, action_range: str, several_ranges: bool) -> dict[str, Any]:
@@ -318,10 +318,10 @@ def plan(
 
       sme study plan smoke --folder runs/smoke --json
     """
-    from sme_registry.studies.estimate import Estimator, Span, makespan
-    from sme_registry.studies.executors import available_cores
-    from sme_registry.studies.ledger import Ledger
-    from sme_registry.studies.scaling import selected
+    from sme_registry.studies.engine.estimate import Estimator, Span, makespan
+    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.ledger import Ledger
+    from sme_registry.studies.engine.scaling import selected
 
     if plan is None:
         _list_plans(json)
@@ -478,7 +478,7 @@ def run(
 
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
-    from sme_registry.studies.runner import run_study
+    from sme_registry.studies.engine.runner import run_study
 
     if ray is not None and executor not in (None, ExecutorName.ray):
         raise OptionError(f"--ray {ray}: --executor {executor} is another. Leave out one of them.")
@@ -496,7 +496,7 @@ def run(
         console=err(),
     )
     if json:
-        print_json(status.plain())
+        print_json(status.to_dict())
     else:
         _print_status(status)
     if status.failed:
@@ -528,11 +528,11 @@ def status(
 
       sme study status runs/all --only "class=k-*" --json
     """
-    from sme_registry.studies.runner import study_status
+    from sme_registry.studies.engine.runner import study_status
 
     found = study_status(folder, only or (), lambda file: _scaled(file, steps, seeds, evaluations))
     if json:
-        print_json(found.plain())
+        print_json(found.to_dict())
     else:
         _print_status(found)
 
@@ -541,8 +541,8 @@ app.command("report")(study_report.report)
 
 
 def _print_status(status: StudyStatus) -> None:
-    from sme_registry.studies.executors import available_cores
-    from sme_registry.studies.runner import STATES
+    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.runner import STATES
 
     file = status.file
     table = Table(
@@ -609,7 +609,7 @@ def _find(name: str) -> StudyFile:
 def _scaled(
     file: StudyFile, steps: list[str] | None, seeds: int | None, evaluations: int | None
 ) -> StudyFile:
-    from sme_registry.studies.scaling import scaled
+    from sme_registry.studies.engine.scaling import scaled
 
     every, single = _budgets(steps)
     return scaled(file, steps=every, steps_of=single, seeds=seeds, evaluations=evaluations)

@@ -78,7 +78,7 @@ def make_dataset(
         raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
     acting = [(0.5 if nu is None else nu, 1.0)] if mix is None else list(mix)
     behaviours = tuple(behaviour_of(what, weight, action_range) for what, weight in acting)
-    recipe = DatasetRecipe.parse(
+    recipe = DatasetRecipe.from_dict(
         {
             "spec": resolve(spec_or_id),
             "behaviours": behaviours,

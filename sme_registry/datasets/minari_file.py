@@ -48,7 +48,7 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.files import read_json, to_json
+from sme_registry.io import read_json, to_json
 from sme_registry.registration import env_spec
 from sme_registry.spec import Digest, Integer, StrictModel
 from sme_registry.spec.sme_spec import Seed
@@ -119,7 +119,7 @@ class DatasetRecord(StrictModel):
                 "of this package: read it with that one, or with Minari alone, or make it anew "
                 "from its recipe. It is left as it is."
             )
-        record = cls.parse(data, f"{source}: {KEY}")
+        record = cls.from_dict(data, f"{source}: {KEY}")
         for field, document in (
             ("recipe_digest", record.recipe),
             ("spec_digest", record.recipe.spec),
@@ -503,7 +503,7 @@ def _metadata(dataset_id: str, record: DatasetRecord) -> dict[str, Any]:
             "ref_max_score": ceiling.mean_return,
             "num_episodes_average_score": floor.episodes,
         }
-    return {**metadata, KEY: record.plain()}
+    return {**metadata, KEY: record.to_dict()}
 
 
 def _hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:

@@ -141,7 +141,7 @@ class DatasetRecipe(Document):
 
     def differences(self, asked: DatasetRecipe) -> list[str]:
         """The fields in which another recipe differs: `transitions 100, asked for 200`."""
-        return _differences("", self.plain(), asked.plain())
+        return _differences("", self.to_dict(), asked.to_dict())
 
 
 def _differences(path: str, own: Any, asked: Any) -> list[str]:
@@ -196,7 +196,7 @@ def behaviour_of(what: Any, weight: float = 1.0, action_range: str | None = None
         )
     if fields["kind"] == "policy":
         fields["action_range"] = action_range
-    return Behaviour.parse(fields, "behaviour")
+    return Behaviour.from_dict(fields, "behaviour")
 
 
 def sha256_of(path: Path) -> str:

@@ -12,7 +12,7 @@ from sme_registry.diagnosis.report import Diagnosis
 from sme_registry.diagnosis.subject import Log
 from sme_registry.diagnosis.words import title
 from sme_registry.evaluation.report import LABELS
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, JsonValue
 
 from sme_registry.errors import DigestMismatchError
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel
 
 Reals = Annotated[tuple[Real, ...], Field(strict=False)]
@@ -335,7 +335,7 @@ class Diagnosis(StrictModel):
           SpecError: a field is wrong, missing or unknown.
           DigestMismatchError: its digest is not that of its spec.
         """
-        found = cls.parse(read_json(path), str(path))
+        found = cls.from_dict(read_json(path), str(path))
         if found.spec.digest != found.spec_digest:
             raise DigestMismatchError(
                 f"{path}: spec_digest={found.spec_digest!r:.90}: its spec has "

@@ -499,7 +499,7 @@ def compare(here: Subject, numbers: Numbers, there: Subject, other: Numbers) -> 
         ("share of squared error: scale", lambda n: n.form.scale),
         ("saturated entries", lambda n: n.form.saturated),
     ]
-    spec_here, spec_there = here.spec.plain(), there.spec.plain()
+    spec_here, spec_there = here.spec.to_dict(), there.spec.to_dict()
     plans = {**there.plan, **here.plan}
     return Comparison(
         name=there.name,

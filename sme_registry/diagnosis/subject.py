@@ -17,7 +17,7 @@ from pydantic import JsonValue
 from sme_registry.envs.shared import Observation
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, load_sb3
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import Cell
 from sme_registry.task.draw import Array
@@ -158,7 +158,7 @@ def of_cell(study: str | Path, key: str) -> Subject:
         )
     data = read_json(found[0])
     try:
-        cell, curve = Cell.parse(data["cell"], str(found[0])), data["curve"]
+        cell, curve = Cell.from_dict(data["cell"], str(found[0])), data["curve"]
         step, regret = np.array(curve["steps"], float), np.array(curve["mean_regret"], float)
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, SpecError):

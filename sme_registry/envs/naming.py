@@ -43,7 +43,7 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
         if key not in fields
     }
     if not named or not isinstance(task, str | dict):
-        plain.kwargs["spec"] = spec.plain()
+        plain.kwargs["spec"] = spec.to_dict()
     if not named:
         plain.id = content_id(spec)
         # EnvSpec splits the id into these once, when it is made.

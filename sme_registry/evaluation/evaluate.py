@@ -140,7 +140,7 @@ def resolve_protocol(
     if isinstance(protocol, EvaluationProtocol):
         return protocol
     if isinstance(protocol, dict):
-        return EvaluationProtocol.parse(protocol)
+        return EvaluationProtocol.from_dict(protocol)
     if not isinstance(protocol, str | os.PathLike):
         raise SpecError(f"protocol={protocol!r:.80}: must be a protocol, its name or its path.")
     path = os.fspath(protocol)

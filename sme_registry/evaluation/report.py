@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.errors import DigestMismatchError
-from sme_registry.files import read_json, to_json, write_atomically
+from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel
 
@@ -145,7 +145,7 @@ class EvaluationReport(StrictModel):
           SpecError: a field is wrong, missing or unknown.
           DigestMismatchError: a digest is not that of the spec or protocol beside it.
         """
-        report = cls.parse(read_json(path), str(path))
+        report = cls.from_dict(read_json(path), str(path))
         for what in ("spec", "protocol"):
             found, stated = getattr(report, what).digest, getattr(report, f"{what}_digest")
             if found != stated:
@@ -161,7 +161,7 @@ class EvaluationReport(StrictModel):
         Raises:
           OptionError: it cannot be written; what stood there is untouched.
         """
-        return write_atomically(path, to_json(self.plain()))
+        return write_atomically(path, to_json(self.to_dict()))
 
     def table(self) -> Table:
         """The report for a terminal of 80 columns: regions across, policy and references down.

@@ -101,4 +101,4 @@ def hyperparameters_of(algorithm: str, changes: Mapping[str, Any] | None) -> Hyp
     kind = _FIELDS[known_algorithm(algorithm)]
     if changes is not None and not isinstance(changes, Mapping):
         raise OptionError(f"hyperparameters={changes!r:.60}: must be a mapping of names to values.")
-    return kind.parse(dict(changes or {}), "hyperparameters")
+    return kind.from_dict(dict(changes or {}), "hyperparameters")

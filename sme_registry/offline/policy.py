@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, PolicyError, SMEError
-from sme_registry.files import parse_json, to_json, write_atomically
+from sme_registry.io import parse_json, to_json, write_atomically
 
 Layer = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 

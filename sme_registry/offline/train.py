@@ -33,7 +33,7 @@ from sme_registry.errors import (
 )
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.files import read_json, to_json, write_atomically
+from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.offline.hyperparameters import (
     BCHyperparameters,
     Hyperparameters,
@@ -157,7 +157,7 @@ class OfflineRecord(StrictModel):
           SpecError: a field is wrong, missing or unknown.
           DigestMismatchError: `spec_digest` is of another spec.
         """
-        record = cls.parse(read_json(path), str(path))
+        record = cls.from_dict(read_json(path), str(path))
         if record.spec.digest != record.spec_digest:
             raise DigestMismatchError(
                 f"{os.fspath(path)}: spec_digest={record.spec_digest!r}: its spec has "
@@ -273,7 +273,7 @@ def train_offline(
     wall, cpu = time.perf_counter() - begun, time.process_time() - begun_cpu
     record = OfflineRecord(
         algorithm=algorithm,  # type: ignore[arg-type]
-        hyperparameters=settings.plain(),
+        hyperparameters=settings.to_dict(),
         seed=seed,
         steps=steps,
         batch_size=batch_size,
@@ -487,4 +487,4 @@ def _write(
         from sme_registry import plots
 
         plots.decay_curve(report, folder / DECAY_CURVE)
-    write_atomically(folder / RECORD, to_json(record.plain()))
+    write_atomically(folder / RECORD, to_json(record.to_dict()))

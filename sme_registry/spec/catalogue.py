@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec
 

@@ -109,7 +109,7 @@ class StrictModel(BaseModel):
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
 
     @classmethod
-    def parse(cls, data: Any, source: str = "") -> Self:
+    def from_dict(cls, data: Any, source: str = "") -> Self:
         """Validate plain data (as `json.loads` gives it).
 
         Args:
@@ -130,7 +130,7 @@ class StrictModel(BaseModel):
             text = lines[0] if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
             raise SpecError(head + text) from None
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Every field as plain JSON data."""
         return self.model_dump(mode="json")
 
@@ -149,7 +149,7 @@ class Document(StrictModel):
 
     def canonical_json(self) -> bytes:
         """The RFC 8785 canonical JSON of every field."""
-        return rfc8785.dumps(self.plain())
+        return rfc8785.dumps(self.to_dict())
 
     @property
     def digest(self) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import Field
 
 from sme_registry.errors import DigestMismatchError, SpecError
-from sme_registry.files import read_json, to_json, write_atomically
+from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec.document import Digest, Integer, Name, StrictModel
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import SMESpec
@@ -73,7 +73,7 @@ class Envelope(StrictModel):
                     f"{source}: digest: missing: must be that of the {cls.content}. To have it, "
                     f"{remedy}."
                 )
-        envelope = cls.parse(data, source)
+        envelope = cls.from_dict(data, source)
         found = getattr(envelope, cls.content).digest
         if found != envelope.digest:
             raise DigestMismatchError(
@@ -100,7 +100,7 @@ class Envelope(StrictModel):
         Raises:
           OptionError: it cannot be written; what stood there is untouched.
         """
-        write_atomically(path, to_json(self.plain()))
+        write_atomically(path, to_json(self.to_dict()))
 
 
 class EnvFile(Envelope):
@@ -146,9 +146,9 @@ class StudyFile(Envelope):
           SpecError: a field is wrong or missing.
         """
         is_file = isinstance(data, dict) and cls.content in data
-        plan = StudyPlan.parse(data[cls.content] if is_file else data, source)
+        plan = StudyPlan.from_dict(data[cls.content] if is_file else data, source)
         own = {**(data if is_file else {}), **given}
-        return cls.parse({**own, "digest": plan.digest, "plan": plan.plain()}, source)
+        return cls.from_dict({**own, "digest": plan.digest, "plan": plan.to_dict()}, source)
 
 
 class ProtocolFile(Envelope):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import MalformedDocumentError, UnknownNameError
-from sme_registry.files import read_json
+from sme_registry.io import read_json
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec, as_spec

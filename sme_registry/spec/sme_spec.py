@@ -210,7 +210,7 @@ class SMESpec(Setting):
         Raises:
           SpecError: an unknown field, or a value outside its range.
         """
-        return SMESpec.parse({**self.plain(), **overrides}) if overrides else self
+        return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
 
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
@@ -222,5 +222,5 @@ def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
     if isinstance(value, SMESpec):
         return value
     if isinstance(value, dict):
-        return SMESpec.parse(value)
+        return SMESpec.from_dict(value)
     raise SpecError(f"{show(value)}: must be an SMESpec or a mapping of its fields.")

@@ -29,8 +29,8 @@ class SuiteClass(Document):
     @property
     def instances(self) -> tuple[SMESpec, ...]:
         """The specs of this class, in the order of its seeds."""
-        fields = self.setting.plain()
-        return tuple(SMESpec.parse({**fields, "seed": seed}) for seed in self.seeds)
+        fields = self.setting.to_dict()
+        return tuple(SMESpec.from_dict({**fields, "seed": seed}) for seed in self.seeds)
 
 
 class Suite(Document):

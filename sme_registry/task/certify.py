@@ -104,7 +104,7 @@ class Certificate:
         """The checks with this outcome."""
         return tuple(check for check in self.checks if check.outcome == outcome)
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON data."""
         checks = [dict(vars(check)) for check in self.checks]
         return {

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.files import to_json
+from sme_registry.io import to_json
 
 _MARKS = {
     "passed": "[green]passed[/]",

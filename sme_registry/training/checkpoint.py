@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import PolicyError
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 
 FILE = "checkpoint.zip"
 _MEMBER = "sme_replay_buffer.npz"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sme_registry.errors import OptionError
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 
 FILE = "episodes.csv"
 _OF_AGENT = "mean_regret/"

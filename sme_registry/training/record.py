@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from sme_registry.errors import OptionError
-from sme_registry.files import read_json, to_json, write_atomically
+from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel
 
@@ -69,7 +69,7 @@ class RunRecord(StrictModel):
           MalformedDocumentError, SpecError: there is a file of that name and it is no record.
         """
         path = folder / FILE
-        return cls.parse(read_json(path), str(path)) if path.exists() else None
+        return cls.from_dict(read_json(path), str(path)) if path.exists() else None
 
     def write(self, folder: Path) -> None:
         """Write it into the run's folder, whole or not at all.
@@ -77,7 +77,7 @@ class RunRecord(StrictModel):
         Raises:
           OptionError: it cannot be written.
         """
-        write_atomically(folder / FILE, to_json(self.plain()))
+        write_atomically(folder / FILE, to_json(self.to_dict()))
 
     def updated(self, **changes: Any) -> RunRecord:
         """This record with some fields changed."""

@@ -26,7 +26,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize

@@ -25,7 +25,7 @@ TEAM = SMESpec(
         {"action_dim": 2, "observes": [0, 2]},
     ]},
 )  # fmt: skip
-SHARED = TEAM.derive(D=0.2, r_min=0.1, team={**TEAM.plain()["team"], "reward": "team"})
+SHARED = TEAM.derive(D=0.2, r_min=0.1, team={**TEAM.to_dict()["team"], "reward": "team"})
 
 
 @pytest.fixture(autouse=True)

@@ -94,7 +94,7 @@ def test_a_batch_in_any_mode_has_an_env_spec_that_is_json() -> None:
 def test_another_spec_given_to_a_named_id_does_not_take_its_name(tmp_path: Path) -> None:
     other = SMESpec(seed=9)
     path = sme_registry.save(other, tmp_path / "Mine.json")
-    for given in (other, other.plain(), str(path), path):
+    for given in (other, other.to_dict(), str(path), path):
         env = gymnasium.make("SME/Default-v1", spec=given)
         assert env.spec is not None
         assert env.spec.id == f"SME/{other.content_name}-v1"
@@ -155,6 +155,6 @@ def test_an_env_spec_with_overrides_goes_by_the_derived_content() -> None:
     derived = sme_registry.load("Default").derive(complexity=10)
     made = sme_registry.env_spec(sme_registry.load("Default"), complexity=10, action_range="unit")
     assert made.id == f"SME/{derived.content_name}-v1"
-    assert made.kwargs == {"spec": derived.plain(), "action_range": "unit"}
+    assert made.kwargs == {"spec": derived.to_dict(), "action_range": "unit"}
     with pytest.raises(sme_registry.SMEError, match="complexity=0"):
         sme_registry.env_spec(derived, complexity=0)

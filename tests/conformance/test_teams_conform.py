@@ -107,7 +107,7 @@ def test_a_spec_of_your_own_with_a_team_is_made_by_its_name() -> None:
 def test_a_team_is_made_from_an_id_a_path_a_digest_a_spec_and_its_fields(tmp_path: Any) -> None:
     spec = sme_registry.load("DuoDeep")
     path = sme_registry.save(spec, tmp_path / "duo.json")
-    for given in ("SME/DuoDeep-v1", "DuoDeep", path, str(path), spec.digest, spec, spec.plain()):
+    for given in ("SME/DuoDeep-v1", "DuoDeep", path, str(path), spec.digest, spec, spec.to_dict()):
         assert sme_registry.make_parallel(given).sme_spec == spec
         assert sme_registry.make_aec(given).unwrapped.sme_spec == spec
 

@@ -80,7 +80,7 @@ def test_a_lane_does_not_depend_on_how_many_others_there_are() -> None:
 
 @pytest.mark.parametrize("mode", [mode.value for mode in AutoresetMode])
 def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing(mode: str) -> None:
-    env = SMEVectorEnv(SMESpec.parse({**HARD, "D": 0.0}), 3, autoreset_mode=mode)
+    env = SMEVectorEnv(SMESpec.from_dict({**HARD, "D": 0.0}), 3, autoreset_mode=mode)
     clean = copy.deepcopy(env)
     rng = np.random.default_rng(2)
     first, second = env.reset(seed=0), clean.reset(seed=0)

@@ -39,8 +39,8 @@ HALVES = [(0.6, 0.5), ("random", 0.5)]
 
 def recipe(spec=None, acting=((0.5, 1.0),), **fields):
     behaviours = [behaviour_of(what, weight) for what, weight in acting]
-    plain = {"spec": SMESpec.parse(spec or {}), "behaviours": behaviours, "transitions": 700}
-    return DatasetRecipe.parse({**plain, **fields})
+    plain = {"spec": SMESpec.from_dict(spec or {}), "behaviours": behaviours, "transitions": 700}
+    return DatasetRecipe.from_dict({**plain, **fields})
 
 
 def made(of, lanes=None, policies=None):
@@ -115,7 +115,7 @@ def test_starts_alpha_and_noise_are_streams_of_their_own():
 
 def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
     for fields in TASKS.values():
-        task = materialize(SMESpec.parse(fields))
+        task = materialize(SMESpec.from_dict(fields))
         noise = noise_task(task, 0)  # the task's own seed, too, is 0
         for own, other in zip(task.policies, noise.policies, strict=True):
             for layer, drawn in zip(own, other, strict=True):
@@ -240,9 +240,9 @@ def test_a_teams_agents_act_on_what_each_is_shown():
         return observations[:, -3:]
 
     policies = {0: {"agent_0": one, "agent_1": two}}
-    of = DatasetRecipe.parse(
+    of = DatasetRecipe.from_dict(
         {
-            "spec": SMESpec.parse(spec),
+            "spec": SMESpec.from_dict(spec),
             "behaviours": [{"kind": "policy", "policy": "team"}],
             "transitions": 90,
         }

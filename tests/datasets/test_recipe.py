@@ -13,7 +13,7 @@ FIELDS = {"spec": {}, "behaviours": [{"kind": "mixture", "nu": 0.5}]}
 
 
 def recipe(**changes):
-    return DatasetRecipe.parse({**FIELDS, **changes})
+    return DatasetRecipe.from_dict({**FIELDS, **changes})
 
 
 def weights(*shares):
@@ -37,7 +37,7 @@ def test_equal_recipes_have_equal_digests_and_each_field_counts():
 
 def test_a_recipe_survives_its_json():
     made = recipe(behaviours=weights(0.5, 0.5), coverage=-0.25)
-    assert DatasetRecipe.parse(made.plain()) == made
+    assert DatasetRecipe.from_dict(made.to_dict()) == made
 
 
 def test_the_fields_in_which_recipes_differ_are_named_with_both_values():
@@ -113,7 +113,7 @@ def test_other_fields_outside_their_range_are_refused(field, value):
 )
 def test_fields_of_another_kind_of_behaviour_are_refused(fields):
     with pytest.raises(SpecError):
-        Behaviour.parse(fields)
+        Behaviour.from_dict(fields)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 1000, 50_000])

@@ -16,7 +16,7 @@ from sme_registry.task import materialize
 
 
 def scored(acting=((0.5, 1.0),), transitions=2_000, **fields):
-    spec = SMESpec.parse(fields)
+    spec = SMESpec.from_dict(fields)
     behaviours = tuple(behaviour_of(what, weight) for what, weight in acting)
     recipe = DatasetRecipe(spec=spec, behaviours=behaviours, transitions=transitions)
     task = materialize(spec)

@@ -114,7 +114,7 @@ def test_the_same_seed_gives_the_same_report_and_another_seed_another(report):
 def numbers(report):
     for rows in (report.regions, *report.references.values()):
         for row in rows:
-            plain = row.plain()
+            plain = row.to_dict()
             yield from (plain[key] for key in plain if key not in ("name", "channels"))
             for channel in plain["channels"]:
                 yield from channel.values()
@@ -193,14 +193,14 @@ def test_a_report_survives_being_written_and_read(report, tmp_path):
     path = report.write(tmp_path / "made" / "report.json")
     again = EvaluationReport.read(path)
     assert again == report
-    assert again.plain() == report.plain()
+    assert again.to_dict() == report.to_dict()
 
 
 def test_a_report_holds_task_and_protocol_whole_with_their_digests(report):
-    plain = report.plain()
-    assert plain["spec"] == SPEC.plain()
+    plain = report.to_dict()
+    assert plain["spec"] == SPEC.to_dict()
     assert plain["spec_digest"] == SPEC.digest
-    assert plain["protocol"] == PROTOCOL.plain()
+    assert plain["protocol"] == PROTOCOL.to_dict()
     assert plain["protocol_digest"] == PROTOCOL.digest
     assert [region["name"] for region in plain["regions"]] == [
         "WD", "OOD 1", "OOD 2", "OOD 3", "OOD 4", "OOD 5",
@@ -219,11 +219,11 @@ def test_a_report_whose_digest_is_of_something_else_is_refused(report, tmp_path,
 
 def test_a_report_with_an_unknown_or_missing_field_is_refused(report):
     with pytest.raises(SpecError, match="unknown field"):
-        EvaluationReport.parse({**report.plain(), "extra": 1})
-    plain = report.plain()
+        EvaluationReport.from_dict({**report.to_dict(), "extra": 1})
+    plain = report.to_dict()
     del plain["regions"][0]["mae"]
     with pytest.raises(SpecError, match="mae: missing"):
-        EvaluationReport.parse(plain)
+        EvaluationReport.from_dict(plain)
 
 
 def rendered(report):

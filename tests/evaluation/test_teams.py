@@ -65,7 +65,7 @@ def report():
 def numbers(scope):
     for rows in (scope.regions, *scope.references.values()):
         for row in rows:
-            plain = row.plain()
+            plain = row.to_dict()
             yield from (plain[key] for key in plain if key not in ("name", "channels"))
             for channel in plain["channels"]:
                 yield from channel.values()
@@ -402,11 +402,11 @@ def test_a_report_of_a_team_survives_being_written_and_read(report, tmp_path):
 def test_a_report_of_a_single_agent_has_no_field_for_agents():
     single = SMESpec(state_dim=4, action_dim=3)
     report = evaluate(half(3), single, SMALL)
-    assert list(report.plain()) == [
+    assert list(report.to_dict()) == [
         "schema_version", "policy", "action_range", "spec", "spec_digest", "protocol",
         "protocol_digest", "regions", "references", "versions",
     ]  # fmt: skip
-    assert EvaluationReport.parse(report.plain()) == report
+    assert EvaluationReport.from_dict(report.to_dict()) == report
     assert report.agents == {}
 
 

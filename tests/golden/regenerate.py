@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.files import write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from leaderboard.keys import SigningKey
-from leaderboard.store import Store
-from leaderboard.submission import (
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import (
     SignedSubmission,
     SignedWithdrawal,
     Submission,
     Withdrawal,
     now,
 )
+from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
 
@@ -28,7 +28,7 @@ Submit = Callable[..., SignedSubmission]
 def tiny_suite(instances: int = 1) -> Suite:
     """One class of the smallest tasks, S = 2 and A = 1."""
     setting = {"state_dim": 2, "action_dim": 1}
-    return Suite.parse(
+    return Suite.from_dict(
         {"classes": [{"name": "Tiny", "setting": setting, "seeds": list(range(instances))}]}
     )
 
@@ -113,7 +113,7 @@ def tiny_submission(
         },
         **fields,
     }
-    return Submission.parse(plain).signed(key), {digest: data}
+    return Submission.from_dict(plain).signed(key), {digest: data}
 
 
 def put_submission(

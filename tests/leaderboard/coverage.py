@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from leaderboard.statistics import Array
+from leaderboard.scoring.metrics import Array
 from sme_registry.statistics import iqm
 from sme_registry.statistics import stratified_bootstrap as bootstrap
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from leaderboard.artefact.sandbox import Sandbox
-from leaderboard.statistics import run_metrics
+from leaderboard.documents.submission import Submission
+from leaderboard.scoring.metrics import run_metrics
 from leaderboard.store.store import Store
-from leaderboard.submission import Submission
 from sme_registry import evaluate
 
 BOARD = Path(__file__).resolve().parents[2] / "examples" / "board"

@@ -13,11 +13,11 @@ from typing import Any
 
 import uvicorn
 
-from leaderboard.server import _listening, _url, create_app
+from leaderboard.web.app import _listening, _url, create_app
 
 _SERVE = """
 import sys
-from leaderboard.server import serve
+from leaderboard.web.app import serve
 serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
 """
 

@@ -11,15 +11,15 @@ import pytest
 
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from leaderboard.bundle import Bundle, make_bundle
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Training
 from leaderboard.errors import Rejection
-from leaderboard.keys import SigningKey
-from leaderboard.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Training
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
 from sme_registry.spec import Suite, SuiteFile
 from sme_registry.training import RunRecord, train
 
-SUITE = Suite.parse(
+SUITE = Suite.from_dict(
     {
         "classes": [
             {"name": "A", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0, 1]},
@@ -219,7 +219,7 @@ def test_progress_counts_the_runs(tmp_path, table):
 
 
 def test_specs_of_a_table_may_be_ids_digests_or_paths(tmp_path, table):
-    suite = Suite.parse({"classes": [{"name": "D", "setting": {}, "seeds": [0, 1]}]})
+    suite = Suite.from_dict({"classes": [{"name": "D", "setting": {}, "seeds": [0, 1]}]})
     file = SuiteFile(name="default", digest=suite.digest, suite=suite)
     save(suite.instances[1], table.parent / "one.json")
     rows = [

@@ -12,8 +12,8 @@ from typer.testing import CliRunner, Result
 
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
-from leaderboard.keys import SigningKey
-from leaderboard.scoring import score_submission
+from leaderboard.documents.keys import SigningKey
+from leaderboard.scoring.score import score_submission
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.spec import ProtocolFile, SuiteFile
@@ -263,7 +263,7 @@ def test_a_board_without_its_key_takes_nothing_in_and_says_so() -> None:
 
 def test_the_index_comes_back_from_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     # A ranking says when it was written, to the second.
-    monkeypatch.setattr("leaderboard.tables.now", lambda: "2026-01-01T00:00:00Z")
+    monkeypatch.setattr("leaderboard.exports.now", lambda: "2026-01-01T00:00:00Z")
     good("keygen")
     make_board()
     make_bundle()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from leaderboard.ranking import ranking, refuse_unpublishable
+from leaderboard.scoring.ranking import ranking, refuse_unpublishable
+from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
-from leaderboard.verify import verify
 from sme_registry.spec import SuiteFile, catalogue
 
 BOARD = Path(__file__).resolve().parents[2] / "examples" / "board"

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard.keys import SigningKey
-from leaderboard.result import METRICS, Estimate, Result
-from leaderboard.scorer import run_scorers
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import METRICS, Estimate, Result
+from leaderboard.scoring.verify import verify
+from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store
-from leaderboard.verify import verify
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.made_up import made_up_result
 

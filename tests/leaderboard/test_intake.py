@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from leaderboard import intake
-from leaderboard.board import hex_of
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import Rejection
-from leaderboard.keys import SigningKey
-from leaderboard.ranking import refuse_unpublishable
-from leaderboard.scorer import run_scorer
+from leaderboard.scoring.ranking import refuse_unpublishable
+from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
-from leaderboard.submission import SignedSubmission, utc
 from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
 
 ANY_TIME = "2000-01-01T00:00:00Z"
@@ -50,10 +50,10 @@ def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmissio
     digest = "sha256:" + hashlib.sha256(data).hexdigest()
     put(store, key, {digest: data})
     signed, _ = tiny_submission(store, key)
-    plain = signed.submission.plain()
+    plain = signed.submission.to_dict()
     for run in plain["runs"]:
         run["artefact"] = {"sha256": digest, "size": len(data)}
-    return type(signed.submission).parse(plain).signed(key)
+    return type(signed.submission).from_dict(plain).signed(key)
 
 
 # Submissions.
@@ -92,9 +92,9 @@ def test_an_artefact_that_is_not_there_is_missed(store: Store, key: SigningKey) 
 def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
-    plain = signed.submission.plain()
+    plain = signed.submission.to_dict()
     plain["runs"][0]["artefact"]["size"] -= 1
-    other = type(signed.submission).parse(plain).signed(key)
+    other = type(signed.submission).from_dict(plain).signed(key)
     assert code_of(lambda: intake.receive(store, other.to_bytes())) == "artefact_digest"
     assert store.entries() == []
 
@@ -118,10 +118,10 @@ def test_artefacts_pass_the_gate_with_the_widths_of_their_spec(
 
 def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> None:
     signed, _ = tiny_submission(store, key)
-    plain = signed.submission.plain()
+    plain = signed.submission.to_dict()
     for run in plain["runs"]:
         run["artefact"] = None
-    failed = type(signed.submission).parse(plain).signed(key)
+    failed = type(signed.submission).from_dict(plain).signed(key)
     assert intake.receive(store, failed.to_bytes()) == failed.id
 
 

@@ -104,7 +104,7 @@ BAD = [
 @pytest.mark.parametrize(("fields", "fragments"), BAD, ids=[str(b)[:50] for b, _ in BAD])
 def test_a_bad_field_is_refused_in_words_that_say_what_to_do(fields, fragments):
     with pytest.raises(SpecError) as caught:
-        SMESpec.parse(fields)
+        SMESpec.from_dict(fields)
     message = str(caught.value)
     for fragment in fragments:
         assert fragment in message
@@ -115,12 +115,12 @@ def test_a_bad_field_is_refused_in_words_that_say_what_to_do(fields, fragments):
 @pytest.mark.parametrize("document", [[], "x", 3, None, True])
 def test_what_is_no_mapping_is_no_spec(document):
     with pytest.raises(SpecError, match="must be an object of named fields"):
-        SMESpec.parse(document)
+        SMESpec.from_dict(document)
 
 
 def test_all_errors_are_told_at_once():
     with pytest.raises(SpecError) as caught:
-        SMESpec.parse({"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}})
+        SMESpec.from_dict({"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}})
     lines = str(caught.value).splitlines()
     assert lines[0] == "SMESpec: "
     told = [line.strip().split(":")[0] for line in lines[1:]]
@@ -129,7 +129,7 @@ def test_all_errors_are_told_at_once():
 
 def test_the_source_of_a_document_begins_its_error():
     with pytest.raises(SpecError, match=r"^here\.json: k=0: must be"):
-        SMESpec.parse({"k": 0}, "here.json")
+        SMESpec.from_dict({"k": 0}, "here.json")
 
 
 def test_the_constructor_raises_pydantics_error_with_the_place_and_our_words():
@@ -184,8 +184,8 @@ def test_a_spec_error_is_also_a_value_error():
         (EvaluationProtocol, {"epsilons": [0.0]}, "epsilons=[0.0]: must increase, from above 0."),
         (EvaluationProtocol, {"states_per_region": 1}, "states_per_region=1: must be an integer"),
         (EvaluationProtocol, {"sampling": "grid"}, "sampling='grid': must be 'volume_uniform'."),
-        (EnvFile, SMESpec().plain(), "digest: missing: must be 'sha256:' and 64 lower-case hex"),
-        (EnvFile, SMESpec().plain(), "spec: missing: must be an object: schema_version, "),
+        (EnvFile, SMESpec().to_dict(), "digest: missing: must be 'sha256:' and 64 lower-case hex"),
+        (EnvFile, SMESpec().to_dict(), "spec: missing: must be an object: schema_version, "),
         (EnvFile, {"spec": {"k": 0}}, "spec.k=0: must be an integer in"),
         (EnvFile, {"spec": {"team": {"agents": [{"action_dim": 1}]}}}, "spec.team.agents: their"),
         (EnvFile, {"name": "a b"}, "name='a b': must be a string of 1 to 64 letters, digits"),
@@ -198,12 +198,12 @@ def test_a_spec_error_is_also_a_value_error():
 )
 def test_other_documents_are_refused_as_clearly(document, fields, fragment):
     with pytest.raises(SpecError) as caught:
-        document.parse(fields)
+        document.from_dict(fields)
     assert fragment in str(caught.value)
 
 
 def test_a_message_of_a_bad_field_is_plain_text_that_json_can_carry():
     with pytest.raises(SpecError) as caught:
-        SMESpec.parse({"k": "\x00\u202e" * 50})
+        SMESpec.from_dict({"k": "\x00\u202e" * 50})
     assert "\x00" not in str(caught.value)
     assert json.dumps(str(caught.value))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import rfc8785
 
-from sme_registry.files import parse_json
+from sme_registry.io import parse_json
 from sme_registry.spec import SMESpec
 
 VECTORS = Path(__file__).parent / "rfc8785"
@@ -55,4 +55,4 @@ def test_the_digest_is_the_hash_of_every_field_in_canonical_form():
     )
     assert SMESpec().canonical_json() == text.encode()
     assert SMESpec().digest == "sha256:" + hashlib.sha256(text.encode()).hexdigest()
-    assert json.loads(text) == SMESpec().plain()
+    assert json.loads(text) == SMESpec().to_dict()

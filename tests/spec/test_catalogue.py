@@ -107,7 +107,7 @@ def test_a_file_goes_by_its_name_and_its_digest_is_its_documents(kind, path):
     assert path.stem == file.versioned_name
     assert file.digest == getattr(file, kind.content).digest
     assert file.description
-    assert file.plain() == json.loads(path.read_text())
+    assert file.to_dict() == json.loads(path.read_text())
 
 
 @pytest.mark.parametrize(("kind", "path"), EVERY_FILE, ids=[path.stem for _, path in EVERY_FILE])
@@ -140,8 +140,8 @@ def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
         {"kk": 1},
     ):
         schema = SMESpec.model_json_schema()
-        assert follows(schema, SMESpec().plain(), schema["$defs"])
-        assert not follows(schema, SMESpec().plain() | bad, schema["$defs"])
+        assert follows(schema, SMESpec().to_dict(), schema["$defs"])
+        assert not follows(schema, SMESpec().to_dict() | bad, schema["$defs"])
     assert fields["seed"]["anyOf"][1]["pattern"] == "^0x[0-9a-fA-F]{1,64}$"
 
 
@@ -175,7 +175,7 @@ def test_a_suites_instances_are_distinct_tasks_that_can_be_drawn(file):
     assert len({spec.digest for spec in instances}) == len(instances)
     for member in file.suite.classes:
         first = member.instances[0]
-        assert first == SMESpec.parse({**member.setting.plain(), "seed": member.seeds[0]})
+        assert first == SMESpec.from_dict({**member.setting.to_dict(), "seed": member.seeds[0]})
         materialize(first)
 
 

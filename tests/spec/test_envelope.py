@@ -75,7 +75,7 @@ def test_a_changed_spec_is_noticed_by_its_digest(saved):
         sme_registry.load(changed(saved, spec=fields))
     message = str(caught.value)
     assert str(saved) in message
-    assert SMESpec.parse(fields).digest in message
+    assert SMESpec.from_dict(fields).digest in message
     assert "take the file again from its source, or save the changed spec as a new file" in message
 
 
@@ -89,7 +89,7 @@ def test_a_changed_spec_is_noticed_by_its_digest(saved):
     ],
 )
 def test_of_what_has_no_digest_or_another_the_remedy_of_its_kind_is_named(kind, remedy):
-    plain = catalogue.entries(kind)[0].plain()
+    plain = catalogue.entries(kind)[0].to_dict()
     without = {field: value for field, value in plain.items() if field != "digest"}
     for data in (without, plain[kind.content], plain | {"digest": "sha256:" + "0" * 64}):
         with pytest.raises(SpecError, match="digest") as caught:
@@ -104,7 +104,7 @@ def test_a_changed_digest_is_noticed(saved):
 
 def bad_fingerprints():
     spec = SMESpec(state_dim=3, action_dim=2, seed=5)
-    good = fingerprint.take(materialize(spec)).plain()
+    good = fingerprint.take(materialize(spec)).to_dict()
     off = json.loads(json.dumps(good))
     off["next_state"][1][2] += 2e-6
     yield pytest.param(off, "fingerprint.next_state: differs by 2e-06", id="a number")
@@ -178,7 +178,7 @@ def test_a_derived_spec_is_held_to_no_fingerprint(saved):
         ("[]", SpecError),
         ("{}", SpecError),
         ('{"name": "a"}', SpecError),
-        (json.dumps(SMESpec().plain()), SpecError),
+        (json.dumps(SMESpec().to_dict()), SpecError),
         ('{"name": ' + "[" * 990 + "]" * 990 + "}", SpecError),
     ],
 )

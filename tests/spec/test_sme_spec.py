@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sme_registry.errors import SpecError
-from sme_registry.files import parse_json
+from sme_registry.io import parse_json
 from sme_registry.spec import AgentSpec, SMESpec, Suite, SuiteClass, TeamSpec
 from tests.strategies import SEEDS, THRESHOLDS, spec_fields, specs
 
@@ -40,7 +40,7 @@ def test_specs_are_equal_exactly_where_their_digests_are(one, other):
 
 @given(spec_fields(), st.data())
 def test_a_spec_differs_from_itself_with_any_one_field_changed(fields, data):
-    spec = SMESpec.parse(fields)
+    spec = SMESpec.from_dict(fields)
     field = data.draw(st.sampled_from(["k", "r_min", "D", "complexity", "horizon", "seed"]))
     value = data.draw(
         {"seed": SEEDS, "r_min": THRESHOLDS, "D": THRESHOLDS}.get(field, st.integers(1, 10))
@@ -60,10 +60,10 @@ def test_every_field_but_the_version_of_the_schema_is_part_of_the_digest():
 
 @given(specs())
 def test_a_spec_survives_plain_data_json_pickling_and_copying(spec):
-    assert SMESpec.parse(spec.plain()) == spec
-    assert SMESpec.parse(parse_json(json.dumps(spec.plain()))) == spec
-    assert SMESpec.parse(parse_json(spec.canonical_json())) == spec
-    assert SMESpec(**spec.plain()) == spec
+    assert SMESpec.from_dict(spec.to_dict()) == spec
+    assert SMESpec.from_dict(parse_json(json.dumps(spec.to_dict()))) == spec
+    assert SMESpec.from_dict(parse_json(spec.canonical_json())) == spec
+    assert SMESpec(**spec.to_dict()) == spec
     for twin in (pickle.loads(pickle.dumps(spec)), copy.deepcopy(spec)):
         assert twin == spec
         assert twin.digest == spec.digest
@@ -73,7 +73,10 @@ def test_a_spec_survives_plain_data_json_pickling_and_copying(spec):
 def test_the_digest_ignores_the_order_of_keys(fields, random):
     keys = list(fields)
     random.shuffle(keys)
-    assert SMESpec.parse({key: fields[key] for key in keys}).digest == SMESpec.parse(fields).digest
+    assert (
+        SMESpec.from_dict({key: fields[key] for key in keys}).digest
+        == SMESpec.from_dict(fields).digest
+    )
 
 
 def test_a_field_at_its_default_is_the_same_spec_as_one_left_out():
@@ -86,7 +89,7 @@ def test_every_zero_is_one_zero(zero):
     spec = SMESpec(r_min=zero, D=zero)
     assert spec.digest == SMESpec().digest
     assert str(spec.r_min) == "0.0"
-    assert "-0" not in json.dumps(spec.plain())
+    assert "-0" not in json.dumps(spec.to_dict())
 
 
 @pytest.mark.parametrize(
@@ -156,12 +159,12 @@ class TestTeams:
         specs = [SMESpec(team=team) for team in (listed, everything, left_out)]
         assert len(set(specs)) == 1
         assert len({spec.digest for spec in specs}) == 1
-        assert specs[0].plain()["team"]["agents"][0]["observes"] == "all"
+        assert specs[0].to_dict()["team"]["agents"][0]["observes"] == "all"
 
     def test_a_part_of_the_channels_is_another_team(self):
         part = SMESpec(team={"agents": [{"action_dim": 4, "observes": list(range(7))}]})
         assert part != SMESpec(team={"agents": [{"action_dim": 4}]})
-        assert part.plain()["team"]["agents"][0]["observes"] == list(range(7))
+        assert part.to_dict()["team"]["agents"][0]["observes"] == list(range(7))
 
     def test_nested_blocks_may_be_models_dicts_lists_or_tuples(self):
         agent = AgentSpec(name="agent_0", action_dim=4, observes=(0, np.int64(2)))
@@ -201,5 +204,5 @@ class TestSuites:
 
 def test_lists_of_wrong_entries_are_not_also_called_too_short():
     with pytest.raises(SpecError) as caught:
-        SMESpec.parse({"team": {"agents": [{"action_dim": 0}]}})
+        SMESpec.from_dict({"team": {"agents": [{"action_dim": 0}]}})
     assert len(str(caught.value).splitlines()) == 1

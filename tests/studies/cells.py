@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.spec import Cell, StudyFile, StudyPlan
-from sme_registry.studies.cell import run_cell
-from sme_registry.studies.result import CellResult
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.result import CellResult
 
 PROTOCOL = {"states_per_region": 2, "epsilons": [1.0]}
 STARTED, GATE = "started", "gate"
@@ -24,7 +24,7 @@ def small_file(
     seeds: int = 2, algorithms: Sequence[str | dict[str, Any]] = ("constant",), **fields: Any
 ) -> StudyFile:
     """References, or other algorithms, on one small class, `seeds` runs each: milliseconds each."""
-    plan = StudyPlan.parse(
+    plan = StudyPlan.from_dict(
         {
             "classes": [
                 {"name": "small", "setting": {"state_dim": 2, "action_dim": 2}, "seeds": [1, 2]}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sme_registry.studies.result import CellFailure
+from sme_registry.studies.engine.result import CellFailure
 from tests.studies.finished import finish, study_file
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.spec import StudyFile, StudyPlan
-from sme_registry.studies.cell import run_cell
-from sme_registry.studies.ledger import Ledger
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
 
 LEARNERS = {
     "Alpha": {"half_life": 10.0, "r_min": 0.7, "k": 0.02},
@@ -28,7 +28,7 @@ def study_file(
     **fields: Any,
 ) -> StudyFile:
     """Learners and a reference on small classes, with five seeds each."""
-    plan = StudyPlan.parse(
+    plan = StudyPlan.from_dict(
         {
             "classes": [
                 {

@@ -13,10 +13,10 @@ from typer.testing import CliRunner, Result
 from sme_registry.cli import app
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, SuiteFile, catalogue
-from sme_registry.studies.cell import run_cell
-from sme_registry.studies.estimate import Estimator, makespan
-from sme_registry.studies.runner import run_study
-from sme_registry.studies.scaling import scaled, selected
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.estimate import Estimator, makespan
+from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.engine.scaling import scaled, selected
 from tests.studies.cells import raising, small_file
 
 ABLATIONS = catalogue.find(StudyFile, "paper-ablations")
@@ -42,8 +42,8 @@ OFFLINE = "offline-quality"
 
 def offline_quality() -> StudyPlan:
     """METHOD, section 4: three depths, five qualities, BC and IQL; no command writes such names."""
-    setting = {name: value for name, value in SMESpec().plain().items() if name != "seed"}
-    return StudyPlan.parse(
+    setting = {name: value for name, value in SMESpec().to_dict().items() if name != "seed"}
+    return StudyPlan.from_dict(
         {
             "classes": [
                 {
@@ -338,7 +338,7 @@ def test_a_plan_is_written_where_the_learners_are_not_installed(
 
 
 def test_a_plan_with_a_changed_digest_is_refused(tmp_path: Path) -> None:
-    plain: dict[str, Any] = small_file().plain()
+    plain: dict[str, Any] = small_file().to_dict()
     plain["plan"]["seeds"] = 3
     (tmp_path / "p.json").write_text(json.dumps(plain))
     text = refused("plan", "p.json")
@@ -352,12 +352,12 @@ class TestEdited:
     def written(self, form: str) -> StudyPlan:
         """Write edited.json, with hyperparameters; the plan that it is meant to be."""
         file = small_file()
-        plain: dict[str, Any] = file.plain()
+        plain: dict[str, Any] = file.to_dict()
         plain["plan"]["algorithms"][0].update(uses="PPO", hyperparameters={"n_steps": 64})
         if form == "no digest":
             del plain["digest"]
         Path("edited.json").write_text(json.dumps(plain["plan"] if form == "bare" else plain))
-        return StudyPlan.parse(plain["plan"])
+        return StudyPlan.from_dict(plain["plan"])
 
     @pytest.mark.parametrize("form", ["old digest", "no digest", "bare"])
     def test_the_error_names_the_command_that_makes_it_a_file(self, form: str) -> None:
@@ -418,6 +418,6 @@ class TestEdited:
 
 def test_a_plan_is_a_document_whose_digest_ignores_names_outside_it() -> None:
     plan = small_file().plan
-    assert StudyPlan.parse(json.loads(json.dumps(plan.plain()))).digest == plan.digest
+    assert StudyPlan.from_dict(json.loads(json.dumps(plan.to_dict()))).digest == plan.digest
     with pytest.raises(OptionError, match="class=GLOB"):
         selected(plan.cells, ["constant"])

@@ -155,8 +155,8 @@ def parts(task):
 
 @pytest.mark.parametrize(("field", "value", "changes"), FIELDS)
 def test_a_field_changes_the_parts_it_should_and_no_others(field, value, changes):
-    base = materialize(SMESpec.parse(BASE))
-    other = materialize(SMESpec.parse(BASE | {field: value}))
+    base = materialize(SMESpec.from_dict(BASE))
+    other = materialize(SMESpec.from_dict(BASE | {field: value}))
     before, after = parts(base), parts(other)
     changed = {
         name for name in before.keys() | after.keys()
@@ -171,7 +171,7 @@ def test_the_table_of_changes_covers_every_field():
 
 
 def test_the_init_changes_only_layers_that_widen():
-    spec = SMESpec.parse(BASE | {"hidden_width": 9})
+    spec = SMESpec.from_dict(BASE | {"hidden_width": 9})
     one, two = materialize(spec), materialize(spec.derive(policy_init="unit_variance"))
     same = {name: np.array_equal(parts(one)[name], parts(two)[name]) for name in parts(one)}
     assert same == {"W": True, "b": True, "inner/0": False, "inner/1": True, "output": True}

@@ -61,7 +61,7 @@ def test_environments_and_files_of_such_a_task_are_refused_too(tmp_path):
     ],
 )
 def test_the_estimate_is_above_what_a_draw_takes_and_not_by_far(fields):
-    spec = SMESpec.parse(fields)
+    spec = SMESpec.from_dict(fields)
     _draw(spec)  # imports and caches of first use are no part of it
     tracemalloc.start()
     task = _draw(spec)

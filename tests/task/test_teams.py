@@ -146,7 +146,7 @@ def test_r_min_gates_each_agent_by_itself():
 
 
 def test_r_min_gates_a_team_paid_as_one_on_the_mean_over_all_channels():
-    shared = TRIO.derive(team={**TRIO.plain()["team"], "reward": "team"}, r_min=0.4)
+    shared = TRIO.derive(team={**TRIO.to_dict()["team"], "reward": "team"}, r_min=0.4)
     # Mean distance (0.05 + 2 · 0.2 + 3 · 0.1) / 6 = 0.125, so r̂ = 0.5 although one earns 0.2.
     done = one_step(shared, 0.05, 0.2, 0.1)
     np.testing.assert_allclose(done.step_reward, 0.5, rtol=0, atol=1e-12)
@@ -158,7 +158,7 @@ def test_the_end_of_one_is_the_end_of_all():
     for amounts in ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)):
         assert one_step(spec, *amounts).terminated[0]
     # A team that is paid as one survives what one of it does, as long as the mean is good.
-    shared = spec.derive(team={**TRIO.plain()["team"], "reward": "team"})
+    shared = spec.derive(team={**TRIO.to_dict()["team"], "reward": "team"})
     assert not one_step(shared, 0.2, 0.0, 0.0).terminated[0]
     assert one_step(shared, 0.2, 0.2, 0.2).terminated[0]
 
@@ -196,7 +196,7 @@ def test_a_team_of_many_is_drawn_and_earns_its_horizon():
 
 @pytest.mark.parametrize("reward", ["individual", "team"])
 def test_the_optimum_of_a_team_earns_exactly_the_horizon(reward):
-    spec = TRIO.derive(k=7, horizon=20, r_min=0.9, D=0.9, team={**TRIO.plain()["team"],
+    spec = TRIO.derive(k=7, horizon=20, r_min=0.9, D=0.9, team={**TRIO.to_dict()["team"],
                                                                 "reward": reward})  # fmt: skip
     task = materialize(spec)
     s, r_cum, paid = np.random.default_rng(1).random((3, 8)), np.zeros((3, 3)), np.zeros((3, 3))

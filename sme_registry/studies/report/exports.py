@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sme_registry.studies.analysis import METRICS
-from sme_registry.studies.tables import Analysis
+from sme_registry.studies.report.analysis import METRICS
+from sme_registry.studies.report.tables import Analysis
 
 _METRIC_LABELS = {metric.key: metric.label for metric in METRICS}
 
@@ -215,7 +215,7 @@ def _scores(analysis: Analysis) -> Printed:
     at = {(r.group, r.metric, r.statistic, r.algorithm): r for r in analysis.aggregates}
     places = list(dict.fromkeys(key[:3] for key in at))
     words = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
-    regions = {"regret_wd": "WD", "regret_ood": "OOD"}
+    regions = {"wd_regret": "WD", "ood_regret": "OOD"}
     return Printed(
         "scores",
         "Scores: 1 − normalised regret",
@@ -252,7 +252,7 @@ def _improvement(analysis: Analysis) -> Printed:
                 f"{first} over {second}",
                 *(
                     _with_interval(row.value, row.low, row.high)
-                    for metric in ("regret_wd", "regret_ood")
+                    for metric in ("wd_regret", "ood_regret")
                     for row in [at[group, metric, first, second]]
                 ),
             )

@@ -27,7 +27,7 @@ from sme_registry.plots import (
     shades,
     similarity_on_grid,
 )
-from sme_registry.studies.analysis import (
+from sme_registry.studies.report.analysis import (
     ALL,
     AXES,
     CURVES,
@@ -36,7 +36,7 @@ from sme_registry.studies.analysis import (
     SEVERAL,
     learnt_from,
 )
-from sme_registry.studies.tables import ENOUGH_RUNS, Analysis, Curve, Group, Run
+from sme_registry.studies.report.tables import ENOUGH_RUNS, Analysis, Curve, Group, Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +46,7 @@ WIDTH = 7.2  # inches: a page's, so that 9 points stay 9 points
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 _LINEAR_DASH = REFERENCE_DASHES["linear_least_squares"]
 _CONSTANT_DASH = REFERENCE_DASHES["constant_half"]
-_HEADINGS = {"regret_wd": "within distribution (WD)", "regret_ood": "out of distribution (OOD)"}
+_HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
 _MAP_EPSILON, _MAP_SIDE = 1.0, 120
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
@@ -390,7 +390,7 @@ class _Drawer:
             "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
             "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
             f"Hollow: fewer than {ENOUGH_RUNS} runs."
-            + (f" {NOT_COMPARABLE}" if metric == "regret_ood" else ""),
+            + (f" {NOT_COMPARABLE}" if metric == "ood_regret" else ""),
             files,
         )
 

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from sme_registry.diagnosis.rules import THRESHOLDS
-from sme_registry.studies.analysis import ALL, AXES, learnt_from
-from sme_registry.studies.tables import ENOUGH_RUNS, Aggregate, Analysis, Contrast
+from sme_registry.studies.report.analysis import ALL, AXES, learnt_from
+from sme_registry.studies.report.tables import ENOUGH_RUNS, Aggregate, Analysis, Contrast
 
-WD, OOD = "regret_wd", "regret_ood"
+WD, OOD = "wd_regret", "ood_regret"
 _NOT_LEARNT = THRESHOLDS["unlearnt"]  # of the constant's regret: nothing to speak of was learnt
 _BROKEN, _HURT = 0.2, 0.05  # of the constant's regret: how much is called what
 

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
-from sme_registry.studies.analysis import learnt_from
+from sme_registry.studies.report.analysis import learnt_from
 from sme_registry.studies.report.exports import Data, Printed, number, table_of
 from sme_registry.studies.report.figures import WIDTH, Picture
-from sme_registry.studies.tables import (
+from sme_registry.studies.report.tables import (
     ENOUGH_RUNS,
     OFFLINE_INTERVAL,
     Analysis,

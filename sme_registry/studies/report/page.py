@@ -17,7 +17,7 @@ from sme_registry.studies.report.exports import Printed
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import caveats, comparison, findings
 from sme_registry.studies.report.offline import offline_words
-from sme_registry.studies.tables import Analysis
+from sme_registry.studies.report.tables import Analysis
 
 _SECTIONS = {
     "breaks": ("What breaks it", ("contrasts", "regret")),

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sme_registry.errors import OptionError
-from sme_registry.files import write_atomically
-from sme_registry.studies.analysis import analyse
-from sme_registry.studies.ledger import REPORT, Ledger
+from sme_registry.io import write_atomically
+from sme_registry.studies.engine.ledger import REPORT, Ledger
+from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.exports import data, printed
 from sme_registry.studies.report.figures import pictures
 from sme_registry.studies.report.offline import offline_data, offline_pictures, offline_printed

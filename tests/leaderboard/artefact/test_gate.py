@@ -16,8 +16,8 @@ from onnx import TensorProto, helper
 import sme_registry
 from leaderboard.artefact.gate import MAX_FIELDS, MAX_NAME, MAX_NODES, inspect
 from leaderboard.artefact.sandbox import Sandbox
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
-from leaderboard.submission import MAX_ARTEFACT_BYTES
 from sme_registry import SMESpec
 from tests.leaderboard.artefact import models
 from tests.leaderboard.artefact.models import (

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from leaderboard.result import Result, RunScore
-from leaderboard.scoring import evaluation_seed, result_of
-from leaderboard.statistics import run_metrics
+from leaderboard.documents.result import Result, RunScore
+from leaderboard.scoring.metrics import run_metrics
+from leaderboard.scoring.score import evaluation_seed, result_of
 from leaderboard.store import Store
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
-from leaderboard.keys import SigningKey
+from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
-from leaderboard.verify import verify
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_submission,

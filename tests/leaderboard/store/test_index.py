@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.keys import SigningKey
-from leaderboard.scoring import result_of
+from leaderboard.scoring.score import result_of
 from leaderboard.store import Index, Store
-from leaderboard.submission import SignedSubmission, utc
 from sme_registry.errors import UnknownNameError
 from tests.leaderboard.conftest import (
     put_submission,
@@ -374,9 +374,9 @@ def test_a_suite_with_teams_makes_no_board(tmp_path):
     import sme_registry
     from sme_registry.spec import EvaluationProtocol, Suite
 
-    team = sme_registry.load("SME/Team2-v1").plain()
+    team = sme_registry.load("SME/Team2-v1").to_dict()
     del team["seed"]
-    suite = Suite.parse({"classes": [{"name": "Team", "setting": team, "seeds": [0]}]})
+    suite = Suite.from_dict({"classes": [{"name": "Team", "setting": team, "seeds": [0]}]})
     with pytest.raises(BoardError, match="single agents"):
         Store.create(
             tmp_path / "board",

@@ -1,0 +1,1 @@
+"""What is signed, hashed and stored: boards, submissions, results and keys."""

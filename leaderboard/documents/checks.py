@@ -1,0 +1,291 @@
+"""`check_submission`: whether a signed submission is one for this board.
+
+What the schema cannot know. In this order, the first that fails is told:
+
+    unsafe_name      names, texts and links hold only characters that are safe to show, and no
+                     name passes for the board's own
+    unknown_suite    it is of this board's suite and track
+    schema           its time is a time
+    stale_time       and near the board's
+    unknown_spec     every run is on an instance of the suite
+    duplicate_run    no run, and no artefact within one instance, is listed twice
+    missing_run      every instance has a run, and every class a count of the runs started
+    schema           which is no more than a result can hold
+    too_large        no artefact is above this board's limit
+
+Reference submissions, signed by the board itself, are checked like any other.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import unicodedata
+from collections import Counter
+
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.submission import (
+    MAX_ARTEFACT_BYTES,
+    MAX_BYTES,
+    Artefact,
+    Method,
+    Run,
+    SignedSubmission,
+    Submission,
+    Submitter,
+    refuse_countless,
+)
+from leaderboard.errors import BoardError, Rejection
+from sme_registry.spec import Suite
+
+THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
+"""The submitter and the family of the board's own reference rows, and of nobody else's."""
+
+MINUTES_AHEAD = 10
+
+# ASCII only: a letter of another script that looks alike would let one method pass for another.
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
+_LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
+# Control and format characters (those that turn the direction of writing are among the latter),
+# surrogates, and separators of lines and paragraphs.
+_UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
+    """Refuse a submission that is not one for this board.
+
+    Args:
+      board: the board.
+      submission: whose signature is verified already.
+      at: the board's time, with a time zone.
+
+    Raises:
+      Rejection: the first of this module's codes that fits, in its order.
+    """
+    check_names(submission, board.key)
+    _check_suite(board, submission)
+    _check_time(submission.created, at, board.limits.age_days)
+    check_runs(board.suite, submission)
+    for index, run in enumerate(submission.runs):
+        if run.artefact is not None and run.artefact.size > board.limits.artefact_bytes:
+            raise Rejection(
+                "too_large",
+                f"runs.{index}.artefact.size={run.artefact.size:,}: must be at most "
+                f"{board.limits.artefact_bytes:,} bytes on this board. Submit a smaller network.",
+            )
+
+
+def check_names(submission: Submission, board_key: str | None = None) -> None:
+    """Refuse what would be unsafe to show: markup, formulas, control characters, the board's names.
+
+    Args:
+      submission: the submission.
+      board_key: whose submissions alone may be called so; None where the board is not known yet.
+
+    Raises:
+      Rejection: `unsafe_name`.
+    """
+    method, training = submission.method, submission.training
+    for field, name in (
+        ("method.name", method.name),
+        ("method.version", method.version),
+        ("method.family", method.family),
+        ("submitter.name", submission.submitter.name),
+    ):
+        if not _NAME.fullmatch(name):
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: must begin with a letter or digit, and hold letters "
+                "a–z, digits, single spaces and '._+-()' only. Rename it.",
+            )
+    for field, name, reserved in (
+        ("submitter.name", submission.submitter.name, THE_BOARD),
+        ("method.family", method.family, REFERENCE_FAMILY),
+    ):
+        if _folded(name) == reserved and submission.submitter.key != board_key:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}={name!a}: is what the board's own reference rows are called: must be "
+                "another name. Rename it.",
+            )
+    if submission.code is not None and not _LINK.fullmatch(submission.code):
+        raise Rejection(
+            "unsafe_name",
+            f"code={submission.code!a}: must be a link of the characters that links have. "
+            "Write others as %XX.",
+        )
+    for field, text in (
+        ("training.library", training.library),
+        ("training.hyperparameters", training.hyperparameters),
+        ("training.hardware", training.hardware),
+        ("statement", submission.statement),
+    ):
+        check_text(field, text)
+
+
+def check_text(field: str, text: str) -> None:
+    """Refuse a text of several lines that holds what could disguise what is shown beside it.
+
+    Raises:
+      Rejection: `unsafe_name`.
+    """
+    for letter in text:
+        if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
+            raise Rejection(
+                "unsafe_name",
+                f"{field}: holds {letter!a}: must hold no control characters but line breaks. "
+                "Remove it.",
+            )
+
+
+def _folded(name: str) -> str:
+    """A name without what a reader overlooks: case, width of letters, spaces."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+
+
+def check_runs(suite: Suite, submission: Submission) -> None:
+    """Refuse runs that are not on the suite's instances, listed twice, missing or uncounted.
+
+    Raises:
+      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` where more runs were
+        started than a result can hold.
+    """
+    class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
+    for index, run in enumerate(submission.runs):
+        if run.spec not in class_of:
+            raise Rejection(
+                "unknown_spec",
+                f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
+                f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
+                "or submit to the board of its suite.",
+            )
+    _check_duplicates(submission)
+    ran = {run.spec for run in submission.runs}
+    for digest, name in class_of.items():
+        if digest not in ran:
+            raise Rejection(
+                "missing_run",
+                f"runs: none on {digest} of class {name}: every instance must have one. "
+                "Train on it, or list a failed run with artefact null, which scores 1.",
+            )
+    _check_started(submission, Counter(class_of[run.spec] for run in submission.runs))
+
+
+def refuse_unsubmittable(board: BoardDocument) -> None:
+    """Refuse a board whose suite needs more runs than a submission can list.
+
+    Needed is a run on each instance, and in each class as many as ranking needs.
+
+    Raises:
+      BoardError: they do not fit into the bytes of a submission.
+    """
+    needed = sum(max(len(one.instances), board.runs_to_rank) for one in board.suite.classes)
+    most = most_runs(board)
+    if needed > most:
+        raise BoardError(
+            f"suite={board.suite_name}: an entry would need {needed:,} runs, one on each instance "
+            f"and {board.runs_to_rank} in each class to be ranked: must be at most {most}, which "
+            f"the {MAX_BYTES:,} bytes of a submission hold. Make a board of fewer classes or "
+            "instances, or one that ranks with fewer runs."
+        )
+
+
+def most_runs(board: BoardDocument) -> int:
+    """How many runs a submission to a board can list, with ample numbers and short texts."""
+    digest = board.suite.digest
+    run = Run(
+        spec=digest,
+        seed=10**6,
+        steps=10**7,
+        artefact=Artefact(sha256=digest, size=MAX_ARTEFACT_BYTES),
+    )
+    submission = Submission(
+        suite=board.suite_reference,
+        method=Method(name="x" * 20, version="1.0", family="x" * 20, knowledge="generic"),
+        submitter=Submitter(name="x" * 20, key=board.key),
+        created="2026-01-01T00:00:00Z",
+        runs=(run,),
+        runs_started={member.name: 100 for member in board.suite.classes},
+    )
+    one, two = (
+        len(SignedSubmission(submission=each, signature="0" * 128).to_bytes())
+        for each in (submission, submission.model_copy(update={"runs": (run, run)}))
+    )
+    return 1 + (MAX_BYTES - one) // (two - one)
+
+
+def _check_suite(board: BoardDocument, submission: Submission) -> None:
+    expected = board.suite_reference
+    if submission.suite != expected:
+        raise Rejection(
+            "unknown_suite",
+            f"suite={submission.suite.name}, {submission.suite.digest}: must be "
+            f"{expected.name}, {expected.digest}. Make the bundle for this board's suite.",
+        )
+    if submission.track != board.track:
+        raise Rejection(
+            "unknown_suite",
+            f"track={submission.track!r}: must be {board.track!r} on this board. Submit to a board "
+            "of this track.",
+        )
+
+
+def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
+    try:
+        moment = datetime.datetime.fromisoformat(created)
+    except ValueError:
+        raise Rejection(
+            "schema", f"created={created!r}: must be a time that exists. Correct it."
+        ) from None
+    if moment - at > datetime.timedelta(minutes=MINUTES_AHEAD):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {MINUTES_AHEAD} minutes ahead of the board's "
+            "clock. Set your clock, and sign it again.",
+        )
+    if at - moment > datetime.timedelta(days=age_days):
+        raise Rejection(
+            "stale_time",
+            f"created={created}: must be at most {age_days} days old. Sign it again.",
+        )
+
+
+def _check_duplicates(submission: Submission) -> None:
+    seeds: dict[tuple[str, int], int] = {}
+    artefacts: dict[tuple[str, str], int] = {}
+    for index, run in enumerate(submission.runs):
+        before = seeds.setdefault((run.spec, run.seed), index)
+        if before != index:
+            raise Rejection(
+                "duplicate_run",
+                f"runs.{index}.seed={run.seed}: runs.{before} has the same spec and seed: must be "
+                "another run. Remove one of them.",
+            )
+        if run.artefact is None:
+            continue
+        before = artefacts.setdefault((run.spec, run.artefact.sha256), index)
+        if before != index:
+            raise Rejection(
+                "duplicate_run",
+                f"runs.{index}.artefact.sha256={run.artefact.sha256}: runs.{before} of the same "
+                "spec has the same policy: must be another run's. Remove one of them.",
+            )
+
+
+def _check_started(submission: Submission, listed: Counter[str]) -> None:
+    started = submission.runs_started
+    for name in started:
+        if name not in listed:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}: must be a class of the suite: {', '.join(listed)}. "
+                "Rename or remove it.",
+            )
+    for name, count in listed.items():
+        if started.get(name, 0) < count:
+            raise Rejection(
+                "missing_run",
+                f"runs_started.{name}={started.get(name)}: must be at least {count}, the runs "
+                "listed. Count every run that was ever started with this method.",
+            )
+    refuse_countless(started)

@@ -1,0 +1,254 @@
+"""`Submission`: what a submitter signs. It carries policies, by their hashes, and never a score.
+
+    id = "sha256:" + hex(SHA-256(canonical JSON of the submission))
+
+A bundle is the folder that is submitted: `submission.json` (a `SignedSubmission`) and one file
+`artefacts/<64 hex digits of its SHA-256>.onnx` for each artefact.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
+
+from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
+from leaderboard.errors import Rejection
+from sme_registry.errors import MalformedDocumentError, SpecError
+from sme_registry.io import parse_json, to_json
+from sme_registry.spec import (
+    Digest,
+    Document,
+    Integer,
+    Name,
+    SchemaVersion,
+    StrictModel,
+    explained,
+)
+
+FILE = "submission.json"
+ARTEFACTS = "artefacts"
+MAX_BYTES = 64 * 2**10
+MAX_ARTEFACT_BYTES = 8 * 2**20
+MAX_RUNS = 10_000
+"""Runs counted in all. `runs_started` may say any number, and each costs a line of the result."""
+
+Track = Literal["open"]  # sealed seasons will be another
+Knowledge = Literal["generic", "family", "oracle"]
+
+_Line = Annotated[str, Field(min_length=1, max_length=80)]
+_Text = Annotated[str, Field(max_length=2000)]
+_Count = Annotated[Integer, Field(ge=0, le=10**12)]
+UtcTime = Annotated[
+    str,
+    Field(
+        pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$",
+        description="a time in UTC, as in 2026-11-21T09:30:00Z",
+    ),
+]
+
+
+class SuiteReference(StrictModel):
+    """The suite that is meant: its name and version for readers, its digest for certain."""
+
+    name: Name
+    digest: Digest
+
+
+class Method(StrictModel):
+    """What was run.
+
+    Attributes:
+      name, version: as the board shows them; letters, digits, spaces and `._+-()`.
+      family: the kind of method, such as "PPO" or "model-based".
+      knowledge: what it knows of the task beyond its interface: "generic" nothing, "family" that
+        it is an SME and how those are made, "oracle" this task's optimal policy.
+    """
+
+    name: _Line
+    version: _Line
+    family: _Line
+    knowledge: Knowledge
+
+
+class Submitter(StrictModel):
+    """Who submits; the key is the identity, the name is what the board shows beside it."""
+
+    name: _Line
+    key: PublicKey
+
+
+class Artefact(StrictModel):
+    """A policy's ONNX file, by content."""
+
+    sha256: Digest
+    size: Annotated[Integer, Field(ge=1, le=MAX_ARTEFACT_BYTES)]
+
+
+class Run(StrictModel):
+    """One training run on one instance of the suite.
+
+    Attributes:
+      spec: digest of the instance.
+      seed: of the training run.
+      steps: environment steps taken.
+      artefact: the policy; null where the run failed, which then scores 1 in every metric.
+    """
+
+    spec: Digest
+    seed: Annotated[Integer, Field(ge=0, lt=2**53)]
+    steps: _Count
+    artefact: Artefact | None = None
+
+
+class Training(StrictModel):
+    """Facts of the training, in the submitter's words.
+
+    Attributes:
+      library: with its version.
+      hyperparameters: where they differ from the library's defaults.
+      hardware: and how long it took.
+    """
+
+    library: Annotated[str, Field(max_length=200)] = ""
+    hyperparameters: _Text = ""
+    hardware: Annotated[str, Field(max_length=200)] = ""
+
+
+class Submission(Document):
+    """Everything that is signed.
+
+    Attributes:
+      runs: at least one for each instance of the suite.
+      runs_started: of each class by name, all runs ever started with this method; those that are
+        not listed in `runs` score 1 in every metric, so that to leave one out gains nothing,
+        unless it was worse than that.
+      created: when it was signed.
+      code: a link to the method's code; null where there is none.
+      statement: anything a reader should know.
+    """
+
+    schema_version: SchemaVersion = 1
+    track: Track = "open"
+    suite: SuiteReference
+    method: Method
+    code: Annotated[str, Field(max_length=300, pattern=r"^https://[!-~]+$")] | None = None
+    submitter: Submitter
+    created: UtcTime
+    runs: Annotated[tuple[Run, ...], Field(min_length=1, max_length=1000, strict=False)]
+    runs_started: dict[Name, _Count]
+    training: Training = Training()
+    statement: _Text = ""
+
+    @field_validator("code", mode="wrap")
+    @classmethod
+    def _link(cls, value: Any, read: ValidatorFunctionWrapHandler) -> str | None:
+        try:
+            link: str | None = read(value)
+        except ValidationError:
+            raise explained(
+                f"code={value!r:.80}: must be an https:// link of at most 300 characters, none "
+                "of them a space. Leave it out where there is none."
+            ) from None
+        return link
+
+    def signed(self, key: SigningKey) -> SignedSubmission:
+        """This submission with its signature; the key must be the submitter's."""
+        return SignedSubmission(submission=self, signature=key.sign("submission", self.digest))
+
+
+class SignedSubmission(StrictModel):
+    """`submission.json`."""
+
+    submission: Submission
+    signature: Signature
+
+    @classmethod
+    def read(cls, text: bytes) -> SignedSubmission:
+        """The submission of a file's bytes, its signature verified.
+
+        Raises:
+          Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
+        """
+        if len(text) > MAX_BYTES:
+            raise Rejection(
+                "too_large",
+                f"{FILE}: must be at most {MAX_BYTES:,} bytes. "
+                "List fewer runs, or shorten the texts.",
+            )
+        try:
+            plain = parse_json(text, FILE)
+        except MalformedDocumentError as error:
+            raise Rejection("not_json", str(error)) from None
+        if isinstance(plain, dict) and "signature" not in plain:
+            raise Rejection(
+                "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
+            )
+        try:
+            signed = cls.from_dict(plain, FILE)
+        except SpecError as error:
+            raise Rejection("schema", str(error)) from None
+        submission = signed.submission
+        if not verifies(
+            submission.submitter.key, signed.signature, "submission", submission.digest
+        ):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signed.signature[:16]}…: is not of this submission by the key "
+                f"{submission.submitter.key[:16]}…. Sign it again after the last change.",
+            )
+        return signed
+
+    @property
+    def id(self) -> str:
+        """The submission's digest, which is its id."""
+        return self.submission.digest
+
+    def to_bytes(self) -> bytes:
+        """The file's bytes."""
+        return to_json(self.to_dict()).encode()
+
+
+class Withdrawal(Document):
+    """What a submitter signs to take a submission off the board; its page stays, marked so."""
+
+    schema_version: SchemaVersion = 1
+    submission: Digest
+    created: UtcTime
+    reason: Annotated[str, Field(max_length=300)] = ""
+
+
+class SignedWithdrawal(StrictModel):
+    """A withdrawal with the signature of the submission's own key."""
+
+    withdrawal: Withdrawal
+    signature: Signature
+
+
+def utc(moment: datetime.datetime) -> str:
+    """A moment as documents write it."""
+    return moment.astimezone(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def now() -> str:
+    """The present moment as documents write it."""
+    return utc(datetime.datetime.now(datetime.UTC))
+
+
+def refuse_countless(started: Mapping[str, int]) -> None:
+    """Refuse more runs than a result can hold.
+
+    Args:
+      started: how many, by class.
+
+    Raises:
+      Rejection: `schema`.
+    """
+    if sum(started.values()) > MAX_RUNS:
+        raise Rejection(
+            "schema",
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
+            "Count the runs of this version of the method only.",
+        )

@@ -1,0 +1,1 @@
+"""Scores: of a run, of a submission, and the ranking of submissions."""

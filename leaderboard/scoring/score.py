@@ -1,0 +1,320 @@
+"""`score_submission`: a submission and its artefacts to a `Result`, every number recomputed.
+
+    run → sandbox → evaluate, on states of a seed of its own → N_m → metrics → θ, intervals
+
+The states of a run come from a seed that protocol, spec and artefact determine:
+
+    seed = first 53 bits of SHA-256(protocol digest, spec digest, artefact digest)
+
+so that anyone can recompute them, and whoever looks for a policy that is lucky on its states has
+to make a new policy for each attempt. What is held at once is one artefact and one batch of states.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from importlib import metadata
+
+import numpy as np
+
+from leaderboard.artefact.sandbox import Actions, Observations, Sandbox
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.result import METRICS, ClassScore, Estimate, Result, RunScore, Scores
+from leaderboard.documents.submission import Submission, refuse_countless
+from leaderboard.errors import Rejection
+from leaderboard.scoring.metrics import run_metrics
+from sme_registry import SMESpec, evaluate
+from sme_registry.errors import PolicyError, SMEError
+from sme_registry.evaluation import EvaluationReport
+from sme_registry.statistics import aggregate, iqm, stratified_bootstrap
+
+Progress = Callable[[int, int], None]
+Instances = dict[str, tuple[str, SMESpec]]
+
+ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
+"""Oracle-like: A at most the first, or N₀ at most the second and |D| at most the third."""
+
+_NOT_NEGATIVE = ("wd", "ood")
+# Loaded beside the scorer by chance; no number of a result comes from them.
+_BESIDE = ("stable_baselines3", "torch")
+
+
+def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str) -> int:
+    """The seed of a run's states, in [0, 2⁵³).
+
+    Args:
+      protocol_digest: of the board's protocol.
+      spec_digest: of the instance.
+      artefact_digest: of the policy's file.
+    """
+    text = f"{protocol_digest}\n{spec_digest}\n{artefact_digest}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
+
+
+def score_submission(
+    board: BoardDocument,
+    submission: Submission,
+    artefact: Callable[[str], bytes],
+    progress: Progress | None = None,
+) -> Result:
+    """Score every run of a submission, and the method over its runs.
+
+    Args:
+      board: the suite, the protocol, and how many runs and draws.
+      submission: one that `checks` let in.
+      artefact: a file's bytes by its digest.
+      progress: called after each batch with the states done and the states in all.
+
+    Returns:
+      The result, a function of board, submission and artefacts but for float noise. It is a
+      rejection where an artefact, or what it does, is refused.
+
+    Raises:
+      BoardError: a sandbox could not be started, or was ended from outside: nothing is judged.
+      MissingDependencyError: onnxruntime is not installed.
+      What `artefact` and `progress` raise; a `Rejection` becomes the result.
+    """
+    try:
+        runs, versions = _score_runs(board, submission, artefact, progress)
+    except Rejection as error:
+        return Result(
+            submission=submission.digest,
+            suite=board.suite.digest,
+            protocol=board.protocol.digest,
+            status="rejected",
+            code=error.code,
+            message=error.message,
+        )
+    return result_of(board, submission.digest, runs, versions)
+
+
+def result_of(
+    board: BoardDocument, submission: str, runs: Sequence[RunScore], versions: dict[str, str]
+) -> Result:
+    """The result that these runs make: θ, intervals and flags.
+
+    Args:
+      board: the suite, and how many runs and draws.
+      submission: its id.
+      runs: all that were started, each class at least once.
+      versions: as the result carries them.
+    """
+    by_class = {
+        member.name: [run for run in runs if run.class_name == member.name]
+        for member in board.suite.classes
+    }
+    scores = _scores(by_class, board.draws, submission)
+    return Result(
+        submission=submission,
+        suite=board.suite.digest,
+        protocol=board.protocol.digest,
+        status="scored",
+        scores=scores,
+        classes=tuple(_class_score(name, found) for name, found in by_class.items()),
+        runs=tuple(runs),
+        enough_runs=all(len(found) >= board.runs_to_rank for found in by_class.values()),
+        oracle_like=_oracle_like(scores),
+        versions=versions,
+    )
+
+
+def _score_runs(
+    board: BoardDocument,
+    submission: Submission,
+    artefact: Callable[[str], bytes],
+    progress: Progress | None,
+) -> tuple[list[RunScore], dict[str, str]]:
+    """The listed runs in order, then those that were not listed; and what versions they are of."""
+    instances = board.instances
+    unlisted = never_listed(board, submission, instances)
+    policies = {(run.spec, run.artefact.sha256) for run in submission.runs if run.artefact}
+    states = board.protocol.states_per_region * len(board.protocol.edges)
+    scored: dict[tuple[str, str], RunScore] = {}
+    versions: dict[str, str] = {}
+    runs = []
+    for index, run in enumerate(submission.runs):
+        class_name, spec = instances[run.spec]
+        if run.artefact is None:
+            runs.append(failed_run(board, class_name, run.spec))
+            continue
+        digest = run.artefact.sha256
+        if (run.spec, digest) not in scored:
+            before = states * len(scored)
+
+            def advanced(done: int, _: int, before: int = before) -> None:
+                if progress is not None:
+                    progress(before + done, states * len(policies))
+
+            try:
+                report = _evaluate(board, spec, artefact(digest), digest, advanced)
+            except Rejection as error:
+                raise Rejection(
+                    error.code,
+                    f"runs.{index} (class {class_name}, spec {run.spec}, artefact {digest}): "
+                    f"{error.message}",
+                ) from None
+            scored[run.spec, digest] = _run_score(board, class_name, report, digest)
+            versions = versions or _versions(report)
+        runs.append(scored[run.spec, digest])
+    return runs + unlisted, versions
+
+
+def never_listed(
+    board: BoardDocument, submission: Submission, instances: Instances
+) -> list[RunScore]:
+    """A score of 1 for each run that was started and is not listed.
+
+    Args:
+      board: the suite.
+      submission: says how many were started.
+      instances: the board's.
+
+    Raises:
+      Rejection: `unknown_spec`, `missing_run` or `schema`, where `checks` saw no such submission.
+    """
+    listed = dict.fromkeys((member.name for member in board.suite.classes), 0)
+    for index, run in enumerate(submission.runs):
+        if run.spec not in instances:
+            raise Rejection(
+                "unknown_spec",
+                f"runs.{index}.spec={run.spec}: must be an instance of {board.suite_name}. "
+                f"`sme show {board.suite_name}` lists them.",
+            )
+        listed[instances[run.spec][0]] += 1
+    for name, count in listed.items():
+        if count == 0:
+            raise Rejection(
+                "missing_run",
+                f"runs: none of class {name!r}: each instance must have one. List those that "
+                "failed with artefact null.",
+            )
+    started = {
+        name: max(submission.runs_started.get(name, 0), count) for name, count in listed.items()
+    }
+    refuse_countless(started)
+    return [
+        failed_run(board, name, None)
+        for name, count in listed.items()
+        for _ in range(started[name] - count)
+    ]
+
+
+def _evaluate(
+    board: BoardDocument,
+    spec: SMESpec,
+    data: bytes,
+    digest: str,
+    progress: Progress,
+) -> EvaluationReport:
+    """A policy on the states of its own seed."""
+    seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
+    protocol = board.protocol.model_copy(update={"seed": seed})
+    with Sandbox(data, spec.state_dim + 2, spec.action_dim) as sandbox:
+        asked = 0
+
+        def policy(observations: Observations) -> Actions:
+            nonlocal asked
+            # `evaluate` asks region after region, so these are a region's first states.
+            if asked % protocol.states_per_region == 0:
+                sandbox.check_rows(observations)
+            asked += len(observations)
+            return sandbox(observations)
+
+        try:
+            return evaluate(
+                policy, spec, protocol, action_range="unit", name=digest, progress=progress
+            )
+        except PolicyError as error:
+            # What the sandbox raised, which `evaluate` takes for a failure of any callable.
+            if isinstance(error.__cause__, SMEError):
+                raise error.__cause__ from None
+            raise
+
+
+def _levels(board: BoardDocument) -> tuple[float, ...]:
+    """ε_m of each region: of its outer face, 0 for WD."""
+    return tuple(high for _, high in board.protocol.edges)
+
+
+def _run_score(
+    board: BoardDocument, class_name: str, report: EvaluationReport, digest: str
+) -> RunScore:
+    regret = tuple(region.normalised_regret for region in report.regions)
+    similarity = tuple(region.similarity for region in report.regions)
+    return RunScore(
+        spec=report.spec_digest,
+        class_name=class_name,
+        artefact=digest,
+        evaluation_seed=report.protocol.seed,
+        regret=regret,
+        similarity=similarity,
+        **run_metrics(regret, similarity, _levels(board)),
+    )
+
+
+def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunScore:
+    """A run without a policy scores 1 in every region and every metric.
+
+    Args:
+      board: whose protocol has the regions.
+      class_name: the suite's class that it was started in.
+      spec: digest of the instance; null where the run is not listed.
+    """
+    regret = (1.0,) * len(board.protocol.edges)
+    return RunScore(
+        spec=spec,
+        class_name=class_name,
+        artefact=None,
+        evaluation_seed=None,
+        regret=regret,
+        similarity=None,
+        **run_metrics(regret, None, _levels(board)),
+    )
+
+
+def _class_score(name: str, runs: list[RunScore]) -> ClassScore:
+    return ClassScore(
+        name=name,
+        runs=len(runs),
+        submitted=sum(run.artefact is not None for run in runs),
+        wd=float(iqm([run.wd for run in runs])),
+        ood=float(iqm([run.ood for run in runs])),
+        profile=tuple(iqm([run.regret for run in runs]).tolist()),
+    )
+
+
+def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Scores:
+    """θ of each metric and each region, with its interval."""
+    classes = {
+        name: np.array(
+            [[*(getattr(run, metric) for metric in METRICS), *run.regret] for run in runs]
+        )
+        for name, runs in by_class.items()
+    }
+    value = aggregate(classes)
+    low, high = stratified_bootstrap(classes, draws, seed)
+    # No regret is negative, so an interval's lower end tells nothing below 0.
+    regrets = [metric in _NOT_NEGATIVE for metric in METRICS]
+    regrets += [True] * (len(value) - len(METRICS))
+    low = np.where(regrets, np.maximum(low, 0.0), low)
+    estimates = [
+        Estimate(value=value, low=low, high=high)
+        for value, low, high in zip(value.tolist(), low.tolist(), high.tolist(), strict=True)
+    ]
+    return Scores(
+        **dict(zip(METRICS, estimates, strict=False)), profile=tuple(estimates[len(METRICS) :])
+    )
+
+
+def _oracle_like(scores: Scores) -> bool:
+    return scores.ood.value <= ORACLE_OOD or (
+        scores.wd.value <= ORACLE_WD and abs(scores.decay.value) <= FLAT
+    )
+
+
+def _versions(report: EvaluationReport) -> dict[str, str]:
+    return {
+        **{name: found for name, found in report.versions.items() if name not in _BESIDE},
+        "onnxruntime": metadata.version("onnxruntime"),
+    }

@@ -1,0 +1,1 @@
+"""The leaderboard over HTTP: the application, its pages and its client."""

@@ -1,0 +1,1 @@
+"""Running a study: cells, the ledger of their results, and executors."""

@@ -1,0 +1,121 @@
+"""How long a study will take: from a table of costs, and from what has finished as soon as it has.
+
+Of a cell, in seconds of one core, with P its steps, E its evaluations, T the horizon, N the states
+of its evaluation within and out of distribution, L the layers of the optimal policy:
+
+    start + P · step + E · T · batch step + N · (state + layer · (L − 1))
+
+Where cells have finished, the sum after `start` is multiplied by the median of what they took over
+what it says of them: of those of the same algorithm and setting, else of the same algorithm.
+"""
+
+from __future__ import annotations
+
+import heapq
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from sme_registry.spec import Cell, SMESpec
+from sme_registry.studies.engine.algorithms import REFERENCE
+from sme_registry.studies.engine.result import CellResult
+
+# Seconds of one training step with the defaults: measured on a quick core, and the
+# slowest seen. What is not here may be as quick as PPO or as slow as SAC.
+SECONDS_PER_STEP = {
+    "PPO": (0.0006, 0.0013),
+    "A2C": (0.0006, 0.0013),
+    "TD3": (0.012, 0.021),
+    "DDPG": (0.012, 0.021),
+    "SAC": (0.013, 0.024),
+    "offline:bc": (0.0015, 0.0030),
+    "offline:iql": (0.006, 0.0110),
+}
+_UNKNOWN = (SECONDS_PER_STEP["PPO"][0], SECONDS_PER_STEP["SAC"][1])
+_BATCH_STEP = (0.00006, 0.0005)  # one step of all episodes of an evaluation, which run as a batch
+_STATE = (1.5e-6, 3e-6)
+_LAYER = (1e-6, 3e-6)  # of π*, which every state is judged by
+_START = (1.5, 4.0)  # a process and its imports
+
+
+class Span(NamedTuple):
+    """Seconds, between two bounds; equal where they come from what has finished."""
+
+    low: float
+    high: float
+
+
+class Estimator:
+    """Seconds of cells, the better the more have finished.
+
+    Args:
+      finished: results to learn from.
+    """
+
+    def __init__(self, finished: Iterable[CellResult] = ()) -> None:
+        self._ratios: dict[str | tuple[str, SMESpec], list[float]] = defaultdict(list)
+        for result in finished:
+            self.observe(result)
+
+    def observe(self, result: CellResult, seconds: float | None = None) -> None:
+        """Learn from a finished cell.
+
+        Args:
+          result: what it left.
+          seconds: that it took by the clock, where that was seen: more than its own time where
+            other jobs share the cores.
+        """
+        expected = _work(result.cell).low
+        if expected > 0 and result.timing.total > 0:
+            took = max(result.timing.total, (seconds or 0.0) - _START[0])
+            ratio = took / expected
+            self._ratios[result.cell.uses].append(ratio)
+            self._ratios[result.cell.uses, _setting(result.cell)].append(ratio)
+
+    def knows(self, cell: Cell) -> bool:
+        """Whether a cell of the same algorithm has finished."""
+        return bool(self._ratios.get(cell.uses))
+
+    def seconds(self, cell: Cell) -> Span:
+        """What the cell will take on one core."""
+        work = _work(cell)
+        ratios = self._ratios.get((cell.uses, _setting(cell))) or self._ratios.get(cell.uses)
+        if ratios:
+            seconds = _START[0] + work.low * statistics.median(ratios)
+            return Span(seconds, seconds)
+        return Span(_START[0] + work.low, _START[1] + work.high)
+
+
+def makespan(seconds: Sequence[float], workers: int) -> float:
+    """When the last of these jobs ends, begun in this order, each by the first who is free.
+
+    Args:
+      seconds: of each job.
+      workers: at least 1.
+
+    Returns:
+      Seconds; 0 for no job.
+    """
+    free = [0.0] * min(workers, len(seconds))
+    for job in seconds:
+        heapq.heapreplace(free, free[0] + job)
+    return max(free, default=0.0)
+
+
+def _work(cell: Cell) -> Span:
+    """A cell's seconds by the table, without its start."""
+    trains = not cell.uses.startswith(REFERENCE)
+    states = cell.protocol.states_per_region * len(cell.protocol.edges)
+    step = SECONDS_PER_STEP.get(cell.uses, _UNKNOWN)
+
+    def bound(i: int) -> float:
+        training = cell.steps * step[i] if trains else 0.0
+        curve = cell.evaluations * cell.spec.horizon * _BATCH_STEP[i]
+        return training + curve + states * (_STATE[i] + _LAYER[i] * (cell.spec.complexity - 1))
+
+    return Span(bound(0), bound(1))
+
+
+def _setting(cell: Cell) -> SMESpec:
+    return cell.spec.model_copy(update={"seed": 0})

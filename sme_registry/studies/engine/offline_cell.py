@@ -1,0 +1,117 @@
+"""Cells that learn from a data set and never from the environment.
+
+    uses                hyperparameters
+    offline:bc          nu, transitions of the data set; the rest is the learner's
+    offline:iql         likewise
+
+The data set is made in the cell, of the behaviour policy of METHOD, section 4, with the cell's
+seed, and is not kept: the same recipe gives the same bits. `steps` are gradient steps. The
+environment is met in the evaluations alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from sme_registry.datasets import DatasetRecipe
+from sme_registry.datasets.collect import collect
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.offline import ALGORITHMS, train_offline
+from sme_registry.spec.study import Cell
+from sme_registry.studies.engine.algorithms import named_after
+from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineScores, Timing
+from sme_registry.task import materialize
+
+OFFLINE = "offline:"
+TRANSITIONS = 50_000
+BATCH_SIZE = 256
+
+
+def offline_name(uses: str) -> str | None:
+    """The learner that `offline:…` names; None for what is none.
+
+    Raises:
+      UnknownNameError: no such learner.
+    """
+    return named_after(OFFLINE, uses, ALGORITHMS)
+
+
+def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> CellResult:
+    """Make the data, learn from it, and judge as every cell is judged.
+
+    Args:
+      cell: what to run; its k-th evaluation falls after round(steps · k / evaluations) steps.
+      name: the learner.
+      progress: told the gradient steps done and those in all.
+
+    Raises:
+      OptionError: ν is missing, or a number is out of range.
+      SpecError: the recipe or a hyperparameter is; or D > 0, where episodes have no common length.
+    """
+    begun = time.thread_time()
+    if cell.spec.D > 0:
+        raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
+    settings: dict[str, Any] = dict(cell.hyperparameters)
+    if "nu" not in settings:
+        raise OptionError("hyperparameters.nu: missing: must be in [0, 1], as in nu=0.5. Add it.")
+    nu, transitions = settings.pop("nu"), settings.pop("transitions", TRANSITIONS)
+    batch_size = settings.pop("batch_size", BATCH_SIZE)
+    recipe = DatasetRecipe.from_dict(
+        {
+            "spec": cell.spec,
+            "behaviours": [{"kind": "mixture", "nu": nu, "weight": 1.0}],
+            "transitions": transitions,
+            "seed": cell.seed,
+            "protocol": cell.protocol,
+        },
+        "data set",
+    )
+    data = collect(recipe, materialize(cell.spec), {})
+    collected = time.thread_time()
+    result = train_offline(
+        data,
+        algorithm=name,
+        steps=cell.steps,
+        batch_size=batch_size,
+        seed=cell.seed,
+        evaluations=max(1, cell.evaluations),
+        episodes=cell.evaluation_episodes,
+        hyperparameters=settings,
+        spec=cell.spec,
+        protocol=cell.protocol,
+        progress=lambda done, total, _: progress(done, total),
+    )
+    record, T = result.record, cell.spec.horizon
+    ended = time.thread_time()
+    training = record.cpu_ms_per_step * cell.steps / 1e3
+    return CellResult(
+        key=cell.digest,
+        cell=cell,
+        curve=LearningCurve(
+            steps=tuple(score.step for score in record.evaluations),
+            episode_return=tuple(score.episode_return for score in record.evaluations),
+            mean_regret=tuple(1.0 - score.episode_return / T for score in record.evaluations),
+            similarity=tuple(score.similarity for score in record.evaluations),
+            length=(float(T),) * len(record.evaluations),
+        ),
+        report=result.report,
+        offline=OfflineScores(
+            nu=nu,
+            transitions=transitions,
+            dataset=record.dataset_digest,
+            behaviour=record.behaviour.similarity,
+            behaviour_sd=record.behaviour.similarity_sd,
+            score=record.score,
+            score_sd=record.evaluations[-1].similarity_sd,
+        ),
+        timing=Timing(
+            total=ended - begun,
+            training=training,
+            environment=collected - begun,
+            evaluation=max(0.0, ended - collected - training),
+            steps_per_second=cell.steps / max(training, 1e-9),
+        ),
+        versions=record.versions,
+    )

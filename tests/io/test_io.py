@@ -1,0 +1,176 @@
+"""Strict JSON in; whole files or none out."""
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
+from sme_registry.io import parse_json, read_json, to_json, write_atomically
+
+MALFORMED = {
+    "empty": (b"", "not JSON: Expecting value at line 1, column 1"),
+    "blank": (b" \n", "not JSON"),
+    "truncated": (b'{"k": 1,\n "D"', "not JSON: Expecting ':' delimiter at line 2, column 5"),
+    "trailing text": (b'{"k": 1} {}', "not JSON: Extra data"),
+    "trailing comma": (b'{"k": 1,}', "not JSON"),
+    "single quotes": (b"{'k': 1}", "not JSON"),
+    "comment": (b'{"k": 1} // one', "not JSON"),
+    "NaN": (b'{"r_min": NaN}', "NaN is not JSON. Use a finite number."),
+    "Infinity": (b'{"r_min": Infinity}', "Infinity is not JSON."),
+    "minus infinity": (b'{"r_min": -Infinity}', "-Infinity is not JSON."),
+    "duplicate key": (b'{"k": 1, "k": 2}', "the key 'k' is given twice."),
+    "inner duplicate key": (b'{"spec": {"k": 1, "k": 1}}', "the key 'k' is given twice."),
+    "byte order mark": (b'\xef\xbb\xbf{"k": 1}', "BOM"),
+    "not UTF-8": (b'{"k": "\xff"}', "not UTF-8 text (byte 7). Save it as UTF-8 JSON."),
+    "UTF-16": ('{"k": 1}'.encode("utf-16"), "not UTF-8 text"),
+    "null bytes": (b"\x00" * 100, "not JSON"),
+    "deep nesting": (b"[" * 100_000, "nested too deeply"),
+    "deep objects": (b'{"a":' * 100_000, "nested too deeply"),
+    "huge integer": (b'{"k": ' + b"9" * 5000 + b"}", "4300 digits"),
+}
+
+
+@pytest.mark.parametrize("text", MALFORMED)
+def test_malformed_json_is_refused_with_its_place_and_path(text, tmp_path):
+    data, fragment = MALFORMED[text]
+    path = tmp_path / "bad.json"
+    path.write_bytes(data)
+    with pytest.raises(MalformedDocumentError) as caught:
+        read_json(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert fragment in str(caught.value)
+    assert isinstance(caught.value, SpecError)
+
+
+def test_strict_json_is_read_as_it_stands():
+    assert parse_json(b'{"a": [1, -0.5, "\xc3\xa4", null, true]}') == {
+        "a": [1, -0.5, "ä", None, True]
+    }
+
+
+def test_missing_files_folders_and_impossible_paths_cannot_be_read(tmp_path):
+    for path in (tmp_path / "no.json", tmp_path, tmp_path / "no" / "no.json", "a\0.json"):
+        with pytest.raises(MalformedDocumentError, match=r"cannot be read: .+\."):
+            read_json(path)
+
+
+def test_a_file_too_large_for_any_document_is_not_even_read(tmp_path):
+    path = tmp_path / "large.json"
+    with path.open("wb") as stream:
+        stream.truncate(65 * 2**20)  # a hole: takes no room
+    with pytest.raises(MalformedDocumentError, match="larger than 64 MiB"):
+        read_json(path)
+
+
+def test_a_write_makes_folders_replaces_and_leaves_nothing_beside(tmp_path):
+    path = tmp_path / "new" / "folder" / "file.json"
+    assert write_atomically(path, "one\n") == path
+    write_atomically(path, b"two\n")
+    assert path.read_bytes() == b"two\n"
+    assert [child.name for child in path.parent.iterdir()] == ["file.json"]
+
+
+def test_a_written_file_has_the_permissions_that_any_new_file_has(tmp_path):
+    (tmp_path / "plain").write_text("")
+    write_atomically(tmp_path / "ours", "")
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "ours")}
+    assert len(modes) == 1
+
+
+def test_a_name_of_the_greatest_length_can_be_written(tmp_path):
+    path = tmp_path / ("n" * 255)
+    write_atomically(path, "whole")
+    assert path.read_text() == "whole"
+
+
+def test_a_failing_rename_leaves_the_target_and_no_temporary_file(tmp_path):
+    target = tmp_path / "taken"
+    (target / "inside").mkdir(parents=True)
+    with pytest.raises(OptionError, match="cannot be written"):
+        write_atomically(target, "new")
+    assert [child.name for child in tmp_path.iterdir()] == ["taken"]
+    assert (target / "inside").is_dir()
+
+
+def test_a_write_interrupted_before_the_rename_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def interrupt(handle: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, "new" * 1000)
+    assert path.read_text() == "old"
+    assert [child.name for child in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("old")
+    script = """
+        import os, signal, sys
+        from sme_registry.io import write_atomically
+        os.fsync = lambda handle: os.kill(os.getpid(), signal.SIGKILL)  # all written, not renamed
+        write_atomically(sys.argv[1], "new" * 100_000)
+    """
+    killed = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(path)], check=False, timeout=60
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert path.read_text() == "old"
+
+
+def test_a_folder_that_may_not_be_written_to_is_refused(tmp_path):
+    folder = tmp_path / "read-only"
+    folder.mkdir()
+    (folder / "file").write_text("old")
+    folder.chmod(0o555)
+    script = """
+        import os, sys
+        from sme_registry.errors import OptionError
+        from sme_registry.io import write_atomically
+        os.chdir(sys.argv[1])
+        if os.geteuid() == 0:
+            os.seteuid(65534)  # root may write anywhere: be nobody
+        try:
+            write_atomically("file", "new")
+        except OptionError as error:
+            print(error)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(folder)],
+        check=True, timeout=60, capture_output=True, text=True,
+    )  # fmt: skip
+    assert "file: cannot be written: Permission denied. Give a path in a folder" in done.stdout
+    assert [child.name for child in folder.iterdir()] == ["file"]
+    assert (folder / "file").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a\0b", "x"), ("x" * 300, "x"), ("file", "\ud800"), ("file/inside", "x")],
+)
+def test_paths_and_texts_that_cannot_be_written_are_refused(tmp_path, name, content):
+    (tmp_path / "file").write_text("old")
+    with pytest.raises(OptionError, match="cannot be written"):
+        write_atomically(f"{tmp_path}/{name}", content)
+    assert [child.name for child in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "old"
+
+
+def test_what_we_write_is_strict_json():
+    value = {"ä": [1.5, None, True, "x"]}
+    assert parse_json(to_json(value)) == value
+    assert "ä" in to_json(value)
+    assert to_json(value).endswith("}\n")
+    with pytest.raises(ValueError, match="Out of range float"):
+        to_json({"a": float("nan")})
+    assert json.loads(to_json(value)) == value

@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import math
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.stats import trim_mean
+
+from leaderboard.scoring.metrics import Array, rank_ranges, run_metrics
+from sme_registry import statistics
+from sme_registry.statistics import aggregate as theta
+from sme_registry.statistics import iqm
+from sme_registry.statistics import stratified_bootstrap as bootstrap
+from tests.leaderboard.coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
+
+LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def runs_of(classes: int, runs: int, metrics: int = 1, seed: int = 0) -> dict[str, Array]:
+    rng = np.random.default_rng(seed)
+    return {f"class{index}": rng.lognormal(size=(runs, metrics)) for index in range(classes)}
+
+
+# One run
+
+
+def test_metrics_of_a_run_are_those_written_out_by_hand() -> None:
+    found = run_metrics(
+        (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
+    )
+
+    assert found["wd"] == 0.1
+    assert found["ood"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
+    assert found["decay"] == pytest.approx(0.4 - 0.1)
+    assert found["slope"] == pytest.approx(0.1 / 0.2)
+    assert found["points"] == pytest.approx(100 * (0.95 - 0.8))
+
+
+def test_slope_is_that_of_the_least_squares_line() -> None:
+    regret = np.random.default_rng(1).random(6)
+
+    slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["slope"]
+
+    assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
+
+
+@pytest.mark.parametrize("levels", [LEVELS, (0.0, 0.1, 0.3, 0.7)])
+def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
+    levels: tuple[float, ...],
+) -> None:
+    found = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
+
+    assert found == {"wd": 1.0, "ood": 1.0, "decay": 0.0, "slope": 0.0, "points": 0.0}
+
+
+def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
+    found = run_metrics((1.0,) * 6, None, LEVELS)
+
+    assert found == {"wd": 1.0, "ood": 1.0, "decay": 1.0, "slope": 1.0, "points": 100.0}
+
+
+# Over runs
+
+
+def test_iqm_of_ten_runs_is_the_mean_of_the_middle_six() -> None:
+    assert iqm([9, 100, 1, 2, 3, 4, 5, 6, -50, 7]) == pytest.approx((2 + 3 + 4 + 5 + 6 + 7) / 6)
+
+
+@pytest.mark.parametrize("runs", range(1, 30))
+def test_iqm_is_scipys_trimmed_mean(runs: int) -> None:
+    values = np.random.default_rng(runs).normal(size=(runs, 3))
+
+    np.testing.assert_allclose(iqm(values), trim_mean(values, 0.25, axis=0), rtol=1e-13)
+
+
+def test_giving_up_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rng = np.random.default_rng(0)
+    honest = {str(index): rng.normal(0.33, 0.03, size=(10, 1)) for index in range(6)}
+    gave_up = {**honest, "0": np.ones((10, 1))}
+
+    def pooled(classes: dict[str, Array]) -> float:
+        return float(iqm(np.concatenate(list(classes.values())))[0])
+
+    ours = float(theta(gave_up)[0] - theta(honest)[0])
+    theirs = pooled(gave_up) - pooled(honest)
+
+    with capsys.disabled():
+        print(
+            f"\ngiving up one class of six: θ moves by {ours:.3f}, the pooled IQM by {theirs:.3f}"
+        )
+    assert ours == pytest.approx(0.11, abs=0.01)
+    assert theirs == pytest.approx(0.01, abs=0.005)
+
+
+# Intervals
+
+
+@pytest.mark.parametrize("n", [3, 10, 13, 24])
+def test_the_interval_is_the_one_that_sorting_every_sample_gives(n: int) -> None:
+    runs = np.random.default_rng(2).lognormal(size=(n, 2))
+    bits = statistics._stream("seed", "only")
+    chosen = (bits.random_raw(300 * n) >> np.uint64(11)).astype(float) / 2**53 * n
+    samples = runs[chosen.astype(int).reshape(300, n)]
+    drawn = math.sqrt(n / (n - 1)) * (iqm(samples.swapaxes(0, 1)) - iqm(runs))
+    lowest, highest = np.quantile(drawn, [0.025, 0.975], axis=0)
+    arm = np.maximum(-lowest, highest)
+
+    low, high = bootstrap({"only": runs}, 300, "seed")
+
+    np.testing.assert_allclose(low, iqm(runs) - arm, rtol=1e-12)
+    np.testing.assert_allclose(high, iqm(runs) + arm, rtol=1e-12)
+
+
+def test_intervals_honour_their_seed() -> None:
+    classes = runs_of(3, 10)
+
+    first, again, other = (bootstrap(classes, 500, seed) for seed in ("a", "a", "b"))
+
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_intervals_of_a_seed_are_the_same_on_every_machine() -> None:
+    low, high = bootstrap(
+        {"a": np.arange(10.0)[:, None] ** 2, "b": np.ones((4, 1))}, 1000, "sha256:0"
+    )
+
+    assert (low[0], high[0]) == pytest.approx((-1.8855890, 26.0522557), abs=1e-6)
+
+
+def test_all_metrics_are_of_the_same_resampled_runs() -> None:
+    runs = np.random.default_rng(3).normal(size=(10, 1))
+
+    low, high = bootstrap({"a": np.concatenate([runs, 2 * runs + 1], axis=1)}, 500, "a")
+
+    assert low[1] == pytest.approx(2 * low[0] + 1)
+    assert high[1] == pytest.approx(2 * high[0] + 1)
+
+
+def test_classes_are_resampled_apart() -> None:
+    runs = np.random.default_rng(4).normal(size=(10, 1))
+    (low,), (high,) = bootstrap({"a": runs}, 4000, "a")
+    (low_of_two,), (high_of_two,) = bootstrap({"a": runs, "b": runs}, 4000, "a")
+
+    assert (high_of_two - low_of_two) / (high - low) == pytest.approx(2**-0.5, rel=0.1)
+
+
+def test_runs_that_agree_leave_no_interval_and_one_run_adds_none() -> None:
+    low, high = bootstrap({"agree": np.ones((10, 2)), "one": np.full((1, 2), 0.5)}, 500, "a")
+
+    np.testing.assert_array_equal(low, [0.75, 0.75])
+    np.testing.assert_array_equal(high, [0.75, 0.75])
+
+
+def test_an_interval_holds_its_score() -> None:
+    for seed in range(50):
+        classes = runs_of(2, 3, metrics=4, seed=seed)
+        low, high = bootstrap(classes, 100, "a")
+        assert (low <= theta(classes)).all()
+        assert (theta(classes) <= high).all()
+
+
+@pytest.mark.parametrize("name", ["normal", "lognormal(1)", "two humps 80:20", "20 % failed"])
+def test_intervals_hold_the_truth_and_do_not_part_equal_methods(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000)
+
+    with capsys.disabled():
+        print(f"\n{name}, {RUNS} runs in {CLASSES} classes: {found}")
+    # Three standard errors of what 400 methods, or 200 pairs of them, can show.
+    slack = 3 * math.sqrt(0.93 * 0.07 / 400)
+    assert min(found.coverage, found.coverage_of_mean) >= 0.93 - slack
+    assert found.parted <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
+
+
+def test_the_bootstrap_of_a_board_takes_well_under_a_second(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    classes = runs_of(6, 10, metrics=11)
+
+    start = time.process_time()
+    bootstrap(classes, 10_000, "a")
+    seconds = time.process_time() - start
+
+    with capsys.disabled():
+        print(f"\n6 classes × 10 runs × 10,000 draws × 11 scores: {seconds:.2f} s")
+    assert seconds < 1.0
+
+
+def test_the_bootstrap_of_many_runs_holds_little_memory() -> None:
+    classes = runs_of(1, 1000, metrics=11)
+
+    tracemalloc.start()
+    bootstrap(classes, 10_000, "a")
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert most < 64 * 2**20
+
+
+# Ranks
+
+
+def test_ranks_are_what_counting_every_pair_gives() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        ends = np.sort(rng.integers(0, 12, size=(rng.integers(1, 15), 2)), axis=1)
+        low, high = ends.T
+        first = [1 + sum(other < own for other in high) for own in low]
+        last = [len(low) - sum(other > own for other in low) for own in high]
+
+        found = rank_ranges(low, high)
+
+        assert (found[0].tolist(), found[1].tolist()) == (first, last)
+        assert (found[0] <= found[1]).all()
+
+
+def test_intervals_that_touch_share_a_rank() -> None:
+    first, last = rank_ranges([0.1, 0.2, 0.5], [0.2, 0.3, 0.6])
+
+    assert list(zip(first.tolist(), last.tolist(), strict=True)) == [(1, 2), (1, 2), (3, 3)]
+
+
+def test_no_entries_have_no_ranks() -> None:
+    first, last = rank_ranges([], [])
+
+    assert len(first) == len(last) == 0

@@ -1,0 +1,352 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+import random
+import time
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import Estimate, Scores
+from leaderboard.errors import NotPublishable
+from leaderboard.exports import to_csv, to_json, to_latex
+from leaderboard.scoring.ranking import (
+    IS_REFERENCE,
+    NOT_LEARNED,
+    TOO_FEW_RUNS,
+    ranking,
+    refuse_unpublishable,
+)
+from leaderboard.store import EntryRow
+from sme_registry import EvaluationProtocol
+from sme_registry.spec import Suite
+
+BOARD = BoardDocument(
+    title="Small",
+    suite_name="small_suite-v1",
+    suite=Suite.from_dict(
+        {"classes": [{"name": "a", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0]}]}
+    ),
+    protocol_name="few-v1",
+    protocol=EvaluationProtocol(states_per_region=60),
+    key=SigningKey.generate().public,
+)
+HEAD = (7, "sha256:" + "ab" * 32)
+DATE = "2026-11-21T09:30:00Z"
+
+
+def scores(wd: float, ood: float, arm: float = 0.05) -> Scores:
+    def around(value: float, arm: float = arm) -> Estimate:
+        return Estimate(value=value, low=value - arm, high=value + arm)
+
+    return Scores(
+        wd=around(wd),
+        ood=around(ood),
+        decay=around(ood - wd),
+        slope=around(0.0),
+        points=around(1.0),
+        profile=(around(wd), *(around(ood) for _ in range(5))),
+    )
+
+
+def entry(sequence: int, found: Scores | None = None, **fields: Any) -> EntryRow:
+    return replace(
+        EntryRow(
+            id=f"sha256:{sequence:064x}",
+            sequence=sequence,
+            received=DATE,
+            status="scored",
+            code="",
+            method=f"method {sequence}",
+            version="1",
+            family="PPO",
+            knowledge="generic",
+            submitter="somebody",
+            key="0" * 64,
+            code_link=None,
+            runs=60,
+            steps=10**6,
+            enough_runs=True,
+            oracle_like=False,
+            reference=False,
+            scores=found,
+        ),
+        **fields,
+    )
+
+
+def reference(sequence: int, name: str, regret: float, **fields: Any) -> EntryRow:
+    found = scores(regret, regret, arm=0.0)
+    return entry(sequence, found, method=name, reference=True, enough_runs=False, **fields)
+
+
+REFERENCES = [reference(1, "optimal", 0.0), reference(2, "constant", 1.0)]
+
+
+def test_entries_stand_in_order_with_the_ranks_that_their_intervals_leave_open() -> None:
+    entries = [
+        entry(3, scores(0.50, 0.6)),
+        entry(4, scores(0.20, 0.6)),
+        entry(5, scores(0.25, 0.6)),
+        entry(6, scores(0.80, 0.9)),
+    ]
+
+    rows = ranking(entries, "wd")
+
+    assert [(row.entry.sequence, row.first, row.last) for row in rows] == [
+        (4, 1, 2),
+        (5, 1, 2),
+        (3, 3, 3),
+        (6, 4, 4),
+    ]
+    assert {row.reason for row in rows} == {""}
+
+
+def test_each_metric_has_its_own_order() -> None:
+    entries = [entry(3, scores(0.1, 0.9)), entry(4, scores(0.3, 0.5)), entry(5, scores(0.4, 0.45))]
+
+    orders = {
+        metric: [row.entry.sequence for row in ranking(entries, metric)]
+        for metric in ("wd", "ood", "decay")
+    }
+
+    assert orders == {"wd": [3, 4, 5], "ood": [5, 4, 3], "decay": [5, 4, 3]}
+
+
+def test_equal_scores_stand_in_the_order_in_which_they_came() -> None:
+    entries = [entry(sequence, scores(0.3, 0.4)) for sequence in (9, 4, 7)]
+
+    assert [row.entry.sequence for row in ranking(entries, "wd")] == [4, 7, 9]
+
+
+def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> None:
+    entries = [
+        *REFERENCES,
+        entry(3, scores(0.1, 0.2), enough_runs=False),
+        entry(4, scores(0.3, 0.4)),
+    ]
+
+    rows = ranking(entries, "wd")
+
+    assert [(row.entry.sequence, row.first, row.last, row.reason) for row in rows] == [
+        (1, None, None, IS_REFERENCE),
+        (3, None, None, TOO_FEW_RUNS),
+        (4, 1, 1, ""),
+        (2, None, None, IS_REFERENCE),
+    ]
+
+
+def test_what_has_not_certainly_learned_has_no_rank_by_decay() -> None:
+    unsure, sure = entry(3, scores(0.46, 0.46)), entry(4, scores(0.45, 0.6))
+
+    rows = ranking([unsure, sure], "decay")
+
+    assert [(row.entry.sequence, row.first, row.reason) for row in rows] == [
+        (3, None, NOT_LEARNED),
+        (4, 1, ""),
+    ]
+    assert [row.first for row in ranking([unsure, sure], "wd")] == [1, 1]
+
+
+def test_only_what_is_scored_and_stands_is_there() -> None:
+    entries = [
+        entry(3, status="waiting"),
+        entry(4, status="rejected", code="schema"),
+        entry(5, scores(0.1, 0.2), status="withdrawn"),
+    ]
+
+    assert ranking(entries, "wd") == []
+
+
+def test_a_thousand_entries_are_ranked_in_less_than_50_ms(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rng = random.Random(0)
+    entries = [entry(index, scores(rng.random(), rng.random())) for index in range(1000)]
+
+    def seconds() -> float:
+        start = time.process_time()
+        assert len(ranking(entries, "wd")) == 1000
+        return time.process_time() - start
+
+    best = min(seconds() for _ in range(5))
+
+    with capsys.disabled():
+        print(f"\nranking 1,000 entries: {1000 * best:.1f} ms")
+    assert best < 0.05
+
+
+# The reference rows
+
+
+def test_a_board_whose_reference_rows_hold_is_published() -> None:
+    nearly = [reference(1, "optimal", 9e-7), reference(2, "constant", 1 - 9e-7)]
+
+    refuse_unpublishable(REFERENCES)
+    refuse_unpublishable(nearly)
+
+
+def test_a_reference_row_that_was_off_may_be_withdrawn_and_submitted_again() -> None:
+    off = reference(3, "optimal", 0.1)
+
+    with pytest.raises(NotPublishable):
+        refuse_unpublishable([*REFERENCES, off])
+    refuse_unpublishable([*REFERENCES, replace(off, status="withdrawn")])
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_without_both_reference_rows_nothing_is_published(left: int) -> None:
+    with pytest.raises(NotPublishable, match="missing: must be scored"):
+        refuse_unpublishable([REFERENCES[left], entry(3, scores(0.1, 0.2))])
+
+
+def test_a_submission_that_calls_itself_optimal_is_no_reference_row() -> None:
+    impostor = replace(REFERENCES[0], reference=False)
+
+    with pytest.raises(NotPublishable, match="'optimal': missing"):
+        refuse_unpublishable([impostor, REFERENCES[1]])
+
+
+@pytest.mark.parametrize("status", ["waiting", "rejected", "withdrawn"])
+def test_a_reference_row_that_is_not_scored_holds_everything_back(status: Any) -> None:
+    with pytest.raises(NotPublishable, match=f"{status}: must be scored"):
+        refuse_unpublishable([REFERENCES[0], replace(REFERENCES[1], status=status)])
+
+
+@pytest.mark.parametrize("name", ["wd", "ood", "decay", "slope", 0, 3, 5])
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("off", [2e-6, -2e-6])
+def test_a_reference_row_off_in_any_region_or_metric_holds_everything_back(
+    which: int, name: str | int, off: float
+) -> None:
+    rows = list(REFERENCES)
+    found = rows[which].scores
+    assert found is not None
+    if isinstance(name, int):
+        profile = list(found.profile)
+        profile[name] = moved(profile[name], off)
+        changed = found.model_copy(update={"profile": tuple(profile)})
+    else:
+        changed = found.model_copy(update={name: moved(getattr(found, name), off)})
+    rows[which] = replace(rows[which], scores=changed)
+
+    with pytest.raises(NotPublishable, match=f"{rows[which].method}.*{name}="):
+        refuse_unpublishable(rows)
+
+
+def moved(estimate: Estimate, off: float) -> Estimate:
+    return estimate.model_copy(update={"value": estimate.value + off})
+
+
+def test_the_constant_policy_may_lose_points_outside() -> None:
+    found = REFERENCES[1].scores
+    assert found is not None
+    points = Estimate(value=2.2, low=2.0, high=2.4)
+    row = replace(REFERENCES[1], scores=found.model_copy(update={"points": points}))
+
+    refuse_unpublishable([REFERENCES[0], row])
+
+
+# As files
+
+HOSTILE = '=HYPERLINK("http://x","y")'
+
+
+def hostile_rows() -> list[Any]:
+    evil = entry(3, scores(0.3, 0.2), method=HOSTILE, submitter="a;=1+1\r\n=2", version="-1")
+    tex = entry(4, scores(0.6, 0.7), method=r"\input{/etc/passwd} 50% & $x_1^2$ #~", version="+1")
+    return ranking([*REFERENCES, evil, tex], "wd")
+
+
+def test_no_cell_of_the_csv_is_a_formula() -> None:
+    text = to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE)
+    lines = list(csv.DictReader(io.StringIO(text)))
+
+    assert len(lines) == 4
+    for line in lines:
+        for name, cell in line.items():
+            try:
+                float(cell)
+            except ValueError:
+                assert not cell.startswith(("=", "+", "-", "@", "\t", "\r")), (name, cell)
+    assert lines[1]["method"] == "'" + HOSTILE
+    assert '"a;=1+1 =2"' in text  # whole in its quotes, where semicolons split cells, too
+
+
+def test_text_that_is_a_negative_number_is_no_number_in_the_csv() -> None:
+    lines = list(csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE))))
+
+    assert lines[1]["version"] == "'-1"
+    assert float(lines[1]["decay"]) == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    "start", ["=", "+", "-", "@", "\t=", " =", "\r=", "＝", "|", "%", "\x00=", "\u202e="]
+)
+def test_no_text_that_a_spreadsheet_may_run_begins_a_cell(start: str) -> None:
+    rows = ranking([entry(3, scores(0.1, 0.2), submitter=f"{start}cmd")], "wd")
+
+    (line,) = csv.DictReader(io.StringIO(to_csv(rows, "wd", BOARD, HEAD, DATE)))
+
+    assert line["submitter"] == f"'{start[-1]}cmd"
+
+
+def test_the_csv_has_every_score_with_its_interval() -> None:
+    lines = list(csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE))))
+
+    assert [line["first"] for line in lines] == ["", "1", "2", ""]
+    found = lines[1]
+    assert [float(found[name]) for name in ("wd", "wd_low", "wd_high")] == pytest.approx(
+        [0.3, 0.25, 0.35]
+    )
+    assert float(found["regret_0"]) == pytest.approx(0.3)
+    assert float(found["regret_5_high"]) == pytest.approx(0.25)
+
+
+def test_latex_shows_what_was_written_and_runs_none_of_it() -> None:
+    text = to_latex(hostile_rows(), "wd", BOARD, HEAD, DATE)
+
+    line = next(line for line in text.splitlines() if "passwd" in line)
+    assert line == (
+        r"2 & \textbackslash{}input\{/etc/passwd\} 50\% \& \$x\_1\textasciicircum{}2\$ "
+        r"\#\textasciitilde{} +1 & somebody & $0.600$ [$0.550$, $0.650$] & "
+        r"$0.700$ [$0.650$, $0.750$] & $0.100$ [$0.050$, $0.150$] \\"
+    )
+
+
+def test_a_name_of_two_lines_cannot_leave_its_line_of_latex() -> None:
+    rows = ranking([entry(3, scores(0.1, 0.2), submitter="a\n\\end{tabular}\u2028b")], "wd")
+
+    lines = to_latex(rows, "wd", BOARD, HEAD, DATE).splitlines()
+
+    assert sum("tabular" in line for line in lines) == 3
+    assert r"a \textbackslash{}end\{tabular\} b" in "\n".join(lines)
+
+
+def test_the_json_has_the_whole_scores() -> None:
+    plain = json.loads(to_json(hostile_rows(), "wd", BOARD, HEAD, DATE))
+
+    assert plain["metric"] == "wd"
+    assert [row["not_ranked"] for row in plain["rows"]] == ["reference", "", "", "reference"]
+    assert Scores.from_dict(plain["rows"][1]["scores"]) == scores(0.3, 0.2)
+    assert plain["rows"][1]["method"] == HOSTILE
+
+
+@pytest.mark.parametrize("write", [to_csv, to_latex, to_json])
+def test_every_file_says_what_it_is_of(write: Any) -> None:
+    text = write(hostile_rows(), "wd", BOARD, HEAD, DATE).replace(r"\_", "_")
+
+    for said in (
+        "small_suite-v1",
+        BOARD.suite.digest,
+        "few-v1",
+        BOARD.protocol.digest,
+        HEAD[1],
+        DATE,
+    ):
+        assert said in text

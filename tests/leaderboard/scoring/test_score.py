@@ -1,0 +1,378 @@
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+import signal
+import sys
+import types
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from onnx import ModelProto, numpy_helper
+
+from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
+from leaderboard.documents.submission import Submission
+from leaderboard.errors import BoardError
+from leaderboard.scoring.metrics import run_metrics
+from leaderboard.scoring.score import (
+    _oracle_like,
+    evaluation_seed,
+    failed_run,
+    result_of,
+    score_submission,
+)
+from sme_registry import EvaluationProtocol, SMESpec, evaluate
+from sme_registry.spec import Suite
+from tests.leaderboard.artefact import models
+
+KEY = SigningKey.generate()
+SUITE = Suite.from_dict(
+    {
+        "classes": [
+            {
+                "name": name,
+                "setting": {"state_dim": 2, "action_dim": 2, "complexity": L},
+                "seeds": seeds,
+            }
+            for name, L, seeds in [("shallow", 1, [0, 1]), ("deep", 3, [0])]
+        ]
+    }
+)
+BOARD = BoardDocument(
+    title="Small",
+    suite_name="small-v1",
+    suite=SUITE,
+    protocol_name="few-v1",
+    protocol=EvaluationProtocol(states_per_region=60),
+    key=KEY.public,
+    runs_to_rank=2,
+    draws=200,
+)
+Policy = Callable[[SMESpec], bytes] | bytes | None
+
+
+def digest_of(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def as_bytes(model: ModelProto) -> bytes:
+    return model.SerializeToString(deterministic=True)
+
+
+def score(
+    *policies: Policy,
+    progress: Callable[[int, int], None] | None = None,
+    specs: list[str] | None = None,
+    opened: list[str] | None = None,
+    **fields: Any,
+) -> Result:
+    """Score these policies on the suite's instances in order, again from the first one on."""
+    instances = SUITE.instances
+    data: dict[str, bytes] = {}
+    runs = []
+    for index, policy in enumerate(policies):
+        spec = instances[index % len(instances)]
+        found = policy(spec) if callable(policy) else policy
+        artefact = None
+        if found is not None:
+            data[digest_of(found)] = found
+            artefact = {"sha256": digest_of(found), "size": len(found)}
+        digest = specs[index] if specs else spec.digest
+        runs.append({"spec": digest, "seed": index, "steps": 10, "artefact": artefact})
+    submission = Submission.from_dict(
+        {
+            "suite": BOARD.suite_reference,
+            "method": {"name": "m", "version": "1", "family": "f", "knowledge": "generic"},
+            "submitter": {"name": "s", "key": KEY.public},
+            "created": "2026-11-21T09:30:00Z",
+            "runs": runs,
+            "runs_started": {},
+            **fields,
+        }
+    )
+
+    def artefact_of(digest: str) -> bytes:
+        if opened is not None:
+            opened.append(digest)
+        return data[digest]
+
+    return score_submission(BOARD, submission, artefact_of, progress)
+
+
+LINEAR = as_bytes(models.linear())
+
+
+def test_the_seed_is_the_first_53_bits_of_the_three_digests() -> None:
+    bits = bin(int(hashlib.sha256(b"p\ns\na").hexdigest(), 16))[2:].zfill(256)
+
+    assert evaluation_seed("p", "s", "a") == int(bits[:53], 2)
+
+
+def test_each_of_the_three_digests_moves_the_seed() -> None:
+    seeds = {evaluation_seed(*digests) for digests in ("psa", "qsa", "pta", "psb")}
+
+    assert len(seeds) == 4
+
+
+def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
+    # What an open board cannot tell: the specs are public, and so is π*. It shows performance,
+    # never learning; all that the board can do is to ask for code.
+    result = score(optimal_onnx, optimal_onnx, optimal_onnx)
+
+    assert result.status == "scored"
+    assert result.scores is not None
+    for estimate in (result.scores.wd, result.scores.ood, *result.scores.profile):
+        assert 0.0 <= estimate.low <= estimate.value <= estimate.high < 1e-6
+    assert result.oracle_like
+
+
+def test_the_constant_policy_scores_one_and_has_no_decay() -> None:
+    result = score(constant_onnx, constant_onnx, constant_onnx)
+
+    assert result.scores is not None
+    for estimate in (result.scores.wd, result.scores.ood, *result.scores.profile):
+        assert (estimate.low, estimate.value, estimate.high) == (1.0, 1.0, 1.0)
+    assert result.scores.decay.value == result.scores.slope.value == 0.0
+    assert not result.oracle_like
+
+
+def test_a_run_has_the_numbers_that_anyone_can_recompute() -> None:
+    W = numpy_helper.to_array(models.linear().graph.initializer[0])
+
+    result = score(LINEAR, LINEAR, LINEAR)
+
+    for run, spec in zip(result.runs, SUITE.instances, strict=True):
+        seed = evaluation_seed(BOARD.protocol.digest, spec.digest, digest_of(LINEAR))
+        report = evaluate(
+            lambda observations: observations @ W,
+            spec,
+            EvaluationProtocol(states_per_region=60, seed=seed),
+        )
+        regret = [region.normalised_regret for region in report.regions]
+        similarity = [region.similarity for region in report.regions]
+        assert run.evaluation_seed == seed
+        assert run.regret == pytest.approx(regret, abs=1e-6)
+        assert run.similarity == pytest.approx(similarity, abs=1e-6)
+        assert run.ood == pytest.approx(np.mean(regret[1:]), abs=1e-6)
+        assert run.points == pytest.approx(
+            100 * (similarity[0] - np.mean(similarity[1:])), abs=1e-4
+        )
+
+
+def test_a_result_is_the_same_each_time_and_reads_back() -> None:
+    first, again = score(LINEAR, LINEAR, None), score(LINEAR, LINEAR, None)
+
+    assert first.canonical_json() == again.canonical_json()
+    assert Result.from_dict(first.to_dict()) == first
+
+
+def test_failed_and_unlisted_runs_score_one() -> None:
+    result = score(LINEAR, None, LINEAR, runs_started={"shallow": 4, "deep": 1})
+
+    shallow, deep = result.classes
+    assert (shallow.runs, shallow.submitted) == (4, 1)
+    assert (deep.runs, deep.submitted) == (1, 1)
+    assert [(run.spec is None, run.artefact is None) for run in result.runs] == [
+        (False, False),
+        (False, True),
+        (False, False),
+        (True, True),
+        (True, True),
+    ]
+    for run in result.runs:
+        if run.artefact is None:
+            assert run.regret == (1.0,) * 6
+            assert run.similarity is run.evaluation_seed is None
+            assert [getattr(run, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
+    # Of four runs the best and the worst are cut, which leaves two that score 1.
+    assert shallow.wd == 1.0
+
+
+def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
+    levels = [high for _, high in BOARD.protocol.edges]
+
+    def run(class_name: str, slope: float) -> RunScore:
+        regret = tuple(0.2 + slope * level for level in levels)
+        similarity = tuple(1.0 - 0.25 * N for N in regret)
+        return RunScore(
+            spec=SUITE.instances[0].digest,
+            class_name=class_name,
+            artefact=digest_of(LINEAR),
+            evaluation_seed=0,
+            regret=regret,
+            similarity=similarity,
+            **run_metrics(regret, similarity, levels),
+        )
+
+    slopes = [0.1 * number for number in range(1, 9)]
+    runs = [run(name, slope) for name in ("shallow", "deep") for slope in slopes]
+    withheld = [
+        run if run.slope < 0.45 else failed_run(BOARD, run.class_name, None) for run in runs
+    ]
+    honest, chosen = (result_of(BOARD, "sha256:" + "0" * 64, each, {}) for each in (runs, withheld))
+
+    assert honest.scores is not None
+    assert chosen.scores is not None
+    for metric in METRICS:
+        assert getattr(honest.scores, metric).value < getattr(chosen.scores, metric).value, metric
+
+
+def test_no_interval_of_a_regret_reaches_below_zero() -> None:
+    result = score(optimal_onnx, None, optimal_onnx)
+
+    assert result.scores is not None
+    assert result.scores.wd.low == result.scores.profile[5].low == 0.0
+    assert result.scores.wd.value == pytest.approx(0.25, abs=1e-6)
+    assert result.scores.decay.low < 0.0  # a difference may be negative
+
+
+def test_ranking_needs_enough_runs_in_each_class() -> None:
+    assert not score(None, None, None).enough_runs
+    assert score(None, None, None, runs_started={"deep": 2}).enough_runs
+
+
+def test_a_policy_that_stands_twice_is_scored_once() -> None:
+    opened: list[str] = []
+    calls: list[tuple[int, int]] = []
+
+    result = score(
+        *[LINEAR] * 6, opened=opened, progress=lambda done, total: calls.append((done, total))
+    )
+
+    assert len(opened) == 3
+    assert result.runs[0] == result.runs[3]
+    assert calls == [(60 * region, 60 * 18) for region in range(1, 19)]
+
+
+@pytest.mark.parametrize(
+    ("policy", "code"),
+    [
+        (b"not a model", "onnx_malformed"),
+        (as_bytes(models.squashed([models.node("Log", "y", "a")])), "run_not_finite"),
+        (as_bytes(models.model([models.node("Abs", "o", "a")])), "run_output"),
+    ],
+)
+def test_an_artefact_that_is_refused_rejects_the_submission_and_is_named(
+    policy: bytes, code: str
+) -> None:
+    result = score(LINEAR, policy, LINEAR)
+
+    assert (result.status, result.code) == ("rejected", code)
+    assert result.message.startswith(
+        f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, artefact {digest_of(policy)}): "
+    )
+    assert result.scores is None
+    assert result.runs == ()
+
+
+def test_an_action_that_depends_on_its_batch_in_an_outer_region_alone_is_found() -> None:
+    far = models.tensor("far", np.float32(1.3))
+    policy = as_bytes(
+        models.squashed(
+            [
+                models.node("Sub", "o far", "d"),
+                models.node("Relu", "d", "r"),  # 0 for every state within ε = 0.6
+                models.node("ReduceMean", "r", "m", keepdims=1),  # over the batch
+                models.node("Add", "y m", "a"),
+            ],
+            [far],
+        )
+    )
+
+    result = score(policy, None, None)
+
+    assert (result.status, result.code) == ("rejected", "run_batch_dependent")
+
+
+def test_an_instance_of_another_suite_is_refused() -> None:
+    other = SMESpec(state_dim=2, action_dim=2, seed=77).digest
+
+    result = score(None, None, None, specs=[SUITE.instances[0].digest, other, other])
+
+    assert result.code == "unknown_spec"
+    assert other in result.message
+
+
+def test_a_class_without_runs_is_refused() -> None:
+    result = score(None, None)
+
+    assert result.code == "missing_run"
+    assert "'deep'" in result.message
+
+
+def test_a_number_of_runs_that_nobody_started_is_refused_before_anything_is_made_of_it() -> None:
+    opened: list[str] = []
+
+    result = score(LINEAR, LINEAR, LINEAR, opened=opened, runs_started={"deep": 10**12})
+
+    assert result.code == "schema"
+    assert "runs_started=1000000000002: must be at most 10,000" in result.message
+    assert opened == []
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
+def test_what_stops_the_scorer_is_no_fault_of_the_submission(error: type[BaseException]) -> None:
+    def stop(done: int, total: int) -> None:
+        raise error
+
+    with pytest.raises(error):
+        score(LINEAR, LINEAR, LINEAR, progress=stop)
+
+
+def children() -> list[int]:
+    found = []
+    for path in glob.glob(f"/proc/{os.getpid()}/task/*/children"):
+        with open(path) as stream:
+            found += [int(child) for child in stream.read().split()]
+    return found
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds its children in /proc")
+def test_a_sandbox_ended_from_outside_judges_nothing() -> None:
+    before = set(children())
+
+    def end_it(done: int, total: int) -> None:
+        for child in set(children()) - before:
+            os.kill(child, signal.SIGKILL)
+
+    with pytest.raises(BoardError, match="through no fault of the model"):
+        score(LINEAR, LINEAR, LINEAR, progress=end_it)
+
+
+@pytest.mark.parametrize(
+    ("wd", "ood", "expected"),
+    [
+        (0.0, 0.01, True),
+        (0.5, 0.01, True),
+        (0.02, 0.03, True),
+        (0.02, 0.031, False),
+        (0.021, 0.022, False),
+        (0.0, 0.011, False),
+    ],
+)
+def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
+    wd: float, ood: float, expected: bool
+) -> None:
+    values = {"wd": wd, "ood": ood, "decay": round(ood - wd, 9), "slope": 0.0, "points": 0.0}
+    estimates = {name: Estimate(value=x, low=x, high=x) for name, x in values.items()}
+    assert tuple(values) == METRICS
+
+    assert _oracle_like(Scores(**estimates, profile=(estimates["wd"],) * 2)) is expected
+
+
+def test_versions_are_those_that_the_numbers_come_from_not_what_else_is_loaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = score(LINEAR, None, None)
+    monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
+
+    beside_torch = score(LINEAR, None, None)
+
+    assert {"sme_registry", "python", "numpy", "onnxruntime"} <= set(alone.versions)
+    assert beside_torch == alone

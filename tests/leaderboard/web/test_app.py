@@ -1,0 +1,789 @@
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import re
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from leaderboard import intake
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import SignedSubmission, utc
+from leaderboard.errors import BoardError
+from leaderboard.store import Store
+from leaderboard.web.app import HTTP_CODES, serve
+from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
+from tests.leaderboard.serving import serving, serving_process
+from tests.leaderboard.web.site import boards
+
+# More patient than httpx, for busy machines; a connection for each request, as `httpx.get` has.
+HTTP = httpx.Client(timeout=60, limits=httpx.Limits(max_keepalive_connections=0))
+
+Json = dict[str, Any]
+JSON = {"Accept": "application/json"}
+BROWSER = {"Accept": "text/html,application/xhtml+xml"}
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, dict[str, str]]]:
+    """The URL of a board with entries of every kind, and their ids. Tests only read it."""
+    path = tmp_path_factory.mktemp("published") / "board"
+    with boards.create(path) as store:
+        ids = boards.furnish(store)
+    with serving(path) as url:
+        yield url, ids
+
+
+@pytest.fixture
+def url(store: Store) -> Iterator[str]:
+    """The URL of the tiny board of `store`."""
+    with serving(store.folder.path) as url:
+        yield url
+
+
+def refusal(answer: httpx.Response) -> tuple[int, str]:
+    assert answer.headers["Content-Type"] == "application/json"
+    body = answer.json()
+    assert set(body) == {"code", "message"}
+    assert body["message"]
+    assert "Traceback" not in body["message"]
+    return answer.status_code, body["code"]
+
+
+def put(
+    url: str, key: SigningKey, data: bytes, digest: str | None = None, **more: Any
+) -> httpx.Response:
+    digest = digest or sha256(data)
+    headers = {"Authorization": intake.upload_header(key, digest), **more}
+    return HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=data, headers=headers)
+
+
+def sha256(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def raw(url: str, request: bytes, patience: float = 60.0) -> bytes:
+    """What a server answers to these bytes, until it closes the connection."""
+    parts = urlsplit(url)
+    with socket.create_connection((parts.hostname, parts.port), patience) as connection:
+        connection.sendall(request)
+        answer = b""
+        while chunk := connection.recv(2**16):
+            answer += chunk
+        return answer
+
+
+def files_of(store: Store) -> list[str]:
+    """Everything under the board's folder but the index, which SQLite keeps busy."""
+    return sorted(
+        str(path.relative_to(store.folder.path))
+        for path in store.folder.path.rglob("*")
+        if path.is_file() and not path.name.startswith("index.sqlite")
+    )
+
+
+# Pages.
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/", "/index.html", "/ood", "/decay.html", "/compare", "/log", "/method", "/board.csv"],
+)
+def test_pages_are_served(published: tuple[str, dict[str, str]], path: str) -> None:
+    answer = HTTP.get(published[0] + path, headers=BROWSER)
+    assert answer.status_code == 200
+    assert len(answer.content) > 500
+
+
+def test_a_submissions_page_shows_its_method(published: tuple[str, dict[str, str]]) -> None:
+    url, ids = published
+    answer = HTTP.get(f"{url}/submissions/{hex_of(ids['sac'])}")
+    assert answer.status_code == 200
+    assert "<h1><bdi>SAC</bdi>" in answer.text
+
+
+def test_every_link_of_the_board_leads_somewhere(published: tuple[str, dict[str, str]]) -> None:
+    url, _ = published
+    links = set(re.findall(r'(?:href|src)="([^"#?]+)', HTTP.get(url).text))
+    local = {link for link in links if "://" not in link}
+    assert len(local) > 10
+    with httpx.Client(base_url=url, timeout=60) as client:
+        broken = [link for link in local if client.get(link).status_code != 200]
+    assert broken == []
+
+
+def test_a_name_with_a_script_is_shown_as_text(published: tuple[str, dict[str, str]]) -> None:
+    url, ids = published
+    for path in ("", f"/submissions/{hex_of(ids['hostile'])}"):
+        page = HTTP.get(url + path).text
+        assert "x&lt;b&gt;y" in page
+        assert "<script>alert" not in page
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/nowhere", "/api/board", "/api/nowhere", "/%2e%2e/board.key", "/healthz"]
+)
+def test_every_answer_has_the_security_headers(
+    published: tuple[str, dict[str, str]], path: str
+) -> None:
+    headers = HTTP.get(published[0] + path).headers
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert "Set-Cookie" not in headers
+
+
+def test_pages_hold_no_inline_script_or_style(published: tuple[str, dict[str, str]]) -> None:
+    url, ids = published
+    for path in ("/", "/compare", "/log", f"/submissions/{hex_of(ids['hostile'])}"):
+        page = HTTP.get(url + path).text
+        assert "<style" not in page
+        assert " style=" not in page
+        assert "<script>" not in page
+        assert "<script src=" in page or "<script" not in page
+
+
+def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
+    with (
+        boards.create(tmp_path / "board", classes=1) as store,
+        serving(store.folder.path) as url,
+        httpx.Client(base_url=url, timeout=60) as client,
+    ):
+        first = client.get("/")
+        known = {"If-None-Match": f'"x", {first.headers["ETag"]}'}
+        same = client.get("/", headers=known)
+        boards.submit(store, SigningKey.generate(), "New", [0.3] * 6)
+        grown = client.get("/", headers=known)
+    assert (first.status_code, same.status_code, grown.status_code) == (200, 304, 200)
+    assert same.content == b""
+    assert "New" not in first.text
+    assert "New" in grown.text
+
+
+def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
+    for path in ("/", "/ood", "/log", "/api/board"):
+        answer = HTTP.get(url + path, headers=JSON)
+        assert refusal(answer) == (503, "not_publishable")
+        assert "'optimal'" in answer.json()["message"]
+    page = HTTP.get(url, headers=BROWSER)
+    assert page.status_code == 503
+    assert page.headers["Content-Type"].startswith("text/html")
+    assert "&#x27;optimal&#x27;" in page.text
+    assert HTTP.get(f"{url}/static/board.css").status_code == 200
+
+
+def test_a_browser_gets_a_page_where_nothing_is(published: tuple[str, dict[str, str]]) -> None:
+    url, _ = published
+    page = HTTP.get(f"{url}/nowhere", headers=BROWSER)
+    assert page.status_code == 404
+    assert page.headers["Content-Type"].startswith("text/html")
+    assert "not_found" in page.text
+    assert refusal(HTTP.get(f"{url}/nowhere")) == (404, "not_found")
+    assert refusal(HTTP.get(f"{url}/api/nowhere", headers=BROWSER)) == (404, "not_found")
+
+
+# Reading by the API.
+
+
+def test_the_server_says_that_it_lives(published: tuple[str, dict[str, str]]) -> None:
+    assert HTTP.get(f"{published[0]}/healthz").json() == {"status": "ok"}
+
+
+@pytest.mark.parametrize("metric", ["wd", "ood", "decay"])
+def test_the_board_as_data_is_in_order(published: tuple[str, dict[str, str]], metric: str) -> None:
+    board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
+    values = [row["scores"][metric]["value"] for row in board["rows"]]
+    assert board["metric"] == metric
+    assert values == sorted(values)
+    assert len(values) > 5
+
+
+def test_a_metric_that_is_none_is_refused(published: tuple[str, dict[str, str]]) -> None:
+    answer = HTTP.get(f"{published[0]}/api/board", params={"metric": "reward"})
+    assert refusal(answer) == (400, "bad_request")
+
+
+def test_the_log_comes_in_parts_that_join(published: tuple[str, dict[str, str]]) -> None:
+    url, _ = published
+    whole = HTTP.get(f"{url}/api/log").json()
+    tail = HTTP.get(f"{url}/api/log", params={"start": 5}).json()
+    assert [entry["sequence"] for entry in whole["entries"]] == list(range(len(whole["entries"])))
+    assert whole["entries"][0]["event"] == "opened"
+    assert tail["entries"] == whole["entries"][5:]
+    assert HTTP.get(f"{url}/api/log", params={"start": 99999}).json()["entries"] == []
+
+
+@pytest.mark.parametrize("start", ["-1", "x", "1e3", "9" * 400, "١"])
+def test_a_start_that_is_no_number_is_refused(
+    published: tuple[str, dict[str, str]], start: str
+) -> None:
+    answer = HTTP.get(f"{published[0]}/api/log", params={"start": start})
+    assert refusal(answer) == (400, "bad_request")
+
+
+def test_a_submission_is_told_with_its_result(published: tuple[str, dict[str, str]]) -> None:
+    url, ids = published
+    scored = HTTP.get(f"{url}/api/submissions/{hex_of(ids['sac'])}").json()
+    rejected = HTTP.get(f"{url}/api/submissions/{hex_of(ids['rejected'])}").json()
+    waiting = HTTP.get(f"{url}/api/submissions/{hex_of(ids['waiting'])}").json()
+    assert scored["status"] == "scored"
+    assert scored["result"]["scores"]["wd"]["value"] < 0.2
+    assert scored["submission"]["method"]["name"] == "SAC"
+    assert (rejected["status"], rejected["result"]["code"]) == ("rejected", "onnx_op")
+    assert (waiting["status"], waiting["result"]) == ("waiting", None)
+    read = SignedSubmission.read(
+        json.dumps({name: scored[name] for name in ("submission", "signature")}).encode()
+    )
+    assert read.id == ids["sac"]
+
+
+def test_scores_are_withheld_until_the_references_are_right(url: str, store: Store) -> None:
+    key = SigningKey.generate()
+    scored = boards.submit(store, key, "PPO", [0.2] * 6)
+    code = ("onnx_op", "node 3: op_type='Loop': must be one of the list.")
+    rejected = boards.submit(store, key, "Broken", None, rejected=code)
+    assert refusal(HTTP.get(url, headers=JSON)) == (503, "not_publishable")
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert (told["status"], told["result"]) == ("scored", None)
+    assert "reference row 'optimal': missing" in told["withheld"]
+    assert "0.2" not in json.dumps(told)
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(rejected)}").json()
+    assert (told["status"], told["result"]["code"]) == ("rejected", "onnx_op")
+
+    for name, level in (("optimal", 0.0), ("constant", 1.0)):
+        own = store.folder.signing_key()
+        boards.submit(store, own, name, [level] * 6, family="reference", spread=0.0)
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert told["result"]["scores"]["profile"][0]["value"] > 0
+    assert told["withheld"] == ""
+
+
+def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]]) -> None:
+    answer = HTTP.get(f"{published[0]}/api/submissions/{'0' * 64}")
+    assert refusal(answer) == (404, "unknown_submission")
+
+
+# Paths.
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../board.key",
+        "/static/../../board.key",
+        "/static/..%2f..%2fboard.key",
+        "/%2e%2e/board.key",
+        "/..%5cboard.key",
+        "/api/objects/..%2f..%2fboard.key",
+        "/api/objects/../../board.key",
+        "/static/board.css%00.html",
+        "/\\..\\board.key",
+        "/%0d%0aSet-Cookie:x",
+    ],
+)
+def test_a_path_that_climbs_is_refused(published: tuple[str, dict[str, str]], path: str) -> None:
+    answer = raw(
+        published[0], f"GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n".encode()
+    )
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert b'"code":"unsafe_name"' in answer
+    assert b"frame-ancestors" in answer
+
+
+@pytest.mark.parametrize(
+    "digits", ["0" * 63, "0" * 65, "A" * 64, "g" * 64, "sha256:" + "0" * 64, "٠" * 64, "x"]
+)
+@pytest.mark.parametrize("where", ["objects", "submissions"])
+def test_odd_hex_is_refused(published: tuple[str, dict[str, str]], where: str, digits: str) -> None:
+    answer = HTTP.get(f"{published[0]}/api/{where}/{digits}")
+    assert refusal(answer) == (400, "unsafe_name")
+
+
+def test_board_files_are_not_served(published: tuple[str, dict[str, str]]) -> None:
+    for path in ("/board.key", "/index.sqlite", "/log/00000000.json", "/static/../board.key"):
+        assert HTTP.get(published[0] + path).status_code == 404
+
+
+def test_another_method_is_refused(published: tuple[str, dict[str, str]]) -> None:
+    url, _ = published
+    for method, path in (("POST", "/api/board"), ("DELETE", f"/api/objects/{'0' * 64}")):
+        assert refusal(HTTP.request(method, url + path)) == (405, "method_not_allowed")
+
+
+# Uploads.
+
+
+def test_an_artefact_goes_in_once_and_comes_out_as_it_was(
+    url: str, store: Store, key: SigningKey
+) -> None:
+    data = linear_onnx(1)
+    path = f"{url}/api/objects/{hex_of(sha256(data))}"
+    assert HTTP.head(path).status_code == 404
+    assert put(url, key, data).status_code == 201
+    assert put(url, key, data).status_code == 200
+    assert HTTP.head(path).status_code == 200
+    assert HTTP.get(path).content == data
+    assert store.object_bytes(sha256(data)) == data
+    assert store.uploads(key.public, "2000-01-01T00:00:00Z") == len(data)
+
+
+def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
+    before = files_of(store)
+    answer = put(url, key, b"these", digest=sha256(b"others"))
+    assert refusal(answer) == (422, "artefact_digest")
+    assert files_of(store) == before
+
+
+def test_an_upload_without_a_signature_is_refused(url: str, key: SigningKey) -> None:
+    path = f"{url}/api/objects/{hex_of(sha256(b'x'))}"
+    other = intake.upload_header(key, sha256(b"y"))
+    forged = intake.upload_header(key, sha256(b"x")).replace(
+        key.public, SigningKey.generate().public
+    )
+    for header in (None, "", "Bearer x", other, forged, "SME-Ed25519 " + "x" * 10_000):
+        headers = {} if header is None else {"Authorization": header}
+        answer = HTTP.put(path, content=b"x", headers=headers)
+        assert refusal(answer) == (403, "bad_signature")
+
+
+@pytest.mark.parametrize("minutes", [-11, 11, 10**6])
+def test_an_upload_signed_at_another_time_is_refused(
+    url: str, key: SigningKey, minutes: int
+) -> None:
+    moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
+    header = intake.upload_header(key, sha256(b"x"), utc(moment))
+    assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
+
+
+def test_a_time_that_is_no_time_is_refused(url: str, key: SigningKey) -> None:
+    header = intake.upload_header(key, sha256(b"x"), "2026-02-31T00:00:00Z")
+    assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
+
+
+def test_an_upload_that_is_too_large_is_refused_by_its_length(
+    store: Store, key: SigningKey, url: str
+) -> None:
+    limit = store.document.limits.artefact_bytes
+    header = intake.upload_header(key, sha256(b"x"))
+    start = time.process_time()  # the server is a thread of this process
+    answer = raw(
+        url,
+        (
+            f"PUT /api/objects/{hex_of(sha256(b'x'))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {header}\r\nContent-Length: {limit + 1}\r\n\r\n"
+        ).encode(),
+    )
+    assert answer.startswith(b"HTTP/1.1 413 ")
+    assert b'"code":"too_large"' in answer
+    assert time.process_time() - start < 1.0
+
+
+def test_an_upload_without_a_length_is_stopped_at_the_limit(
+    tmp_path: Path, key: SigningKey
+) -> None:
+    with tiny_board(tmp_path / "b", limits={"artefact_bytes": 100_000}) as store:
+        before = files_of(store)
+        with serving(store.folder.path) as url:
+
+            def endless() -> Iterator[bytes]:
+                for _ in range(40):
+                    yield b"x" * 5000
+
+            digest = sha256(b"x" * 200_000)
+            headers = {"Authorization": intake.upload_header(key, digest)}
+            answer = HTTP.put(
+                f"{url}/api/objects/{hex_of(digest)}", content=endless(), headers=headers
+            )
+            assert refusal(answer) == (413, "too_large")
+            small = b"y" * 5000
+            headers = {"Authorization": intake.upload_header(key, sha256(small))}
+            answer = HTTP.put(
+                f"{url}/api/objects/{hex_of(sha256(small))}", content=iter([small]), headers=headers
+            )
+            assert answer.status_code == 201
+        store.folder.object(sha256(small)).unlink()
+        assert files_of(store) == before
+
+
+def test_a_length_that_lies_leaves_nothing_behind(url: str, store: Store, key: SigningKey) -> None:
+    before = files_of(store)
+    data = b"z" * 1000
+    for length in (999, 1001):
+        head = (
+            f"PUT /api/objects/{hex_of(sha256(data))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {intake.upload_header(key, sha256(data))}\r\n"
+            f"Connection: close\r\nContent-Length: {length}\r\n\r\n"
+        )
+        parts = urlsplit(url)
+        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
+            connection.sendall(head.encode() + data)
+            connection.shutdown(socket.SHUT_WR)
+            answer = connection.recv(2**16)
+        assert answer.startswith(b"HTTP/1.1 4") or answer == b""
+    assert not store.has_object(sha256(data))
+    assert files_of(store) == before
+
+
+def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
+    store: Store, key: SigningKey
+) -> None:
+    before = files_of(store)
+    head = (
+        f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
+        f"Authorization: {intake.upload_header(key, sha256(b'z'))}\r\n"
+        "Content-Length: 1000000\r\n\r\n"
+    ).encode() + b"z" * 70_000
+    with serving(store.folder.path, upload_seconds=2.0) as url:
+        parts = urlsplit(url)
+        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
+            connection.sendall(head)  # broken off
+        answer = raw(url, head)  # and slow
+        assert answer.startswith(b"HTTP/1.1 408 ")
+        assert b'"code":"too_slow"' in answer
+        assert files_of(store) == before
+        assert put(url, key, b"good").status_code == 201  # and it holds none of the quota
+
+
+def test_the_quota_of_a_key_counts_what_is_under_way(tmp_path: Path, key: SigningKey) -> None:
+    limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600}
+    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
+        head = (
+            f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {intake.upload_header(key, sha256(b'z'))}\r\n"
+            "Content-Length: 600\r\n\r\n"
+        ).encode()
+        parts = urlsplit(url)
+        with socket.create_connection((parts.hostname, parts.port), 60) as connection:
+            connection.sendall(head + b"z")
+            deadline = time.monotonic() + 5
+            while True:  # until the server has read the head
+                answer = put(url, key, bytes(401))
+                if answer.status_code == 429 or time.monotonic() > deadline:
+                    break
+                store.folder.object(sha256(bytes(401))).unlink()
+            assert refusal(answer) == (429, "quota")
+            assert put(url, SigningKey.generate(), bytes(401)).status_code == 201
+
+
+def test_the_quota_of_a_key_is_kept(tmp_path: Path, key: SigningKey) -> None:
+    limits = {"upload_bytes_per_day": 1000}
+    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
+        assert put(url, key, bytes(600)).status_code == 201
+        assert refusal(put(url, key, bytes(500))) == (429, "quota")
+        assert put(url, key, bytes(400)).status_code == 201
+        assert put(url, SigningKey.generate(), bytes(500)).status_code == 201
+
+
+def test_the_quota_of_the_board_is_kept(tmp_path: Path, key: SigningKey) -> None:
+    limits = {"total_bytes": 1000}
+    with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
+        assert put(url, key, bytes(600)).status_code == 201
+        answer = put(url, SigningKey.generate(), bytes(500))
+        assert refusal(answer) == (429, "quota")
+
+
+# Submissions and withdrawals.
+
+
+def post(url: str, text: bytes) -> httpx.Response:
+    return HTTP.post(f"{url}/api/submissions", content=text)
+
+
+def uploaded(
+    url: str, store: Store, key: SigningKey, number: int = 0, **fields: Any
+) -> SignedSubmission:
+    """A tiny submission whose artefacts are uploaded."""
+    signed, artefacts = tiny_submission(store, key, number, **fields)
+    for data in artefacts.values():
+        assert put(url, key, data).status_code in (200, 201)
+    return signed
+
+
+def test_a_submission_is_taken_once(url: str, store: Store, key: SigningKey) -> None:
+    signed = uploaded(url, store, key)
+    first, second = post(url, signed.to_bytes()), post(url, signed.to_bytes())
+    assert (first.status_code, second.status_code) == (202, 200)
+    assert first.json() == second.json()
+    assert first.json()["id"] == signed.id
+    told = HTTP.get(url + first.json()["url"]).json()
+    assert (told["id"], told["status"]) == (signed.id, "waiting")
+    assert [entry.id for entry in store.entries()] == [signed.id]
+
+
+Break = Callable[[Json], Any]
+
+
+def _without(*names: str) -> Break:
+    def change(plain: Json) -> None:
+        for name in names:
+            del plain[name]
+
+    return change
+
+
+def _set(name: str, value: Any) -> Break:
+    def change(plain: Json) -> None:
+        plain[name] = value
+
+    return change
+
+
+def _more_runs(plain: Json) -> None:
+    plain["runs"] = plain["runs"] * 2
+
+
+def _of_suite(plain: Json) -> None:
+    plain["suite"] = {"name": "other-v1", "digest": "sha256:" + "1" * 64}
+
+
+def _of_spec(plain: Json) -> None:
+    plain["runs"][0]["spec"] = "sha256:" + "1" * 64
+
+
+def _started_fewer(plain: Json) -> None:
+    plain["runs_started"] = dict.fromkeys(plain["runs_started"], 0)
+
+
+def _artefact_elsewhere(plain: Json) -> None:
+    plain["runs"][0]["artefact"]["sha256"] = "sha256:" + "1" * 64
+
+
+def _artefact_larger(plain: Json) -> None:
+    plain["runs"][0]["artefact"]["size"] += 1
+
+
+def _named(name: str) -> Break:
+    def change(plain: Json) -> None:
+        plain["method"]["name"] = name
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (_set("score", 0.0), "schema"),
+        (_without("method"), "schema"),
+        (_set("statement", "x" * 2001), "schema"),
+        (_set("created", "yesterday"), "schema"),
+        (_set("created", "2020-01-01T00:00:00Z"), "stale_time"),
+        (_set("created", "2120-01-01T00:00:00Z"), "stale_time"),
+        (_set("created", "2026-02-31T00:00:00Z"), "schema"),
+        (_set("track", "sealed"), "schema"),
+        (_of_suite, "unknown_suite"),
+        (_of_spec, "unknown_spec"),
+        (_more_runs, "duplicate_run"),
+        (_started_fewer, "missing_run"),
+        (_named("<script>alert(1)</script>"), "unsafe_name"),
+        (_named("=HYPERLINK(1)"), "unsafe_name"),
+        (_artefact_elsewhere, "artefact_missing"),
+        (_artefact_larger, "artefact_digest"),
+    ],
+)
+def test_a_submission_that_is_wrong_has_its_code(
+    url: str, store: Store, key: SigningKey, change: Break, code: str
+) -> None:
+    plain = uploaded(url, store, key).submission.to_dict()
+    change(plain)
+    start = time.process_time()  # the server is a thread of this process
+    answer = post(url, _signed_anyway(plain, key))
+    assert time.process_time() - start < 1.0
+    assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
+    assert set(answer.json()) == {"code", "message"}
+    assert store.entries() == []
+
+
+def _signed_anyway(plain: Json, key: SigningKey) -> bytes:
+    """A submission signed rightly, whatever it holds."""
+    import rfc8785
+
+    digest = "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()
+    return json.dumps({"submission": plain, "signature": key.sign("submission", digest)}).encode()
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "code"),
+    [
+        (b"", 400, "not_json"),
+        (b"{", 400, "not_json"),
+        (b"\xff\xfe", 400, "not_json"),
+        (b'{"a": NaN}', 400, "not_json"),
+        (b'{"signature": 1, "signature": 2}', 400, "not_json"),
+        (b"[" * 30_000, 400, "not_json"),
+        (b'{"a":' * 10_000 + b"1" + b"}" * 10_000, 400, "not_json"),
+        (b"1" * 60_000, 400, "not_json"),
+        (b"[]", 422, "schema"),
+        (b"null", 422, "schema"),
+        (b"{}", 403, "bad_signature"),
+        (b'{"submission": {}, "signature": "00"}', 422, "schema"),
+        (b" " * (64 * 2**10 + 1), 413, "too_large"),
+        (b'{"runs": [' + b"{}," * 10**6 + b"{}]}", 413, "too_large"),
+    ],
+)
+def test_a_body_that_is_no_submission_has_its_code(
+    url: str, store: Store, text: bytes, status: int, code: str
+) -> None:
+    start = time.process_time()  # the server is a thread of this process
+    answer = post(url, text)
+    assert time.process_time() - start < 1.0
+    assert refusal(answer) == (status, code)
+    assert store.entries() == []
+
+
+def test_a_body_is_refused_as_soon_as_it_is_too_large(url: str) -> None:
+    head = b"POST /api/submissions HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\n"
+    answer = raw(url, head + b" " * (64 * 2**10 + 1))  # the rest never comes
+    assert answer.startswith(b"HTTP/1.1 413 ")
+    assert b'"code":"too_large"' in answer
+
+
+def test_a_changed_submission_is_not_the_signed_one(
+    url: str, store: Store, key: SigningKey
+) -> None:
+    plain = uploaded(url, store, key).to_dict()
+    plain["submission"]["statement"] = "changed afterwards"
+    assert refusal(post(url, json.dumps(plain).encode())) == (403, "bad_signature")
+
+
+def test_submissions_of_a_key_have_a_quota_that_says_when(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
+        put_submission(store, key, 1)
+        put_submission(store, key, 2)
+        with serving(store.folder.path) as url:
+            answer = post(url, uploaded(url, store, key, 3).to_bytes())
+            assert refusal(answer) == (429, "quota")
+            received = store.submissions_of(key.public, "2000-01-01T00:00:00Z")[0]
+            tomorrow = datetime.datetime.fromisoformat(received) + datetime.timedelta(days=1)
+            assert f"after {utc(tomorrow)}" in answer.json()["message"]
+            other = SigningKey.generate()
+            assert post(url, uploaded(url, store, other, 4).to_bytes()).status_code == 202
+
+
+def test_a_board_takes_only_so_many_that_wait(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
+        put_submission(store, key, 1)
+        with serving(store.folder.path) as url:
+            answer = post(url, uploaded(url, store, SigningKey.generate(), 2).to_bytes())
+            assert refusal(answer) == (429, "quota")
+
+
+def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: SigningKey) -> None:
+    signed = uploaded(url, store, key)
+    post(url, signed.to_bytes())
+    path = f"{url}/api/withdrawals"
+    stranger = intake.withdrawal_of(signed.id, SigningKey.generate())
+    answer = HTTP.post(path, json=stranger.to_dict())
+    assert refusal(answer) == (403, "bad_signature")
+    unknown = intake.withdrawal_of("sha256:" + "0" * 64, key)
+    assert refusal(HTTP.post(path, json=unknown.to_dict())) == (404, "unknown_submission")
+    own = intake.withdrawal_of(signed.id, key, "a bug")
+    for _ in range(2):
+        answer = HTTP.post(path, json=own.to_dict())
+        assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")
+    assert refusal(post(url, signed.to_bytes())) == (410, "withdrawn")
+    told = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}").json()
+    assert told["withdrawal"] == own.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "code"),
+    [
+        (b"{", 400, "not_json"),
+        (b"{}", 422, "schema"),
+        (b"[" * 60_000, 400, "not_json"),
+        (b" " * 70_000, 413, "too_large"),
+    ],
+)
+def test_a_body_that_is_no_withdrawal_has_its_code(
+    url: str, text: bytes, status: int, code: str
+) -> None:
+    assert refusal(HTTP.post(f"{url}/api/withdrawals", content=text)) == (status, code)
+
+
+# Faults, and `serve`.
+
+
+def test_a_fault_of_the_server_is_told_to_its_log_only(
+    url: str, store: Store, key: SigningKey, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = linear_onnx(5)
+    put(url, key, data)
+    path = store.folder.object(sha256(data))
+    path.chmod(0o644)
+    path.write_bytes(b"rotten")
+    answer = HTTP.get(f"{url}/api/objects/{hex_of(sha256(data))}")
+    assert refusal(answer) == (500, "internal")
+    assert str(store.folder.path) not in answer.text
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    assert any("failed" in record.message and record.exc_info for record in caplog.records)
+
+
+def test_every_code_of_the_server_is_explained() -> None:
+    from leaderboard.errors import CODES
+    from leaderboard.web import app as server
+
+    source = Path(server.__file__).read_text()
+    used = set(re.findall(r'Refusal\(\s*"(\w+)"', source)) | set(server._STATUS)
+    assert used <= set(HTTP_CODES) | set(CODES)
+    assert not set(HTTP_CODES) & set(CODES)
+
+
+@pytest.mark.parametrize("signal_name", ["SIGINT", "SIGTERM"])
+def test_serve_scores_beside_and_stops_cleanly(
+    tmp_path: Path, key: SigningKey, signal_name: str
+) -> None:
+    with tiny_board(tmp_path / "board") as store:
+        intake.submit_references(store)
+        with serving_process(store.folder.path, workers=1) as (url, process):
+            deadline = time.monotonic() + 60
+            while store.waiting() and time.monotonic() < deadline:
+                assert process.poll() is None
+                time.sleep(0.05)
+            assert HTTP.get(url).status_code == 200
+            children = _children(process.pid)
+            assert len(children) >= 2
+            process.send_signal(getattr(signal, signal_name))
+            _, err = process.communicate(timeout=20)
+        assert (process.returncode, err) == (0, "")
+        # Multiprocessing's own tracker ends by itself, a moment after those that it watched.
+        deadline = time.monotonic() + 30
+        while [child for child in children if _is_alive(child)] and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not [child for child in children if _is_alive(child)]
+
+
+def _children(pid: int) -> list[int]:
+    """All processes under this one."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in map(int, (task / "children").read_text().split()):
+            found += [child, *_children(child)]
+    return found
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_serve_says_where_nothing_can_listen(store: Store) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(BoardError, match="cannot listen here"),
+    ):
+        serve(store.folder.path, port=taken.getsockname()[1], workers=0)

@@ -1,0 +1,263 @@
+from __future__ import annotations
+
+import http.server
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import SignedSubmission
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.store import Store
+from leaderboard.web import client
+from sme_registry.errors import OptionError
+from tests.leaderboard.conftest import tiny_board, tiny_submission
+from tests.leaderboard.serving import serving
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_WAITS", (0.01, 0.01))
+
+
+@pytest.fixture
+def url(store: Store) -> Iterator[str]:
+    with serving(store.folder.path) as url:
+        yield url
+
+
+def bundle_of(
+    folder: Path, store: Store, key: SigningKey, number: int = 0, **fields: Any
+) -> tuple[Path, SignedSubmission]:
+    """A bundle's folder of a tiny submission."""
+    signed, artefacts = tiny_submission(store, key, number, **fields)
+    (folder / "artefacts").mkdir(parents=True)
+    (folder / "submission.json").write_bytes(signed.to_bytes())
+    for digest, data in artefacts.items():
+        (folder / "artefacts" / f"{hex_of(digest)}.onnx").write_bytes(data)
+    return folder, signed
+
+
+Script = Callable[[str, str], tuple[int, bytes] | None]
+
+
+@contextmanager
+def scripted(script: Script) -> Iterator[tuple[str, list[str]]]:
+    """A server that answers as told (None: it hangs up); yields its URL and what it was asked."""
+    asked: list[str] = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def answer(self) -> None:
+            asked.append(f"{self.command} {self.path}")
+            self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            answer = script(self.command, self.path)
+            if answer is None:
+                self.close_connection = True
+                return
+            status, body = answer
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        do_GET = do_HEAD = do_PUT = do_POST = answer
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}", asked
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_bundle_arrives_whole_and_once(
+    tmp_path: Path, url: str, store: Store, key: SigningKey
+) -> None:
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    seen: list[tuple[int, int]] = []
+    assert client.submit(url, folder, key, progress=lambda *at: seen.append(at)) == signed.id
+    assert client.submit(url + "/", folder, key) == signed.id
+    assert seen == [(1, 1)]
+    assert [entry.id for entry in store.entries()] == [signed.id]
+    for run in signed.submission.runs:
+        assert run.artefact is not None
+        assert store.has_object(run.artefact.sha256)
+
+
+def test_the_status_is_that_of_the_board(
+    tmp_path: Path, url: str, store: Store, key: SigningKey
+) -> None:
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    with pytest.raises(Rejection, match="unknown_submission"):
+        client.status(url, signed.id)
+    client.submit(url, folder, key)
+    assert client.status(url, signed.id)["status"] == "waiting"
+    client.withdraw(url, signed.id, key, "a bug")
+    assert client.status(url, hex_of(signed.id))["status"] == "withdrawn"
+    withdrawal = store.withdrawal(signed.id)
+    assert withdrawal is not None
+    assert withdrawal.withdrawal.reason == "a bug"
+
+
+def test_a_stranger_cannot_withdraw(
+    tmp_path: Path, url: str, store: Store, key: SigningKey
+) -> None:
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    client.submit(url, folder, key)
+    with pytest.raises(Rejection) as caught:
+        client.withdraw(url, signed.id, SigningKey.generate())
+    assert caught.value.code == "bad_signature"
+
+
+def test_a_refusal_has_the_boards_own_code_and_words(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"upload_bytes_per_day": 10}) as store:
+        folder, _ = bundle_of(tmp_path / "bundle", store, key)
+        with serving(store.folder.path) as url, pytest.raises(Rejection) as caught:
+            client.submit(url, folder, key)
+    assert caught.value.code == "quota"
+    assert "within 24 hours" in caught.value.message
+
+
+def test_what_the_board_has_is_not_sent_again(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    told = json.dumps({"id": signed.id}).encode()
+    with scripted(lambda method, _: (200, b"" if method == "HEAD" else told)) as (url, asked):
+        client.submit(url, folder, key)
+    assert [line.split()[0] for line in asked] == ["HEAD", "POST"]
+
+
+def test_requests_that_got_lost_are_sent_again(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    folder, signed = bundle_of(tmp_path / "bundle", store, key)
+    answers = {
+        "HEAD": iter([None, (404, b"")]),
+        "PUT": iter([None, (503, b"<html>"), (201, b"{}")]),
+        "POST": iter([None, (202, json.dumps({"id": signed.id}).encode())]),
+    }
+    with scripted(lambda method, _: next(answers[method])) as (url, asked):
+        assert client.submit(url, folder, key) == signed.id
+    methods = [line.split()[0] for line in asked]
+    assert methods == ["HEAD"] * 2 + ["PUT"] * 3 + ["POST"] * 2
+
+
+def test_a_board_that_is_away_is_given_up(tmp_path: Path, store: Store, key: SigningKey) -> None:
+    folder, _ = bundle_of(tmp_path / "bundle", store, key)
+    with scripted(lambda *_: None) as (url, asked), pytest.raises(BoardError, match="reached"):
+        client.submit(url, folder, key)
+    assert len(asked) == 3
+    with pytest.raises(BoardError, match="reached"):  # nothing listens there any more
+        client.status(url, "0" * 64)
+
+
+def test_a_refusal_is_not_tried_again(key: SigningKey) -> None:
+    no = json.dumps({"code": "quota", "message": "none left"}).encode()
+    with (
+        scripted(lambda *_: (429, no)) as (url, asked),
+        pytest.raises(Rejection, match="none left"),
+    ):
+        client.withdraw(url, "0" * 64, key)
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("status", "body"),
+    [
+        (200, b"<html>a login page</html>"),
+        (200, b"[]"),
+        (200, b'{"id": "sha256:1"}'),
+        (302, b""),
+        (418, b'{"code": ["quota"], "message": {}}'),
+        (500, b'{"code": "internal", "message": "\\u001b[2J"}'),
+        (200, b"[" * 100_000),
+    ],
+)
+def test_what_is_no_board_is_said_so(status: int, body: bytes, key: SigningKey) -> None:
+    with scripted(lambda *_: (status, body)) as (url, _), pytest.raises(BoardError) as caught:
+        client.status(url, "0" * 64)
+    assert str(caught.value).isprintable()
+
+
+def test_an_endless_answer_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_MAX_ANSWER", 1000)
+    with (
+        scripted(lambda *_: (200, b" " * 5000)) as (url, _),
+        pytest.raises(BoardError, match="more than 1,000 bytes"),
+    ):
+        client.status(url, "0" * 64)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "board",
+        "ftp://127.0.0.1/",
+        "file:///etc/passwd",
+        "http://",
+        "http://127.0.0.1:99999x",
+        "http://user:word@127.0.0.1",
+        "https://board.example/?next=1",
+        "http://board.example",
+        "http://10.0.0.1:8000",
+        "http://localhost.example",
+    ],
+)
+def test_a_url_that_is_none_of_a_board_is_refused(url: str) -> None:
+    with pytest.raises(OptionError, match="url="):
+        client.status(url, "0" * 64)
+
+
+@pytest.mark.parametrize(
+    ("url", "near"),
+    [
+        ("http://127.0.0.1:8000/", True),
+        ("http://[::1]:8000", True),
+        ("http://localhost:8000/board/", True),
+        ("https://board.example/", False),
+    ],
+)
+def test_plain_http_is_for_this_machine(url: str, near: bool) -> None:
+    import httpx
+
+    assert client._checked(httpx.URL, url, insecure=False) == (url.rstrip("/"), near)
+
+
+def test_plain_http_elsewhere_has_to_be_asked_for() -> None:
+    import httpx
+
+    url = "http://board.example:8000"
+    assert client._checked(httpx.URL, url, insecure=True) == (url, False)
+
+
+def test_an_id_that_is_none_is_refused(key: SigningKey) -> None:
+    for id in ("", "x", "sha256:" + "0" * 63, "../" * 30):
+        with pytest.raises(OptionError, match="id="):
+            client.status("http://127.0.0.1:1", id)
+        with pytest.raises(OptionError, match="id="):
+            client.withdraw("http://127.0.0.1:1", id, key)
+
+
+def test_an_artefact_that_was_changed_is_not_sent(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    folder, _ = bundle_of(tmp_path / "bundle", store, key)
+    for path in (folder / "artefacts").iterdir():
+        path.write_bytes(bytes(path.stat().st_size))
+    with scripted(lambda *_: (404, b"")) as (url, asked), pytest.raises(Rejection) as caught:
+        client.submit(url, folder, key)
+    assert caught.value.code == "artefact_digest"
+    assert not [line for line in asked if line.startswith("PUT")]

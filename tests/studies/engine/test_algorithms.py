@@ -1,0 +1,131 @@
+"""`uses`: every kind of name, and what is said of those that lead nowhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.studies.engine.algorithms import find_algorithm, new_learner, reference_name
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+SPEC = SMESpec(state_dim=2, action_dim=2, horizon=20)
+MODULE = """
+from stable_baselines3 import PPO
+number = 3
+def small(env, *, seed, width=8):
+    return PPO("MlpPolicy", env, seed=seed, device="cpu", policy_kwargs={"net_arch": [width]})
+def nothing(env, *, seed):
+    return None
+"""
+
+
+@pytest.fixture
+def env() -> Any:
+    from sme_registry.sb3 import SMEVecEnv
+
+    return SMEVecEnv(SPEC)
+
+
+@pytest.fixture
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    (tmp_path / "own_learners.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("own_learners", None)
+
+
+def made(uses: str, env: Any, **hyperparameters: Any) -> Any:
+    return new_learner(uses, env, seed=1, steps=100, hyperparameters=hyperparameters)
+
+
+@pytest.mark.parametrize("name", ["PPO", "ppo", "Td3", "SAC", "A2C", "DDPG"])
+def test_sb3s_algorithms_are_found_in_any_case(name: str) -> None:
+    assert find_algorithm(name) is getattr(sb3, name.upper())
+
+
+def test_a_class_of_sb3s_kind_is_used_as_it_is(env: Any) -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    tqc = made("sb3_contrib:TQC", env, top_quantiles_to_drop_per_net=3, train_freq=[2, "episode"])
+    assert type(tqc) is contrib.TQC
+    assert tqc.top_quantiles_to_drop_per_net == 3
+    assert tqc.train_freq.frequency == 2
+    assert tqc.seed == 1
+    assert tqc.replay_buffer.buffer_size == 101
+    assert tqc.learn(10).num_timesteps >= 10
+
+
+def test_the_replay_buffer_keeps_the_size_that_was_asked_for(env: Any) -> None:
+    assert made("TD3", env, buffer_size=50).replay_buffer.buffer_size == 50
+    assert made("TD3", env).replay_buffer.buffer_size == 101
+
+
+def test_a_function_of_a_module_in_this_folder_makes_the_learner(
+    env: Any, own_module: Path
+) -> None:
+    learner = made("own_learners:small", env, width=5)
+    assert learner.policy.net_arch == [5]
+
+
+def test_an_installed_entry_point_is_found_by_its_name(
+    env: Any, own_module: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = own_module / "own_learners-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-learners\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[sme_registry.algorithms]\nsmall-ppo = own_learners:small\nlost = own_learners:lost\n"
+    )
+    monkeypatch.syspath_prepend(str(own_module))
+    assert made("small-ppo", env).policy.net_arch == [8]
+    with pytest.raises(UnknownNameError, match="Did you mean 'small-ppo'"):
+        find_algorithm("smal-ppo")
+    with pytest.raises(OptionError, match="entry point 'own_learners:lost' cannot be imported"):
+        find_algorithm("lost")
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("TD4", UnknownNameError, "Did you mean 'TD3'"),
+        ("reference:linear", OptionError, "cannot be imported"),
+        ("no_such_module:make", OptionError, "cannot be imported: ModuleNotFoundError"),
+        ("own_learners:smal", OptionError, "AttributeError.*Did you mean 'small'"),
+        ("own_learners:number", OptionError, "is a int: must be a class"),
+    ],
+)
+def test_a_name_that_leads_nowhere_is_explained(
+    name: str, error: type[Exception], said: str, own_module: Path
+) -> None:
+    with pytest.raises(error, match=said):
+        find_algorithm(name)
+
+
+def test_a_reference_is_told_from_what_learns() -> None:
+    assert reference_name("reference:constant") == "constant"
+    assert reference_name("PPO") is None
+    with pytest.raises(UnknownNameError, match="must be one of reference:optimal"):
+        reference_name("reference:nobody")
+
+
+@pytest.mark.parametrize(
+    ("uses", "settings", "said"),
+    [
+        ("TD3", {"learning_rat": 0.1}, "Did you mean 'learning_rate'"),
+        ("PPO", {"seed": 3}, "PPO has none of this name"),
+        ("SAC", {"policy_kwargs": {"depth": 3}}, "refuses the task or its hyperparameters"),
+        ("own_learners:small", {"depth": 3}, "unexpected keyword argument 'depth'"),
+        ("own_learners:nothing", {}, "made a NoneType, which has no learn and no predict"),
+    ],
+)
+def test_what_an_algorithm_does_not_take_or_make_is_refused(
+    uses: str, settings: dict[str, Any], said: str, env: Any, own_module: Path
+) -> None:
+    with pytest.raises(OptionError, match=said):
+        made(uses, env, **settings)

@@ -1,0 +1,244 @@
+"""A study's cell: what it trains is what SB3 alone would, and what it says of it is exact."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec
+from sme_registry.errors import (
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.spec.study import Cell
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.result import CellResult
+
+SPEC = SMESpec(state_dim=2, action_dim=2, horizon=20)
+
+
+def cell(uses: str = "TD3", **changes: Any) -> Cell:
+    fields: dict[str, Any] = {
+        "spec": SPEC,
+        "uses": uses,
+        "hyperparameters": {},
+        "action_range": "symmetric",
+        "seed": 3,
+        "steps": 130,
+        "evaluations": 4,
+        "evaluation_episodes": 3,
+        "protocol": {"states_per_region": 100},
+    }
+    return Cell(**{**fields, **changes})
+
+
+def without_timing(result: CellResult) -> dict[str, Any]:
+    return {field: value for field, value in result.to_dict().items() if field != "timing"}
+
+
+class Searcher:
+    """A learner of another make: keeps the constant action that paid most on one try."""
+
+    def __init__(self, env: Any, seed: int, spread: float) -> None:
+        self.env, self.spread = env, spread
+        self.generator = np.random.default_rng(seed)
+        self.best, self.action = -1.0, np.zeros(env.action_space.shape, np.float32)
+
+    def learn(self, total_timesteps: int) -> None:
+        self.env.reset()
+        for _ in range(total_timesteps):
+            tried: Any = self.generator.uniform(-self.spread, self.spread, self.action.shape)
+            reward = float(self.env.step(tried[None])[1][0])
+            if reward > self.best:
+                self.best, self.action = reward, tried.astype(np.float32)
+
+    def predict(self, observation: Any, *, deterministic: bool) -> Any:
+        assert deterministic
+        return np.tile(self.action, (len(observation), 1))
+
+
+class Idler(Searcher):
+    def learn(self, total_timesteps: int) -> None:
+        super().learn(total_timesteps // 2)
+
+
+def search(env: Any, *, seed: int, spread: float = 1.0) -> Searcher:
+    return Searcher(env, seed, spread)
+
+
+def idle(env: Any, *, seed: int) -> Searcher:
+    return Idler(env, seed, 1.0)
+
+
+@pytest.fixture(scope="module")
+def td3(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellResult, Path]:
+    pytest.importorskip("stable_baselines3")
+    path = tmp_path_factory.mktemp("models") / "model.zip"
+    return run_cell(cell(), model_path=path), path
+
+
+def test_the_same_cell_gives_the_same_result(td3: tuple[CellResult, Path]) -> None:
+    assert without_timing(run_cell(cell())) == without_timing(td3[0])
+    assert without_timing(run_cell(cell(seed=4))) != without_timing(td3[0])
+
+
+def test_a_result_survives_its_file(td3: tuple[CellResult, Path]) -> None:
+    result = td3[0]
+    assert CellResult.from_dict(result.to_dict()) == result
+    assert result.key == cell().digest
+    assert result.cell == cell()
+    assert {"torch", "stable_baselines3", "sme_registry"} <= result.versions.keys()
+
+
+def test_it_learns_what_sb3_alone_would_learn(td3: tuple[CellResult, Path]) -> None:
+    from stable_baselines3 import TD3
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    from sme_registry.sb3 import SMEVecEnv
+    from sme_registry.training.algorithms import one_thread
+
+    regrets: list[float] = []
+
+    class Listen(BaseCallback):  # type: ignore[misc, unused-ignore]
+        def _on_step(self) -> bool:
+            regrets.extend(info["regret"] for info in self.locals["infos"])
+            return True
+
+    with one_thread():
+        alone = TD3("MlpPolicy", SMEVecEnv(SPEC), seed=3, device="cpu").learn(130, Listen())
+    result, path = td3
+    kept = TD3.load(path, device="cpu")
+    for ours, theirs in zip(kept.policy.parameters(), alone.policy.parameters(), strict=True):
+        assert bool((ours == theirs).all())
+    assert result.online_regret == pytest.approx(np.mean(regrets), abs=1e-12)
+
+
+def test_evaluating_changes_nothing_of_the_training(td3: tuple[CellResult, Path]) -> None:
+    silent = run_cell(cell(evaluations=0))
+    assert silent.curve.steps == ()
+    assert silent.online_regret == td3[0].online_regret
+    assert silent.report == td3[0].report
+
+
+def test_evaluations_are_evenly_spaced_and_the_last_is_at_the_end(
+    td3: tuple[CellResult, Path],
+) -> None:
+    curve = td3[0].curve
+    assert curve.steps == (32, 65, 98, 130)
+    assert {len(column) for column in curve.to_dict().values()} == {4}
+    assert all(0 <= value <= 20 for value in curve.episode_return)
+    assert curve.length == (20.0,) * 4
+    for returned, regret in zip(curve.episode_return, curve.mean_regret, strict=True):
+        assert returned == pytest.approx(20 * (1 - regret))
+
+
+def test_on_policy_training_ends_with_its_last_rollout() -> None:
+    result = run_cell(cell("PPO", steps=90, hyperparameters={"n_steps": 50, "batch_size": 25}))
+    assert result.curve.steps == (22, 45, 68, 100)
+    assert result.report.policy == "PPO"
+
+
+def test_more_evaluations_than_steps_are_all_made() -> None:
+    assert run_cell(cell(steps=2, evaluations=5)).curve.steps == (0, 1, 1, 2, 2)
+
+
+def test_without_steps_what_is_judged_is_untrained() -> None:
+    result = run_cell(cell(steps=0, evaluations=2))
+    assert result.curve.steps == (0, 0)
+    assert result.online_regret is None
+    assert result.timing.steps_per_second == 0.0
+
+
+def test_seconds_add_up(td3: tuple[CellResult, Path]) -> None:
+    timing = td3[0].timing
+    parts = timing.training, timing.environment, timing.evaluation
+    assert min(parts) > 0.0
+    assert sum(parts) <= timing.total
+    learning = timing.training + timing.environment
+    assert timing.steps_per_second == pytest.approx(130 / learning)
+
+
+def test_progress_is_told_up_to_the_end() -> None:
+    told: list[tuple[int, int]] = []
+    run_cell(cell("PPO", hyperparameters={"n_steps": 50}), lambda *now: told.append(now))
+    assert told[0] == (0, 130)
+    assert told[-1] == (130, 130)
+    assert told == sorted(told)
+
+
+def test_nothing_is_written_that_was_not_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    run_cell(cell(steps=20))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_unit_action_range_is_trained_in_and_recorded() -> None:
+    unit, symmetric = (
+        run_cell(cell("PPO", action_range=range_, steps=32, hyperparameters={"n_steps": 32}))
+        for range_ in ("unit", "symmetric")
+    )
+    assert (unit.report.action_range, symmetric.report.action_range) == ("unit", "symmetric")
+    # An untrained Gaussian's mean is 0: an end of the one range, and the middle of the other.
+    assert unit.report.regions[0].normalised_regret > 1.5
+    assert symmetric.report.regions[0].normalised_regret == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_learner_of_another_make_is_evaluated_when_it_is_due() -> None:
+    uses = "tests.studies.test_cell:search"
+    result = run_cell(cell(uses, hyperparameters={"spread": 0.5}))
+    assert result.curve.steps == (32, 65, 98, 130)
+    assert 0.0 < (result.online_regret or 0.0) < 1.0
+    # A constant action: its return no longer changes once the best try is found.
+    assert result.report.regions[0].similarity > 0.6
+
+
+def test_a_learner_that_stops_early_is_refused() -> None:
+    with pytest.raises(PolicyError, match="returned after 65 steps"):
+        run_cell(cell("tests.studies.test_cell:idle"))
+
+
+def test_a_reference_is_judged_as_often_as_a_learner_would_be() -> None:
+    result = run_cell(cell("reference:optimal"))
+    assert result.curve.steps == (32, 65, 98, 130)
+    assert result.curve.mean_regret == pytest.approx((0,) * 4, abs=1e-6)
+    assert result.online_regret is None
+    assert result.timing.training == 0.0
+    constant = run_cell(cell("reference:constant"))
+    assert len(set(constant.curve.episode_return)) == 4
+    assert constant.curve != run_cell(cell("reference:constant", seed=4)).curve
+    assert constant.report.regions[0].normalised_regret == pytest.approx(1.0)
+
+
+def test_episodes_may_end_early() -> None:
+    result = run_cell(cell("reference:constant", spec=SPEC.derive(D=0.2), evaluation_episodes=50))
+    assert all(1 <= length < 20 for length in result.curve.length)
+
+
+def test_what_cannot_be_run_is_refused() -> None:
+    team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
+    with pytest.raises(SpecError, match=r"spec\.team: must be null: .* this one is for 2"):
+        Cell.from_dict({**cell().to_dict(), "spec": team.to_dict()})
+    with pytest.raises(OptionError, match="has none"):
+        run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
+    with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):
+        run_cell(cell("reference:liner"))
+
+
+def test_without_sb3_a_reference_runs_and_a_learner_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)  # as if it were not installed
+    assert run_cell(cell("reference:linear")).online_regret is None
+    with pytest.raises(MissingDependencyError, match="pip install 'sme-registry"):
+        run_cell(cell("PPO"))

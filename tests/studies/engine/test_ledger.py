@@ -1,0 +1,160 @@
+"""The folder of a study: whole files, locks that end with their process, nothing misread."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.spec import Cell
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellFailure, CellResult
+from tests.studies.cells import small_file, wait_for
+
+FILE = small_file()
+CELL, OTHER = (planned.cell for planned in FILE.plan.cells)
+
+HOLDER = """
+import sys, time
+from sme_registry.studies.engine.ledger import Ledger
+lock = Ledger(sys.argv[1]).lock(sys.argv[2])
+print("holds" if lock else "not", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def result() -> CellResult:
+    return run_cell(CELL)
+
+
+def failed(cell: Cell) -> CellFailure:
+    return CellFailure(key=cell.digest, cell=cell, error="E", traceback="", versions={})
+
+
+def result_path(folder: Path, cell: Cell) -> Path:
+    return folder / "cells" / f"{cell.digest.removeprefix('sha256:')}.json"
+
+
+def test_a_result_is_read_back_as_it_was_and_ends_the_failure_before_it(
+    tmp_path: Path, result: CellResult
+) -> None:
+    ledger = Ledger(tmp_path / "study")
+    assert ledger.results() == {}
+    ledger.write(failed(CELL))
+    assert ledger.failure(CELL.digest) == failed(CELL)
+    ledger.write(result, b"a model")
+    assert ledger.result(CELL.digest) == result
+    assert ledger.results() == ledger.results([OTHER.digest, CELL.digest]) == {CELL.digest: result}
+    assert ledger.failures() == {}
+    assert ledger.model_path(CELL.digest).read_bytes() == b"a model"
+
+
+def test_a_lock_is_had_once_until_it_is_released(tmp_path: Path) -> None:
+    ledger, another = Ledger(tmp_path), Ledger(tmp_path)
+    lock = ledger.lock(CELL.digest)
+    assert lock is not None
+    assert another.lock(CELL.digest) is None
+    assert another.lock(OTHER.digest) is not None
+    assert another.is_running(CELL.digest)
+    lock.release()
+    assert not another.is_running(CELL.digest)
+    assert another.lock(CELL.digest) is not None
+
+
+def test_a_lock_ends_with_the_process_that_held_it_however_that_died(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDER, str(tmp_path), CELL.digest]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "holds\n"
+        assert Ledger(tmp_path).lock(CELL.digest) is None
+        assert Ledger(tmp_path).is_running(CELL.digest)
+        holder.kill()
+        holder.wait()
+    wait_for(lambda: not Ledger(tmp_path).is_running(CELL.digest))
+    assert Ledger(tmp_path).lock(CELL.digest) is not None
+
+
+def test_asking_whether_a_cell_runs_makes_no_file(tmp_path: Path) -> None:
+    assert not Ledger(tmp_path).is_running(CELL.digest)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["half", "other", "not JSON", "edited"])
+def test_a_file_that_is_no_result_of_its_cell_counts_as_absent_and_is_set_aside(
+    damage: str, tmp_path: Path, result: CellResult
+) -> None:
+    said: list[str] = []
+    ledger = Ledger(tmp_path, said.append)
+    ledger.write(result)
+    path = result_path(tmp_path, CELL)
+    text = path.read_text()
+    if damage == "half":
+        path.write_text(text[: len(text) // 2])
+    elif damage == "other":
+        path = path.rename(result_path(tmp_path, OTHER))
+    elif damage == "not JSON":
+        path.write_bytes(b"\x00" * 100)
+    else:
+        path.write_text(json.dumps(json.loads(text) | {"online_regret": "none"}))
+    damaged = path.read_bytes()
+    cell = OTHER if damage == "other" else CELL
+    assert ledger.result(cell.digest) is None
+    assert ledger.results() == {}
+    assert path.read_bytes() == damaged  # reading changes nothing
+    ledger.set_aside(cell.digest)
+    assert not path.exists()
+    assert path.with_name(f"{path.name}.corrupt").read_bytes() == damaged
+    (line,) = said
+    assert str(path) in line
+    assert "runs again" in line
+
+
+def test_a_good_result_is_not_set_aside(tmp_path: Path, result: CellResult) -> None:
+    ledger = Ledger(tmp_path)
+    ledger.write(result)
+    ledger.set_aside(CELL.digest)
+    assert ledger.result(CELL.digest) == result
+
+
+def test_what_a_killed_write_leaves_is_never_read(tmp_path: Path, result: CellResult) -> None:
+    ledger = Ledger(tmp_path)
+    ledger.write_plan(FILE)
+    path = result_path(tmp_path, CELL)
+    path.parent.mkdir()
+    (path.parent / f".{path.name}.x1y2z3").write_text("{")
+    assert ledger.results() == {}
+    assert ledger.plan_file() == FILE
+
+
+def test_a_folder_of_other_files_is_no_study(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(OptionError, match=r"thesis\.tex"):
+        Ledger(tmp_path).plan_file()
+    with pytest.raises(OptionError, match="Not a directory"):
+        Ledger(tmp_path / "thesis.tex").plan_file()
+    assert Ledger(tmp_path / "new").plan_file() is None
+
+
+def test_a_plan_that_was_damaged_is_an_error_and_not_a_new_study(tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text("{")
+    with pytest.raises(SpecError, match="not JSON"):
+        Ledger(tmp_path).plan_file()
+
+
+def test_a_folder_that_cannot_be_written_to_is_a_typed_error(
+    tmp_path: Path, result: CellResult
+) -> None:
+    (tmp_path / "cells").touch()
+    (tmp_path / "locks").touch()
+    with pytest.raises(OptionError, match="cannot be written"):
+        Ledger(tmp_path).write(result)
+    with pytest.raises(OptionError, match="cannot be locked"):
+        Ledger(tmp_path).lock(CELL.digest)
+    assert sorted(os.listdir(tmp_path)) == ["cells", "locks"]

@@ -1,0 +1,101 @@
+"""Cells that learn from data: the same machinery, and what they add."""
+
+from __future__ import annotations
+
+import pytest
+
+from sme_registry.datasets import DatasetRecipe
+from sme_registry.datasets.collect import collect
+from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.spec import Cell, EvaluationProtocol, SMESpec, StudyFile, StudyPlan
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.runner import run_study
+from sme_registry.task import materialize
+
+PROTOCOL = EvaluationProtocol(states_per_region=200)
+
+
+def cell(uses: str = "offline:bc", spec: SMESpec | None = None, **hyperparameters: object) -> Cell:
+    return Cell(
+        spec=spec or SMESpec(state_dim=2, action_dim=1, seed=1),
+        uses=uses,
+        hyperparameters={"nu": 0.5, "transitions": 1000, **hyperparameters},
+        action_range="unit",
+        seed=3,
+        steps=60,
+        evaluations=2,
+        evaluation_episodes=2,
+        protocol=PROTOCOL,
+    )
+
+
+@pytest.mark.parametrize("learner", ["bc", "iql"])
+def test_a_cell_learns_from_the_data_of_its_seed_and_is_judged_as_every_cell(learner: str) -> None:
+    done = run_cell(cell(f"offline:{learner}"))
+    assert done.curve.steps == (30, 60)
+    assert done.online_regret is None
+    assert done.report.protocol == PROTOCOL
+    assert done.offline is not None
+    recipe = DatasetRecipe.from_dict(
+        {
+            "spec": done.cell.spec,
+            "behaviours": [{"kind": "mixture", "nu": 0.5, "weight": 1.0}],
+            "transitions": 1000,
+            "seed": 3,
+            "protocol": PROTOCOL,
+        }
+    )
+    data = collect(recipe, materialize(done.cell.spec), {})
+    assert done.offline.dataset == data.digest
+    assert done.offline.behaviour == float(data.similarities.mean())
+    assert done.offline.score == done.curve.similarity[-1]
+    again = run_cell(cell(f"offline:{learner}"))
+    assert (again.curve, again.report, again.offline) == (done.curve, done.report, done.offline)
+
+
+def test_more_noise_makes_worse_data_and_other_cells() -> None:
+    noisy, clean = run_cell(cell(nu=1.0)), run_cell(cell(nu=0.0))
+    assert noisy.key != clean.key
+    assert noisy.offline is not None
+    assert clean.offline is not None
+    assert clean.offline.behaviour == pytest.approx(1.0)
+    assert noisy.offline.behaviour < 0.97
+
+
+def test_bad_offline_cells_are_refused_in_words() -> None:
+    with pytest.raises(UnknownNameError, match="offline:iql"):
+        run_cell(cell("offline:iq"))
+    with pytest.raises(OptionError, match="nu"):
+        run_cell(cell().model_copy(update={"hyperparameters": {}}))
+    with pytest.raises(SpecError, match="nu"):
+        run_cell(cell(nu=1.5))
+    with pytest.raises(SpecError, match="D"):
+        run_cell(cell(spec=SMESpec(state_dim=2, action_dim=1, D=0.1)))
+
+
+def test_a_study_runs_offline_cells_as_it_runs_others(tmp_path) -> None:
+    setting = {"state_dim": 2, "action_dim": 1}
+    plan = StudyPlan.from_dict(
+        {
+            "classes": [{"name": "tiny", "setting": setting, "seeds": [1]}],
+            "algorithms": [
+                {
+                    "name": "BC (0.5)",
+                    "uses": "offline:bc",
+                    "hyperparameters": {"nu": 0.5, "transitions": 500},
+                }
+            ],
+            "seeds": 1,
+            "steps": 20,
+            "evaluations": 1,
+            "evaluation_episodes": 1,
+            "protocol": PROTOCOL.to_dict(),
+        }
+    )
+    file = StudyFile(name="tiny", version=1, digest=plan.digest, plan=plan)
+    run_study(file, tmp_path / "study", executor="in-process")
+    ledger = Ledger(tmp_path / "study")
+    result = ledger.result(plan.cells[0].cell.digest)
+    assert result is not None
+    assert result.offline is not None

@@ -1,0 +1,107 @@
+"""Cells as tasks of Ray. Nearly all of the time here is Ray's own: 15 to 30 s for each start."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sme_registry.errors import OptionError
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.runner import run_study
+from tests.studies import cells
+from tests.studies.cells import small_file
+
+pytest.importorskip("ray")
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+# In a process of its own: Ray leaves handles to the garbage collector, and threads to whoever is
+# next. Two nodes on this machine; the larger one is removed as soon as cells fill both.
+LOST_NODE = """
+import sys, threading
+from functools import partial
+from pathlib import Path
+from sme_registry.studies.engine.runner import run_study
+from tests.studies import cells
+
+study, notes = map(Path, sys.argv[1:])
+from ray.cluster_utils import Cluster
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+lost = cluster.add_node(num_cpus=2)
+
+def lose():
+    cells.wait_for(lambda: len(cells.pids(notes)) == 3, seconds=200)
+    workers = cells.pids(notes)
+    cluster.remove_node(lost, allow_graceful=False)
+    # A worker outlives its node for a moment, in which it could still end its cell.
+    cells.wait_for(lambda: sum(map(cells.alive, workers)) == 1, seconds=100)
+    (notes / cells.GATE).touch()
+
+losing = threading.Thread(target=lose)
+losing.start()
+run_study(
+    cells.small_file(seeds=6), study, executor="ray", ray=cluster.address,
+    run=partial(cells.gated, notes),
+)
+losing.join()
+cluster.shutdown()
+"""
+
+
+def test_when_a_node_is_lost_its_cells_run_again_and_every_cell_has_one_result(
+    tmp_path: Path,
+) -> None:
+    study, notes = tmp_path / "study", tmp_path / "notes"
+    notes.mkdir()
+    process = subprocess.run(
+        [sys.executable, "-c", LOST_NODE, str(study), str(notes)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=ENVIRONMENT,
+        timeout=300,
+    )
+    assert process.returncode == 0, process.stderr
+    keys = {planned.cell.digest for planned in small_file(seeds=6).plan.cells}
+    assert set(Ledger(study).results()) == keys
+    assert not Ledger(study).failures()
+    began = cells.starts(notes)
+    assert set(began) == keys
+    # Three ran when the node was lost. The two that ran there began once more; no other did.
+    assert sorted(began.values()) == [1, 1, 1, 1, 2, 2]
+
+
+def test_a_local_cluster_is_started_quietly_and_ends_with_the_command(tmp_path: Path) -> None:
+    plan, study = tmp_path / "plan.json", tmp_path / "study"
+    file = small_file(seeds=2, algorithms=["constant", {"name": "bad", "uses": "math:sqrt"}])
+    file.write(plan)
+    sme = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
+    process = subprocess.run(
+        [*sme, "study", "run", str(plan), "-f", str(study), "--ray", "local", "--jobs", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=ENVIRONMENT,
+        timeout=300,
+    )
+    assert process.returncode == 1, process.stderr
+    assert len(Ledger(study).results()) == 2
+    assert len(Ledger(study).failures()) == 2
+    lines = process.stderr.splitlines()
+    ours = ("study small-v1: ", "failed: bad on small", "2 of 4 cells failed")
+    assert [line for line in lines if not line.startswith(ours)] == []
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "127.0.0.1", "127.0.0.1:99999"])
+def test_an_address_that_nobody_answers_at_is_refused_and_nothing_is_written(
+    address: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=r"cannot be reached: .* Give 'local'"):
+        run_study(small_file(), tmp_path / "study", executor="ray", ray=address)
+    assert not (tmp_path / "study").exists()

@@ -1,0 +1,468 @@
+"""Running a study: nothing lost, nothing twice, whatever ends a process or a disk."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellFailure
+from sme_registry.studies.engine.runner import run_study, study_status
+from tests.studies import cells
+from tests.studies.cells import small_file
+
+ROOT = Path(__file__).resolve().parents[2]
+
+DRIVER = """
+import sys
+from functools import partial
+from pathlib import Path
+from sme_registry.studies.engine.runner import run_study
+from tests.studies import cells
+study, notes, seeds, open_for = sys.argv[1:]
+work = partial(cells.gated, Path(notes), open_for=int(open_for))
+run_study(cells.small_file(int(seeds)), study, jobs=2, run=work)
+"""
+# A file may grow no longer than a plan: results are longer.
+FULL_DISK = """
+import resource, sys
+from sme_registry.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
+main()
+"""
+SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
+
+
+@pytest.fixture
+def notes(tmp_path: Path) -> Path:
+    folder = tmp_path / "notes"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    return tmp_path / "study"
+
+
+def quick(file: Any, folder: Path, **options: Any) -> tuple[Any, str]:
+    """Run in this process; the status, and what was said."""
+    said = io.StringIO()
+    options = {"executor": "in-process", "console": Console(file=said, width=200)} | options
+    return run_study(file, folder, **options), said.getvalue()
+
+
+def driver(study: Path, notes: Path, seeds: int, open_for: int = 0) -> subprocess.Popen[str]:
+    arguments = (str(study), str(notes), str(seeds), str(open_for))
+    return subprocess.Popen(
+        [sys.executable, "-c", DRIVER, *arguments], stderr=subprocess.PIPE, text=True
+    )
+
+
+def keys(file: Any) -> set[str]:
+    return {planned.cell.digest for planned in file.plan.cells}
+
+
+def test_every_cell_is_run_once_and_running_again_runs_nothing(study: Path, notes: Path) -> None:
+    file, work = small_file(seeds=3), partial(cells.noted, notes)
+    status, said = quick(file, study, run=work)
+    assert (status.count("done"), len(status.cells)) == (3, 3)
+    assert set(Ledger(study).results()) == keys(file)
+    assert "3 cells · 3 to run · 1 at once" in said
+    again, said = quick(file, study, run=work)
+    assert again == status
+    assert "3 finished before, which are reused · 0 to run" in said
+    assert set(cells.starts(notes).values()) == {1}
+
+
+def test_a_process_of_each_cell_gives_the_same_results_with_one_thread(
+    study: Path, notes: Path, tmp_path: Path
+) -> None:
+    file = small_file(seeds=2)
+    quick(file, tmp_path / "here")
+    before = dict(os.environ)
+    status, _ = quick(
+        file, study, executor="processes", jobs=2, run=partial(cells.surroundings, notes)
+    )
+    assert status.count("done") == 2
+    assert (notes / "threads").read_text() == "1 1"
+    assert dict(os.environ) == before
+    here = Ledger(tmp_path / "here").results()
+    for key, result in Ledger(study).results().items():
+        # This process may have loaded more than the cell's own did, and a report names all of it.
+        ours = here[key].report.model_copy(update={"versions": result.report.versions})
+        assert result.report == ours
+
+
+def test_a_cell_that_raises_is_listed_with_its_error_and_retried_on_request(study: Path) -> None:
+    file = small_file(seeds=3)
+    status, said = quick(file, study, run=cells.raising)
+    assert [status.count(state) for state in ("done", "failed", "waiting")] == [2, 1, 0]
+    (broken,) = status.failed
+    assert broken.planned.run == 1
+    assert broken.failure is not None
+    assert broken.failure.error == "ValueError: this one is broken"
+    assert "in raising" in broken.failure.traceback
+    assert "failed: constant on small, run 1: ValueError: this one is broken" in said
+
+    status, said = quick(file, study, run=cells.raising)
+    assert "1 failed before (--retry runs them again) · 0 to run" in said
+    status, _ = quick(file, study, run=cells.raising, retry_failed=True)
+    assert status.failed[0].failure.attempts == 2
+    status, _ = quick(file, study, retry_failed=True)
+    assert status.count("done") == 3
+    assert not Ledger(study).failures()
+
+
+def test_what_another_run_saw_fail_or_finish_meanwhile_is_not_run_again(
+    study: Path, notes: Path
+) -> None:
+    file = small_file(seeds=3)
+    first, second, third = (planned.cell for planned in file.plan.cells)
+
+    def beside_another(cell: Any, progress: Any, model_path: Any) -> Any:
+        failure = CellFailure(
+            key=second.digest, cell=second, error="theirs", traceback="", versions={}
+        )
+        Ledger(study).write(failure)
+        Ledger(study).write(cells.run_cell(third))
+        return cells.noted(notes, cell)
+
+    status, _ = quick(file, study, run=beside_another)
+    assert set(cells.starts(notes)) == {first.digest}
+    assert (status.count("done"), status.count("failed")) == (2, 1)
+    assert status.failed[0].failure.error == "theirs"
+
+
+def test_a_cell_whose_process_is_killed_fails_and_the_others_go_on(study: Path) -> None:
+    status, _ = quick(small_file(seeds=4), study, executor="processes", jobs=2, run=cells.dying)
+    assert (status.count("done"), status.count("failed")) == (3, 1)
+    failure = status.failed[0].failure
+    assert "killed by SIGKILL" in failure.error
+    assert "Memory may have run out" in failure.error
+    assert failure.traceback == "last words\n"
+
+
+def test_a_cleaner_of_temporary_files_fails_no_cell(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Should the cells' folder ever be another, what is removed is this one, and nobody else's.
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    status, _ = quick(small_file(2), study, executor="processes", jobs=1, run=cells.littering)
+    assert status.count("done") == 2, [cell.failure for cell in status.failed]
+
+
+def test_after_kill_9_only_the_cells_that_ran_are_run_again(study: Path, notes: Path) -> None:
+    with driver(study, notes, seeds=6, open_for=2) as killed:
+        try:
+            # Two have finished, and two wait at the gate.
+            cells.wait_for(lambda: sum(cells.starts(notes).values()) == 4)
+            cells.wait_for(lambda: len(Ledger(study).results()) == 2)
+        finally:
+            killed.kill()
+    children = cells.pids(notes)
+    cells.wait_for(lambda: not any(map(cells.alive, children)))
+    status = study_status(study)
+    assert (status.count("done"), status.count("running")) == (2, 0)
+    finished = set(Ledger(study).results())
+
+    (notes / cells.GATE).touch()
+    status, _ = quick(small_file(seeds=6), study, run=partial(cells.gated, notes))
+    assert status.count("done") == 6
+    begun = cells.starts(notes)
+    assert {key for key, times in begun.items() if times == 1} >= finished
+    assert sum(begun.values()) == 6 + 2
+
+
+def test_two_runs_on_one_folder_share_the_cells_and_each_is_run_once(
+    study: Path, notes: Path
+) -> None:
+    with driver(study, notes, seeds=6) as one, driver(study, notes, seeds=6) as two:
+        try:
+            # All that they hold wait at the gate: two cells each, and no cell twice.
+            cells.wait_for(lambda: sum(cells.starts(notes).values()) == 4)
+            assert study_status(study).count("running") == 4
+            (notes / cells.GATE).touch()
+            said = [process.communicate(timeout=120)[1] for process in (one, two)]
+        finally:
+            one.kill()
+            two.kill()
+    assert [one.returncode, two.returncode] == [0, 0], said
+    assert cells.starts(notes) == dict.fromkeys(keys(small_file(seeds=6)), 1)
+    assert study_status(study).count("done") == 6
+
+
+def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(study: Path, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.json"
+    small_file(algorithms=("constant",), evaluations=100_000, evaluation_episodes=100).write(plan)
+    command = [*SME, "study", "run", str(plan), "--folder", str(study), "--jobs", "2"]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stderr is not None
+        cells.wait_for((study / "plan.json").exists)
+        cells.wait_for(lambda: study_status(study).count("running") == 2)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the children, too
+        said = process.stderr.read()
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == (
+        f"error: interrupted: 0 of 2 cells are finished and kept in {study}. The same command "
+        "goes on from there."
+    )
+    assert "Traceback" not in said
+    assert study_status(study).count("waiting") == 2
+
+
+def test_a_corrupt_result_is_set_aside_and_its_cell_run_again(study: Path, notes: Path) -> None:
+    file, work = small_file(seeds=2), partial(cells.noted, notes)
+    quick(file, study, run=work)
+    path = min((study / "cells").iterdir())
+    path.write_text(path.read_text()[:-100])
+    assert study_status(study).count("waiting") == 1
+    status, said = quick(file, study, run=work)
+    assert status.count("done") == 2
+    assert "Set aside as" in said
+    assert sorted(cells.starts(notes).values()) == [1, 2]
+    assert path.with_name(f"{path.name}.corrupt").exists()
+
+
+def test_of_an_edited_plan_only_the_new_cells_are_run(study: Path, notes: Path) -> None:
+    work = partial(cells.noted, notes)
+    quick(small_file(seeds=2), study, run=work)
+    edited = small_file(seeds=3, algorithms=("optimal", "constant"))
+    status, said = quick(edited, study, run=work)
+    assert status.count("done") == 6
+    assert "The folder's plan was small-v1" in said
+    assert "2 finished before, which are reused · 4 to run" in said
+    assert set(cells.starts(notes).values()) == {1}
+    assert Ledger(study).plan_file() == edited
+    status, _ = quick(small_file(seeds=1), study, run=work)
+    assert (len(status.cells), status.others) == (1, 5)
+    assert len(cells.starts(notes)) == 6
+
+
+def test_only_the_selected_cells_are_run_and_the_plan_stays_whole(study: Path) -> None:
+    file = small_file(seeds=2, algorithms=("optimal", "constant"))
+    status, _ = quick(file, study, only=["algorithm=opt*"])
+    assert {cell.planned.algorithm for cell in status.cells} == {"optimal"}
+    status = study_status(study)
+    assert (status.count("done"), status.count("waiting")) == (2, 2)
+    assert study_status(study, ["algorithm=constant"]).count("waiting") == 2
+
+
+def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(
+    study: Path, tmp_path: Path
+) -> None:
+    plan, small = tmp_path / "plan.json", small_file(seeds=2)
+    small.write(plan)
+    quick(small_file(seeds=1), study)
+    before = {path: path.read_bytes() for path in (study / "cells").iterdir()}
+    command = [sys.executable, "-c", FULL_DISK, "study", "run", str(plan), "-f", str(study)]
+    process = subprocess.run(
+        [*command, "--executor", "in-process"], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 2, process.stderr
+    assert process.stderr.splitlines()[-1].startswith("error: ")
+    assert "cannot be written: File too large" in process.stderr
+    assert "Traceback" not in process.stderr
+    assert {path: path.read_bytes() for path in (study / "cells").iterdir()} == before
+    status, _ = quick(small, study)
+    assert status.count("done") == 2
+
+
+class _Heard(io.StringIO):
+    """What was said, and what is to happen when certain words are."""
+
+    def __init__(self, words: str, then: Any) -> None:
+        super().__init__()
+        self._words, self._then = words, then
+
+    def write(self, text: str) -> int:
+        if self._words in text:
+            self._then()
+        return super().write(text)
+
+
+def test_what_cannot_be_written_now_is_kept_until_there_is_room(study: Path, notes: Path) -> None:
+    file = small_file(seeds=4)
+    Ledger(study).write_plan(file)
+    in_the_way = study / "cells"
+    in_the_way.touch()
+
+    def make_room() -> None:
+        in_the_way.unlink()
+        (notes / cells.GATE).touch()
+
+    # Run 0 ends and cannot be written; run 1 runs until there is room again.
+    console = Console(file=_Heard("No cell is begun until there is room", make_room), width=400)
+    work = partial(cells.gated, notes, open_for=1)
+    status, _ = quick(file, study, executor="processes", jobs=2, run=work, console=console)
+    assert status.count("done") == 4
+    assert set(cells.starts(notes).values()) == {1}
+
+
+@pytest.fixture
+def read_only(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A study of one finished cell that may be read and not be written to, also by root."""
+    folder = Path(tempfile.mkdtemp(prefix="read-only-"))
+    quick(small_file(seeds=1), folder)
+    for path in (*folder.iterdir(), folder):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(65534)
+    yield folder
+    if root:
+        os.seteuid(0)
+    folder.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+def test_a_read_only_folder_is_a_typed_error_and_can_still_be_looked_at(read_only: Path) -> None:
+    with pytest.raises(OptionError, match=r"plan\.json: cannot be written: Permission denied"):
+        quick(small_file(seeds=2), read_only)
+    with pytest.raises(OptionError, match="cannot be locked: Permission denied"):
+        Ledger(read_only).lock(small_file(seeds=2).plan.cells[1].cell.digest)
+    assert study_status(read_only).count("done") == 1
+    status, _ = quick(small_file(seeds=1), read_only)  # nothing to write
+    assert status.count("done") == 1
+
+
+@pytest.mark.parametrize("executor", ["in-process", "processes"])
+def test_models_are_kept_where_that_is_asked_for(executor: str, study: Path) -> None:
+    file = small_file(seeds=2)
+    quick(file, study, executor=executor, run=cells.modelled, only=["class=small"])
+    assert not (study / "models").exists()
+    kept = study.with_name("kept")
+    quick(file, kept, executor=executor, run=cells.modelled, keep_models=True)
+    for key in keys(file):
+        assert Ledger(kept).model_path(key).read_bytes() == key.encode()
+
+
+def test_asking_for_models_too_late_says_how_many_there_are_not(study: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    learner = {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 8, "batch_size": 8}}
+    file = small_file(seeds=2, algorithms=[learner, "constant"], steps=8)
+    _, said = quick(file, study, only=["algorithm=PPO"])
+    assert "no model" not in said
+    status, said = quick(file, study, keep_models=True)
+    assert status.count("done") == 4
+    assert "2 of the finished cells have no model and are not run again" in said
+    assert "a new folder" in said
+    assert not (study / "models").exists()
+    kept = study.with_name("kept")
+    quick(file, kept, keep_models=True)
+    _, said = quick(file, kept, keep_models=True)  # a reference never has a model
+    assert "4 finished before" in said
+    assert "no model" not in said
+
+
+def test_results_of_other_versions_are_reused_and_said_to_be(study: Path) -> None:
+    file = small_file(seeds=3)
+    quick(file, study)
+    ledger = Ledger(study)
+    for planned, numpy in zip(file.plan.cells, ("1.0.0", "1.0.1"), strict=False):
+        result = ledger.result(planned.cell.digest)
+        assert result is not None
+        versions = {**result.versions, "numpy": numpy, "of a package that is not installed": "1"}
+        ledger.write(result.model_copy(update={"versions": versions}))
+    status, said = quick(file, study)
+    assert status.count("done") == 3
+    here = f"(here {np.__version__})"
+    assert (
+        "2 of the reused results were made with other versions than are installed: "
+        f"numpy 1.0.0 {here}, numpy 1.0.1 {here}."
+    ) in " ".join(said.split())
+    fresh = study.with_name("fresh")
+    quick(file, fresh)
+    assert "other versions" not in quick(file, fresh)[1]
+
+
+def test_a_result_of_another_cell_is_a_failure(study: Path) -> None:
+    other = small_file(seeds=3).plan.cells[2].cell
+
+    def mistaken(cell: Any, progress: Any, model_path: Any) -> Any:
+        return cells.run_cell(other)
+
+    status, _ = quick(small_file(seeds=1), study, run=mistaken)
+    assert "the result is of the cell sha256:" in status.failed[0].failure.error
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"jobs": 0}, OptionError, "jobs=0"),
+        ({"executor": "threads"}, UnknownNameError, "must be one of processes"),
+        ({"only": ["class"]}, OptionError, "class=GLOB"),
+        ({"only": ["run=1"]}, OptionError, "class=GLOB"),
+        ({"only": ["algorithm=constnat"]}, UnknownNameError, "Did you mean 'constant'"),
+    ],
+)
+def test_bad_arguments_are_refused_and_nothing_is_written(
+    options: dict[str, Any], error: type[Exception], words: str, study: Path
+) -> None:
+    with pytest.raises(error, match=words):
+        quick(small_file(), study, **options)
+    assert not study.exists()
+
+
+def test_a_misspelt_algorithm_is_one_error_before_anything_is_written(study: Path) -> None:
+    file = small_file(algorithms=[{"name": "T", "uses": "TD33"}])
+    with pytest.raises(UnknownNameError, match="Did you mean 'TD3'"):
+        quick(file, study)
+    assert not study.exists()
+
+
+def test_a_terminal_has_bars_and_anything_else_lines(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sme_registry.studies.engine.progress.SECONDS_BETWEEN_LINES", 0.0)
+    _, said = quick(small_file(seeds=2), study)
+    assert "study small-v1: 1 of 2 cells · about" in said
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=120)
+    status, _ = quick(small_file(seeds=4), study, console=console, run=cells.modelled)
+    assert status.count("done") == 4
+    assert "constant on small, run 3" in screen.getvalue()
+    assert "━" in screen.getvalue()
+
+
+def test_the_command_ends_with_1_where_a_cell_failed_and_lists_it(
+    study: Path, tmp_path: Path
+) -> None:
+    plan = tmp_path / "plan.json"
+    bad = {"name": "bad", "uses": "reference:linear", "hyperparameters": {"slope": 2}}
+    small_file(algorithms=["constant", bad]).write(plan)
+    command = [*SME, "study", "run", str(plan), "-f", str(study), "--executor", "in-process"]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert process.returncode == 1, process.stderr
+    assert "2 of 4 cells failed. The same command with --retry" in process.stderr
+    assert "bad on small, run 0: OptionError: hyperparameters=['slope']" in process.stdout
+    again = subprocess.run([*command, "--retry", "--json"], capture_output=True, check=False)
+    assert again.returncode == 1
+    printed = json.loads(again.stdout)
+    assert (printed["done"], printed["failed"]) == (2, 2)
+    assert [failure["attempts"] for failure in printed["failures"]] == [2, 2]

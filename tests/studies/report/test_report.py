@@ -1,0 +1,391 @@
+"""`sme study report`: whole, deterministic, in words that its numbers bear out."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from sme_registry.errors import OptionError
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report.findings import caveats, comparison, findings
+from sme_registry.studies.report.tables import Analysis
+
+pytest.importorskip("matplotlib")
+
+from sme_registry.cli.app import app
+from sme_registry.studies.report import write_report
+from sme_registry.studies.report.figures import pictures
+
+SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF"}
+FIGURES = {
+    "contrasts-regret", "contrasts-training", "wd-regret", "ood-regret", "regions", "decay",
+    "scores", "profiles-wd", "profiles-ood", "improvement", "learning-curves-k",
+    "learning-curves-r_min", "learning-curves-complexity", "learning-curves-several-axes",
+}  # fmt: skip
+
+
+class Page(HTMLParser):
+    """What a browser would make of the page: tags that close, ids, links, and what it loads."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "input"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.loads: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if "id" in found:
+            self.ids.append(str(found["id"]))
+        if tag == "a":
+            self.links.append(str(found["href"]))
+        if tag == "img":
+            self.images.append(found)
+        self.loads += [str(found[name]) for name in ("src", "data", "srcset") if name in found]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & set(self.open):
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    write_report(finished, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def analysis(finished: Path) -> Analysis:
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    return analyse(file, ledger.results(), draws=300)
+
+
+def without(finished: Path, leave_out: Any) -> Analysis:
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    gone = {planned.cell.digest for planned in file.plan.cells if leave_out(planned)}
+    results = {key: result for key, result in ledger.results().items() if key not in gone}
+    return analyse(file, results, draws=300)
+
+
+def test_every_figure_is_there_in_every_format(written: Path):
+    for ending, signature in SIGNATURES.items():
+        files = {path.stem: path for path in (written / "figures").glob(f"*.{ending}")}
+        assert set(files) == FIGURES
+        assert all(path.read_bytes().startswith(signature) for path in files.values())
+    assert len(Page((written / "index.html").read_text()).images) == len(FIGURES)
+
+
+def test_the_page_is_whole_and_loads_nothing(written: Path):
+    text = (written / "index.html").read_text()
+    page = Page(text)
+    assert page.open == []
+    assert len(set(page.ids)) == len(page.ids)
+    assert all(link.removeprefix("#") in page.ids for link in page.links)
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in page.loads)
+    assert all(image["alt"] for image in page.images)
+    assert "default-src 'none'" in text
+    assert "<script" not in text
+    assert not re.search(r"url\(|@import", text)
+
+
+def test_the_page_says_where_its_numbers_come_from(written: Path, analysis: Analysis):
+    text = Page((written / "index.html").read_text()).text
+    assert analysis.file.digest in text
+    assert analysis.file.plan.protocol.digest in text
+    assert "73 of 75 runs" in text
+    assert "numpy" in text
+    assert "Beta on k-25, run 3: failed: ValueError: <b>bad</b>" in text  # as text, not as a tag
+    assert "Beta on k-25, run 4" in text
+
+
+def test_the_same_results_give_the_same_report(finished: Path, written: Path, tmp_path: Path):
+    formats = ("html", "csv", "latex")
+    for path in write_report(finished, tmp_path, formats):
+        assert path.read_bytes() == (written / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_the_csv_holds_every_number_of_the_tables(written: Path, finished: Path):
+    with (written / "tables" / "contrasts.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    failures = {key: failure.error for key, failure in ledger.failures().items()}
+    contrasts = analyse(file, ledger.results(), failures).contrasts
+    assert [float(row["change"]) for row in rows] == [row.change for row in contrasts]
+    assert [row["low"] for row in rows] == [str(row.low) for row in contrasts]
+    with (written / "tables" / "runs.csv").open(newline="") as stream:
+        assert len(list(csv.DictReader(stream))) == 73
+
+
+def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path):
+    files = list((written / "tables").glob("*.tex"))
+    assert len(files) == 10
+    for path in files:
+        text = path.read_text()
+        assert text.isascii(), path
+        columns = re.search(r"begin\{tabular\}\{(l+r*)\}", text)
+        assert columns is not None
+        rows = [line for line in text.splitlines() if line.endswith(r" \\")]
+        assert len(rows) > 1
+        for row in rows:
+            assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1]) - 1
+            assert not re.search(r"(?<!\\)[_%#]", row)
+
+
+def test_the_words_name_what_each_learner_was_made_to_suffer_from(analysis: Analysis):
+    alpha, beta = findings(analysis)
+    assert (alpha.algorithm, beta.algorithm) == ("Alpha", "Beta")
+    assert alpha.headline.startswith("Alpha is broken most by minimum reward r_min: on r_min-0_5")
+    assert "5 pairs of runs" in alpha.headline
+    assert "among the axes varied here it is the worst" in alpha.points[0]
+    assert beta.headline.startswith("Beta is broken most by reward interval k: on k-25")
+
+
+def contrasted(analysis: Analysis, *changes: tuple[str, str, dict[str, Any]]) -> Analysis:
+    """With other contrasts of Alpha, each by its class and metric."""
+    rows = {(r.class_name, r.algorithm, r.metric): r for r in analysis.contrasts}
+    for class_name, metric, fields in changes:
+        at = class_name, "Alpha", metric
+        rows[at] = dataclasses.replace(rows[at], **fields)
+    return dataclasses.replace(analysis, contrasts=tuple(rows.values()))
+
+
+ALONE = {"low": None, "high": None, "pairs": 1}
+
+
+def test_the_words_name_what_looks_worse_than_what_is_certain(analysis: Analysis):
+    alpha, _ = findings(
+        contrasted(
+            analysis,
+            ("complexity-10", "wd_regret", {"change": 1.06, **ALONE}),
+            ("complexity-10", "ood_regret", {"change": 1.01, **ALONE}),
+        )
+    )
+    assert alpha.headline.startswith("Alpha is broken by minimum reward r_min: on r_min-0_5")
+    larger = "Larger still, but not certain: complexity L (complexity-10: +{}, a single pair"
+    assert larger.format("1.06") in alpha.headline
+    assert "the worst" not in alpha.points[0]
+    assert not any("Not shown" in point and "complexity-10" in point for point in alpha.points)
+    (outside,) = (point for point in alpha.points if point.startswith("Out of distribution"))
+    assert "the same property makes it worse: minimum reward r_min" in outside
+    assert larger.format("1.01") in outside
+    assert "most" not in alpha.headline + outside
+
+
+def test_an_axis_with_a_class_that_is_shown_still_has_its_open_ones_listed(analysis: Analysis):
+    alpha, _ = findings(
+        contrasted(
+            analysis,
+            ("k-25", "wd_regret", {"change": 0.05, "low": 0.02, "high": 0.08}),
+            ("complexity-10", "wd_regret", {"axis": "k", "change": 0.1, **ALONE}),
+        )
+    )
+    (still_open,) = (point for point in alpha.points if point.startswith("Not shown"))
+    assert "reward interval k (complexity-10: +0.10, a single pair, no interval)" in still_open
+
+
+def test_nothing_is_called_the_worst_beside_what_has_no_interval(analysis: Analysis):
+    assert "the worst" in findings(analysis)[0].points[0]
+    alone = contrasted(analysis, ("complexity-10", "wd_regret", {"change": 0.01, **ALONE}))
+    sure = findings(alone)[0].points[0]
+    assert "no interval rules it out of complexity L (complexity-10: +0.01, a single pair" in sure
+
+
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [(0.95, "is about where the constant"), (1.25, "is worse than the constant")],
+)
+def test_the_words_say_where_a_broken_policy_ends_up(analysis: Analysis, level: float, words: str):
+    ended = contrasted(analysis, ("r_min-0_5", "wd_regret", {"level": level}))
+    assert f"At {level:.2f} it {words} action ½" in " ".join(findings(ended)[0].points)
+
+
+def test_the_words_say_when_runs_are_few(analysis: Analysis):
+    beta = findings(analysis)[1]
+    assert "an indication, not a finding" in beta.points[0]
+    assert any("as few as 3 pairs" in caveat for caveat in caveats(analysis))
+
+
+def test_the_words_say_when_the_worst_is_not_settled(finished: Path):
+    """Without r_min and k, what Alpha is left with makes hardly a difference."""
+    cut = without(finished, lambda p: p.class_name in ("r_min-0_5",) and p.algorithm == "Alpha")
+    alpha = findings(cut)[0]
+    assert "broken" not in alpha.headline
+    text = alpha.headline + " ".join(alpha.points)
+    assert "not settled" in text or "no proof of the contrary" in text or "though little" in text
+
+
+def test_the_words_claim_nothing_from_one_run(finished: Path):
+    cut = without(finished, lambda p: p.run > 0)
+    for finding in findings(cut):
+        assert finding.headline.startswith("No class has been shown")
+        assert finding.headline.endswith("That is no proof of the contrary.")
+        rows = [
+            row for row in cut.contrasts
+            if (row.algorithm, row.metric) == (finding.algorithm, "wd_regret")
+        ]  # fmt: skip
+        most = max(rows, key=lambda row: row.change)
+        assert finding.points[-1] == (
+            "A single pair of runs has no interval; the largest change of such a pair is "
+            f"+{most.change:.2f} ({most.class_name})."
+        )
+        assert not any("upper end" in point for point in finding.points)
+
+
+def test_the_words_keep_upper_ends_apart_from_changes_without_one(finished: Path):
+    cut = without(finished, lambda p: p.run > 0)
+    ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
+    alpha, _ = findings(contrasted(cut, ("k-25", "wd_regret", ends)))
+    assert alpha.headline.endswith("the intervals say what is still possible.")
+    assert alpha.points[-2] == "The largest upper end is +0.04."
+    assert alpha.points[-1].startswith("A single pair of runs has no interval")
+
+
+def test_the_words_say_when_there_is_nothing_to_contrast(finished: Path):
+    cut = without(finished, lambda p: p.class_name == "default")
+    assert [f.headline[:24] for f in findings(cut)] == [
+        "Nothing can be said of A",
+        "Nothing can be said of B",
+    ]
+
+
+def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
+    levels = tuple(
+        dataclasses.replace(level, value=0.97)
+        if (level.class_name, level.metric) == ("default", "wd_regret")
+        else level
+        for level in analysis.levels
+    )
+    for finding in findings(dataclasses.replace(analysis, levels=levels)):
+        assert "learnt next to nothing" in finding.points[0]
+
+
+def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis):
+    text = comparison(analysis)
+    assert "scores highest" in text
+    blurred = tuple(dataclasses.replace(r, low=0.1, high=0.9) for r in analysis.improvements)
+    text = comparison(dataclasses.replace(analysis, improvements=blurred))
+    assert "leaves open which of the two is better" in text
+
+
+def test_the_comparison_says_who_was_trained_for_longer(analysis: Analysis):
+    assert "trained for" not in comparison(analysis)
+
+    def longer(run: Any) -> Any:
+        cell = run.planned.cell.model_copy(update={"steps": 4000})
+        return dataclasses.replace(run, planned=run.planned.model_copy(update={"cell": cell}))
+
+    results = tuple(longer(r) if r.planned.algorithm == "Alpha" else r for r in analysis.results)
+    text = comparison(dataclasses.replace(analysis, results=results))
+    assert text.startswith("Alpha was trained for 4,000 steps, Beta for 40. Over the 5 classes")
+
+
+def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):
+    levels = tuple(  # the worst is in the last panel, and far above the others
+        dataclasses.replace(level, value=1.7, low=1.5, high=1.9)
+        if (level.class_name, level.algorithm) == ("plane", "Alpha")
+        else level
+        for level in analysis.levels
+    )
+    found, _ = pictures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
+    assert len(figures) == len(found) == len(FIGURES)
+    for picture, figure in zip(found, figures, strict=True):
+        for axes in figure.axes:
+            (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
+            for line in axes.lines:
+                if line.get_transform() == axes.transData:
+                    for x, y in line.get_xydata():
+                        assert left <= x <= right, picture.name
+                        assert bottom <= y <= top, picture.name
+    bottoms = {axes.get_ylim()[0] for axes in figures[2].axes}
+    assert (found[2].name, bottoms) == ("wd-regret", {0.0})
+
+
+def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):
+    pytest.importorskip("stable_baselines3")
+    from sme_registry.spec import StudyFile, StudyPlan
+    from sme_registry.studies.engine.cell import run_cell
+
+    plan = StudyPlan.from_dict(
+        {
+            "classes": [
+                {"name": "plane", "setting": {"state_dim": 2, "action_dim": 2}, "seeds": [1]}
+            ],
+            "algorithms": [
+                {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 64, "n_epochs": 1}}
+            ],
+            "seeds": 1,
+            "steps": 64,
+            "evaluations": 1,
+            "protocol": {"states_per_region": 50, "epsilons": [1.0]},
+        }
+    )
+    ledger = Ledger(tmp_path)
+    ledger.write_plan(StudyFile(name="maps", digest=plan.digest, plan=plan))
+    (planned,) = plan.cells
+    model = tmp_path / "model.zip"
+    result = run_cell(planned.cell, model_path=model)
+    ledger.write(result)
+    assert "maps.png" not in {path.name for path in write_report(tmp_path, formats=["png"])}
+    ledger.write(result, model.read_bytes())
+    assert "maps.png" in {path.name for path in write_report(tmp_path, formats=["png"])}
+    ledger.model_path(result.key).write_bytes(b"no model")
+    page = write_report(tmp_path, formats=["html"])[0].read_text()
+    assert "not a model that Stable-Baselines3 saved" in page
+
+
+@pytest.mark.parametrize("formats", [["gif"], []])
+def test_another_format_is_refused(finished: Path, tmp_path: Path, formats: list[str]):
+    with pytest.raises(OptionError, match="must be of html, png, pdf, csv, latex"):
+        write_report(finished, tmp_path, formats)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_into_the_study_or_where_it_is_told(finished: Path, tmp_path: Path):
+    study = tmp_path / "study"
+    shutil.copytree(finished, study)
+    done = CliRunner().invoke(app, ["study", "report", str(study), "--format", "csv,latex"])
+    assert done.exit_code == 0, done.output
+    assert (study / "report" / "tables" / "contrasts.csv").is_file()
+    assert not (study / "report" / "index.html").exists()
+    out = tmp_path / "elsewhere"
+    CliRunner().invoke(app, ["study", "report", str(study), "-o", str(out), "--format", "csv"])
+    assert (out / "tables" / "contrasts.csv").is_file()
+
+
+def test_the_command_refuses_a_folder_without_a_study_or_without_results(
+    finished: Path, tmp_path: Path
+):
+    empty = CliRunner().invoke(app, ["study", "report", str(tmp_path)])
+    assert empty.exit_code == 2
+    assert "holds no study" in empty.output
+    shutil.copy(finished / "plan.json", tmp_path)
+    planned = CliRunner().invoke(app, ["study", "report", str(tmp_path)])
+    assert planned.exit_code == 2
+    assert "none of its 75 runs has finished" in planned.output

@@ -1,0 +1,250 @@
+"""Learning from data in a study's report: made-up scores, and what is said of them."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry.spec import StudyFile
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellResult, OfflineScores
+from sme_registry.studies.report.analysis import ALL, CURVES, analyse
+from sme_registry.studies.report.exports import number
+from sme_registry.studies.report.tables import Analysis, Curve
+from tests.studies.finished import study_file
+
+pytest.importorskip("matplotlib")
+
+from sme_registry.studies.report import write_report
+from sme_registry.studies.report.figures import pictures
+from sme_registry.studies.report.findings import comparison
+from sme_registry.studies.report.offline import (
+    offline_data,
+    offline_pictures,
+    offline_printed,
+    offline_words,
+)
+
+CLASSES: dict[str, dict[str, Any]] = {"shallow": {}, "deep": {"complexity": 3}}
+NUS = (0.0, 0.5)
+# Over the behaviour policy, by learner and class: BC imitates, IQL surpasses and then collapses.
+CHANGES = {("BC", "shallow"): 0.004, ("BC", "deep"): -0.15,
+           ("IQL", "shallow"): 0.05, ("IQL", "deep"): -0.4}  # fmt: skip
+
+
+def planned(**fields: Any) -> StudyFile:
+    algorithms = [
+        {"name": f"{name} ({nu:g})", "uses": f"offline:{name.lower()}", "action_range": "unit",
+         "hyperparameters": {"nu": nu}}
+        for nu in NUS
+        for name in ("BC", "IQL")
+    ]  # fmt: skip
+    return study_file(CLASSES, **{"algorithms": algorithms, **fields})
+
+
+def results(file: StudyFile) -> dict[str, CellResult]:
+    """The reports of a constant, with scores that were never reached."""
+    judged: dict[str, CellResult] = {}
+    found = {}
+    for place in file.plan.cells:
+        cell = place.cell
+        spec = cell.spec.digest
+        if spec not in judged:
+            fields = {"uses": "reference:constant", "steps": 0, "hyperparameters": {}}
+            judged[spec] = run_cell(cell.model_copy(update=fields))
+        nu = float(str(cell.hyperparameters["nu"]))
+        behaviour = 1.0 - nu / 6.0 + 0.001 * place.run
+        change = CHANGES[place.algorithm.split()[0], place.class_name] + 0.0005 * (place.run - 2)
+        scores = OfflineScores(
+            nu=nu,
+            transitions=1000,
+            dataset=f"sha256:{hash_of(place.class_name, nu, place.run):064x}",
+            behaviour=behaviour,
+            behaviour_sd=0.1,
+            score=behaviour + change,
+            score_sd=0.01 * (1 + place.run),
+        )
+        own = {"key": cell.digest, "cell": cell, "offline": scores}
+        found[cell.digest] = judged[spec].model_copy(update=own)
+    return found
+
+
+def hash_of(class_name: str, nu: float, run: int) -> int:
+    return 1000 * list(CLASSES).index(class_name) + 100 * NUS.index(nu) + run
+
+
+@pytest.fixture(scope="module")
+def file() -> StudyFile:
+    return planned()
+
+
+@pytest.fixture(scope="module")
+def done(file: StudyFile) -> dict[str, CellResult]:
+    return results(file)
+
+
+@pytest.fixture(scope="module")
+def analysis(file: StudyFile, done: dict[str, CellResult]) -> Analysis:
+    return analyse(file, done, draws=300)
+
+
+def first_runs(file: StudyFile, done: dict[str, CellResult], runs: int) -> Analysis:
+    keys = {place.cell.digest for place in file.plan.cells if place.run < runs}
+    return analyse(file, {key: done[key] for key in keys}, draws=300)
+
+
+def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis: Analysis) -> None:
+    assert [row[:3] for row in analysis.offline_data] == [
+        (name, nu, 5) for name in CLASSES for nu in NUS
+    ]
+    assert [row.behaviour for row in analysis.offline_data[:2]] == pytest.approx(
+        [1.002, 1.002 - 0.5 / 6.0]
+    )
+    assert {row.learner for row in analysis.offline} == {"BC", "IQL"}
+    for row in analysis.offline:
+        assert row.runs == 5
+        assert row.score_sd == pytest.approx(0.03)
+        assert row.change == pytest.approx(CHANGES[row.learner, row.class_name])
+        assert row.low is not None
+        assert row.high is not None
+        assert row.low < row.change < row.high
+
+
+def test_settings_besides_nu_tell_learners_apart() -> None:
+    algorithms = [
+        {"name": name, "uses": "offline:iql", "action_range": "unit", "hyperparameters": own}
+        for name, own in (("IQL a", {"nu": 0.5}), ("IQL b", {"nu": 0.5, "expectile": 0.9}))
+    ]
+    file = planned(algorithms=algorithms, seeds=1)
+    found = analyse(file, results(file), draws=300)
+    assert [row.learner for row in found.offline] == [
+        "IQL (default expectile)", "IQL (expectile = 0.9)",
+    ] * 2  # fmt: skip
+
+
+def test_words_say_who_imitates_who_surpasses_and_who_collapses(analysis: Analysis) -> None:
+    text = " ".join(offline_words(analysis))
+    assert "The behaviour policies are near 1 − ν/6 everywhere: +0.002 off at most" in text
+    assert "BC is near the behaviour policy at shallow (ν = 0, 0.5)" in text
+    assert "BC collapses on the deepest class, deep (2 values of ν, 10 runs)" in text
+    assert "IQL is nowhere near" in text
+    assert "surpass its data at shallow (ν = 0, 0.5), by +0.050." in text
+    assert "fall behind its data at deep (ν = 0, 0.5), by −0.400." in text
+    assert "IQL collapses on the deepest class" in text
+    assert "no more than 0.02 better than the constant ½" in text
+    assert "indication" not in text
+
+
+@pytest.mark.parametrize("runs", [1, 3, 4])
+def test_of_few_runs_nothing_is_called_shown(
+    file: StudyFile, done: dict[str, CellResult], runs: int
+) -> None:
+    few = first_runs(file, done, runs)
+    assert all((row.low is None) == (runs < 4) for row in few.offline)
+    text = " ".join(offline_words(few))
+    assert "It is shown" not in text
+    assert ("All of its few runs surpass their data" in text) == (runs > 1)
+    assert ("A single run, no more than a hint" in text) == (runs == 1)
+    assert ("It has not been shown to surpass its data" in text) == (runs == 1)
+    assert "With so few runs this is an indication." in text
+    (picture,) = offline_pictures(few, ("svg",))
+    assert ("there is no interval" in picture.caption) == (runs < 4)
+    assert ("bootstrap intervals of the mean" in picture.caption) == (runs == 4)
+
+
+def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
+    pairs = {(row.first, row.second) for row in analysis.improvements if row.group == ALL}
+    learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
+    assert pairs == learners
+    text = comparison(analysis)
+    for nu in ("0", "0.5"):
+        assert f"of those on 1,000 transitions of ν = {nu}, BC ({nu}) scores highest" in text
+        assert f"A run of it beats one of IQL ({nu})" in text
+    assert text.count("A run of it beats") == 2
+
+
+def test_the_words_say_what_the_names_stand_for(analysis: Analysis) -> None:
+    assert "BC (0) learnt from data of ν = 0. The behaviour policy" in offline_words(analysis)[0]
+
+
+def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
+    analysis: Analysis, figures: list[Any]
+) -> None:
+    names = [f"BC ({i})" for i in range(10)]
+    steps = np.arange(1.0, 4.0)
+    curves = tuple(
+        Curve(c, name, measure, steps, *[steps + i] * 3, 1, 1)
+        for i, name in enumerate(names)
+        for c in CLASSES
+        for measure in CURVES
+    )
+    run = analysis.results[0]
+    results = tuple(
+        dataclasses.replace(run, planned=run.planned.model_copy(update={"algorithm": name}))
+        for name in names
+    )
+    many = dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names), results=results, curves=curves,
+        contrasts=(), profiles=(),
+    )  # fmt: skip
+    found, _ = pictures(many, ("svg",), {})
+    assert found[-1].name == "learning-curves-complexity"
+    figure = figures[-1]
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title() for axes in shown if axes.get_title()] == names
+    assert [axes.get_xlabel() for axes in shown if axes.get_xlabel()] == ["gradient steps"] * 10
+    assert len({round(axes.get_position().x0, 6) for axes in shown}) == 4
+    assert len({axes.get_ylim() for axes in shown}) == 1  # of all learners, not of a row
+
+
+def test_the_report_has_it_first_and_in_every_format(
+    file: StudyFile, done: dict[str, CellResult], tmp_path: Path
+) -> None:
+    ledger = Ledger(tmp_path / "study")
+    ledger.write_plan(file)
+    for result in done.values():
+        ledger.write(result)
+    out = tmp_path / "out"
+    write_report(tmp_path / "study", out)
+    for ending in ("png", "pdf"):
+        assert (out / "figures" / f"offline-improvement.{ending}").exists()
+    page = (out / "index.html").read_text()
+    assert page.index('<section id="offline"') < page.index('<section id="words"')
+    assert page.count('id="table-offline"') == page.count('id="figure-offline-improvement"') == 1
+    for name in ("offline", "offline-improvement"):
+        text = (out / "tables" / f"{name}.tex").read_text()
+        assert text.isascii()
+        assert "$\\nu$" in text
+    with (out / "tables/offline-runs.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(done)
+    assert all(
+        float(row["change"]) == float(row["score"]) - float(row["behaviour"]) for row in rows
+    )
+
+
+def test_the_table_has_the_behaviour_beside_the_learners(analysis: Analysis) -> None:
+    scores, changes = offline_printed(analysis)
+    assert scores.columns == ("class", "ν", "constant ½", "behaviour policy", "BC", "IQL")
+    constant = number(analysis.offline_data[0].constant, 3)
+    assert scores.rows[0] == (
+        "shallow", "0", constant, "1.002 ± 0.100 (5)", "1.006 ± 0.030 (5)", "1.052 ± 0.030 (5)",
+    )  # fmt: skip
+    assert changes.rows[0][2].startswith("+0.004 [")
+    assert changes.rows[-1][3].endswith(" *")
+
+
+def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    found = analyse(file, ledger.results(), draws=100)
+    assert (found.offline, found.offline_data) == ((), ())
+    assert not [*offline_data(found), *offline_printed(found), *offline_words(found)]
+    assert offline_pictures(found, ("svg",)) == []
