@@ -277,7 +277,7 @@ def training_curve(
     The cloud is the episodes; the line their running median over a centred window.
 
     Args:
-      episodes: the path of a run's episodes.csv, or rows with `step` and `mean_regret`, as
+      episodes: the path of a run's episodes.csv, or rows with `step` and `regret`, as
         attributes or as keys.
       path: the file to write, .png, .pdf or .svg.
       title: what stands above.
@@ -336,10 +336,10 @@ def _episodes(episodes: str | os.PathLike[str] | Iterable[Any]) -> tuple[Array, 
     try:
         if rows and isinstance(rows[-1], dict) and None in rows[-1].values():
             rows.pop()  # the row that a killed run was writing
-        points = [(field(row, "step"), field(row, "mean_regret")) for row in rows]
+        points = [(field(row, "step"), field(row, "regret")) for row in rows]
     except (KeyError, AttributeError, TypeError, ValueError):
         raise OptionError(
-            f"{source}: every row must have numbers for step and mean_regret. "
+            f"{source}: every row must have numbers for step and regret. "
             "Give the episodes.csv of a training run."
         ) from None
     if not points:

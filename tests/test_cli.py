@@ -609,7 +609,7 @@ class TestTrain:
         assert "training PPO: 1,024 of 1,024 steps" in result.stderr
         assert "team's mean regret" in result.stderr
         header = (tmp_path / "run/episodes.csv").read_text().splitlines()[0]
-        assert header.endswith(",mean_regret/agent_0,mean_regret/agent_1")
+        assert header.endswith(",regret/agent_0,regret/agent_1")
         again = good(
             "evaluate", "run/model.zip", "Team2", "--set", "horizon=20", *QUICK, "--json"
         ).stdout

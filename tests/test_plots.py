@@ -28,7 +28,7 @@ def report():
     return evaluate(half, PLANE, PROTOCOL, name=r"a $\frac$ name")
 
 
-EPISODES = [{"step": 100 * (i + 1), "mean_regret": 1.0 - i / 50} for i in range(50)]
+EPISODES = [{"step": 100 * (i + 1), "regret": 1.0 - i / 50} for i in range(50)]
 
 
 @pytest.mark.parametrize("ending", plots.FORMATS)
@@ -222,8 +222,8 @@ def test_similarity_map_refuses_arguments_out_of_range(tmp_path, spec, options, 
 
 def test_training_curve_reads_a_csv_and_leaves_out_a_row_cut_short(tmp_path, figures):
     path = tmp_path / "episodes.csv"
-    rows = [f"{i},{row['step']},{row['mean_regret']}" for i, row in enumerate(EPISODES)]
-    path.write_text("\n".join(["episode,step,mean_regret", *rows, "51,51"]))
+    rows = [f"{i},{row['step']},{row['regret']}" for i, row in enumerate(EPISODES)]
+    path.write_text("\n".join(["episode,step,regret", *rows, "51,51"]))
     plots.training_curve(path, tmp_path / "from-csv.png", window=5)
     plots.training_curve(EPISODES, tmp_path / "from-rows.png", window=5)
     cloud, expected = (f.axes[0].collections[0].get_offsets() for f in figures)
@@ -233,9 +233,9 @@ def test_training_curve_reads_a_csv_and_leaves_out_a_row_cut_short(tmp_path, fig
 
 def test_training_curve_is_the_running_median(tmp_path, figures):
     rng = np.random.default_rng(0)
-    rows = [{"step": i, "mean_regret": r} for i, r in enumerate(rng.random(30), start=1)]
+    rows = [{"step": i, "regret": r} for i, r in enumerate(rng.random(30), start=1)]
     plots.training_curve(rows, tmp_path / "figure.png", window=5)
-    regret = np.array([row["mean_regret"] for row in rows])
+    regret = np.array([row["regret"] for row in rows])
     line = figures[0].axes[0].lines[0]
     medians = [np.median(regret[max(0, i - 2) : i + 3]) for i in range(30)]
     assert np.array_equal(line.get_ydata(), medians)
@@ -246,9 +246,9 @@ def test_training_curve_is_the_running_median(tmp_path, figures):
     ("content", "message"),
     [
         ("", "holds no finished episode yet"),
-        ("step,mean_regret\n", "holds no finished episode yet"),
-        ("a,b\n1,2\n", "must have numbers for step and mean_regret"),
-        ("step,mean_regret\n1,x\n", "must have numbers for step and mean_regret"),
+        ("step,regret\n", "holds no finished episode yet"),
+        ("a,b\n1,2\n", "must have numbers for step and regret"),
+        ("step,regret\n1,x\n", "must have numbers for step and regret"),
         (None, "cannot be read"),
     ],
 )

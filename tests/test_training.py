@@ -80,9 +80,9 @@ def test_the_logged_episodes_are_whole_and_their_regret_is_exact(run: TrainingRe
     assert [int(row["step"]) for row in rows] == [20, 40, 60, 80, 100, 120, 140]
     for row in rows:
         # With k = 1 and r_min = 0 the return is the horizon less the sum of regrets.
-        expected = 20 * (1 - float(row["mean_regret"]))
+        expected = 20 * (1 - float(row["regret"]))
         assert float(row["return"]) == pytest.approx(expected, abs=1e-4)
-        assert float(row["mean_similarity"]) <= 1
+        assert float(row["similarity"]) <= 1
         assert row["terminated"] == "0"
     assert read_episodes(run.folder / "episodes.csv") == [
         Episode(*(pytest.approx(value) for value in episode)) for episode in run.episodes
@@ -100,16 +100,16 @@ def test_the_same_seed_trains_the_same_model_and_another_one_does_not(
     run: TrainingResult, tmp_path: Path
 ) -> None:
     same, other = short(tmp_path / "same"), short(tmp_path / "other", seed=1)
-    assert [e.mean_regret for e in same.episodes] == [e.mean_regret for e in run.episodes]
+    assert [e.regret for e in same.episodes] == [e.regret for e in run.episodes]
     assert same.report.regions == run.report.regions
-    assert [e.mean_regret for e in other.episodes] != [e.mean_regret for e in run.episodes]
+    assert [e.regret for e in other.episodes] != [e.regret for e in run.episodes]
 
 
 def test_training_lowers_regret(tmp_path: Path) -> None:
     # One second of TD3 on a task of one channel; the first 100 steps act at random.
     spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
     result = train(spec, steps=350, folder=tmp_path / "run", protocol=PROTOCOL, progress=False)
-    regrets = [episode.mean_regret for episode in result.episodes]
+    regrets = [episode.regret for episode in result.episodes]
     assert np.mean(regrets[-4:]) < 0.7 * np.mean(regrets[:4])
     reference = result.report.references["constant_half"][0]
     assert result.report.regions[0].similarity > reference.similarity
@@ -300,7 +300,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(tmp_path: Path) -
     finished.record.updated(status="running", steps_done=0).write(folder)
     (folder / "checkpoint.zip").unlink()
     again = short(folder, steps=40, resume=True)
-    assert [e.mean_regret for e in again.episodes] == [e.mean_regret for e in finished.episodes]
+    assert [e.regret for e in again.episodes] == [e.regret for e in finished.episodes]
 
 
 def test_a_finished_run_is_refused_unless_forced(run: TrainingResult, tmp_path: Path) -> None:
@@ -491,19 +491,19 @@ def test_a_team_is_trained_by_ppo_and_the_record_says_how(team_run: TrainingResu
 def test_each_agent_of_a_team_has_a_column_of_its_exact_regret(team_run: TrainingResult) -> None:
     path = team_run.folder / "episodes.csv"
     rows = list(csv.DictReader(io.StringIO(path.read_text())))
-    assert tuple(rows[0]) == (*COLUMNS, "mean_regret/agent_0", "mean_regret/agent_1")
+    assert tuple(rows[0]) == (*COLUMNS, "regret/agent_0", "regret/agent_1")
     assert [int(row["step"]) for row in rows] == [160 * (1 + i // 8) for i in range(48)]
     for row, episode in zip(rows, team_run.episodes, strict=True):
-        regrets = [float(row["mean_regret/agent_0"]), float(row["mean_regret/agent_1"])]
-        assert regrets == pytest.approx(episode.agents_mean_regret)
-        assert float(row["mean_regret"]) == pytest.approx(sum(regrets) / 2)
+        regrets = [float(row["regret/agent_0"]), float(row["regret/agent_1"])]
+        assert regrets == pytest.approx(episode.agents_regret)
+        assert float(row["regret"]) == pytest.approx(sum(regrets) / 2)
         # With k = 1 and r_min = 0 a return is the horizon less the sum of regrets.
-        assert float(row["return"]) == pytest.approx(20 * (1 - float(row["mean_regret"])), abs=1e-4)
+        assert float(row["return"]) == pytest.approx(20 * (1 - float(row["regret"])), abs=1e-4)
         assert row["length"] == "20"
     assert regrets[0] != regrets[1]
     read = read_episodes(path)
-    assert [e.agents_mean_regret for e in read] == [
-        pytest.approx(e.agents_mean_regret) for e in team_run.episodes
+    assert [e.agents_regret for e in read] == [
+        pytest.approx(e.agents_regret) for e in team_run.episodes
     ]
 
 
@@ -524,7 +524,7 @@ def test_the_logged_regret_is_what_the_agents_were_told(tmp_path: Path) -> None:
     assert len(replay["actions"]) == 20
     told = [[info["regret"] for info in env.step(a)[3]] for a in replay["actions"]]
     (episode,) = result.episodes
-    assert episode.agents_mean_regret == pytest.approx(np.mean(told, axis=0))
+    assert episode.agents_regret == pytest.approx(np.mean(told, axis=0))
 
 
 def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run: TrainingResult) -> None:
@@ -544,7 +544,7 @@ def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
     result = train(spec, algorithm="TD3", steps=225, folder=tmp_path / "run", protocol=PROTOCOL,
                    progress=False)  # fmt: skip
     assert result.record.num_envs == 1
-    regrets = np.array([episode.agents_mean_regret for episode in result.episodes])
+    regrets = np.array([episode.agents_regret for episode in result.episodes])
     assert (regrets[-2:].mean(axis=0) < 0.7 * regrets[:2].mean(axis=0)).all()
 
 
@@ -558,7 +558,7 @@ def test_a_teams_run_that_stopped_goes_on_with_its_columns(
     assert (result.record.sessions, result.record.steps_done) == (2, 2048)
     assert [e.step for e in result.episodes[:48]] == [e.step for e in team_run.episodes]
     assert len(result.episodes) == 96
-    assert all(len(episode.agents_mean_regret) == 2 for episode in result.episodes)
+    assert all(len(episode.agents_regret) == 2 for episode in result.episodes)
 
 
 def _copy(source: Path, target: Path) -> None:

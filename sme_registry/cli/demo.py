@@ -89,7 +89,7 @@ def regret_by_stage(result: TrainingResult) -> list[tuple[int, int, float]]:
     edges = np.linspace(0, result.record.steps_done, _STAGES + 1).astype(int)
     stages = []
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        regrets = [e.mean_regret for e in result.episodes if first < e.step <= last]
+        regrets = [e.regret for e in result.episodes if first < e.step <= last]
         if regrets:
             stages.append((first, last, float(np.mean(regrets))))
     return stages

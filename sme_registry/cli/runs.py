@@ -170,7 +170,7 @@ def train(
     model.zip, run.json, evaluation.json, figures, and what TensorBoard reads.
 
     The agents of a team share one policy (its shared observation: `sme evaluate --help`).
-    episodes.csv then has the team's mean and a column mean_regret/<agent> for each. A step is one
+    episodes.csv then has the team's mean and a column regret/<agent> for each. A step is one
     of the whole team, so the algorithm sees as many transitions as there are agents; SB3's own
     count, on TensorBoard's axis, is of those. PPO collects its 2,048 transitions over all agents
     of all teams together, not 2,048 from each: run.json says n_steps.

@@ -159,7 +159,7 @@ def of_cell(study: str | Path, key: str) -> Subject:
     data = read_json(found[0])
     try:
         cell, curve = Cell.from_dict(data["cell"], str(found[0])), data["curve"]
-        step, regret = np.array(curve["steps"], float), np.array(curve["mean_regret"], float)
+        step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, SpecError):
             raise
@@ -209,7 +209,7 @@ def _episodes(path: Path) -> Log | None:
     rows = episode_files.read_episodes(path) if path.exists() else []
     if not rows:
         return None
-    step, regret, ended = np.array([(e.step, e.mean_regret, e.terminated) for e in rows], float).T
+    step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T
     return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
 
 

@@ -27,7 +27,7 @@ class Rollouts(NamedTuple):
       episode_return: the sum of an episode's rewards, in [0, T].
       discounted_return: the same, the i-th reward by γ^i.
       length: its steps, in [1, T].
-      mean_regret: mean of 1 − step reward over its steps, in [0, 1].
+      regret: mean of 1 − step reward over its steps, in [0, 1].
       similarity: mean r̃ over its steps, in [0, 1].
       similarity_square: mean r̃² over its steps, in [0, 1].
     """
@@ -35,7 +35,7 @@ class Rollouts(NamedTuple):
     episode_return: Array
     discounted_return: Array
     length: Array
-    mean_regret: Array
+    regret: Array
     similarity: Array
     similarity_square: Array
 

@@ -100,22 +100,22 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
                 step=self.steps_done,
                 episode_return=returned,
                 length=int(length),
-                mean_regret=regret / length,
-                mean_similarity=similarity / length,
+                regret=regret / length,
+                similarity=similarity / length,
                 terminated=terminated,
                 wall_seconds=round(self.wall_seconds, 3),
-                agents_mean_regret=tuple(regrets),
+                agents_regret=tuple(regrets),
             )
         )
-        self.logger.record_mean("sme/mean_regret", regret / length)
-        self.logger.record_mean("sme/mean_similarity", similarity / length)
+        self.logger.record_mean("sme/regret", regret / length)
+        self.logger.record_mean("sme/similarity", similarity / length)
         for agent, value in zip(self._agents, regrets, strict=True):
-            self.logger.record_mean(f"sme/mean_regret/{agent}", value)
+            self.logger.record_mean(f"sme/regret/{agent}", value)
 
     def _running_mean(self) -> str:
         recent = self._log.episodes[-_RECENT:]
         if not recent:
             return ""
-        regret = np.mean([episode.mean_regret for episode in recent])
+        regret = np.mean([episode.regret for episode in recent])
         whose = "team's mean regret" if self._agents else "mean regret"
         return f"{whose} {regret:.3f} (last {len(recent)} episodes)"

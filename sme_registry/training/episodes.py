@@ -1,6 +1,6 @@
 """`episodes.csv`: one row for each finished episode, on disk as soon as it has ended.
 
-A team's has a column more for each agent, `mean_regret/<agent>`.
+A team's has a column more for each agent, `regret/<agent>`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 
 FILE = "episodes.csv"
-_OF_AGENT = "mean_regret/"
+_OF_AGENT = "regret/"
 
 
 class Episode(NamedTuple):
@@ -27,12 +27,12 @@ class Episode(NamedTuple):
         team is one step of all its agents.
       episode_return: the sum of its rewards, in [0, T]; the column is called `return`.
       length: its steps.
-      mean_regret: mean regret 1 − r over its steps, in [0, 1]; exact.
-      mean_similarity: mean r̃ over its steps, in [0, 1]; exact.
+      regret: mean regret 1 − r over its steps, in [0, 1]; exact.
+      similarity: mean r̃ over its steps, in [0, 1]; exact.
       terminated: 1 where it ended by D, 0 where its time was up.
       wall_seconds: of training, over all sessions, when it ended.
-      agents_mean_regret: each agent's mean regret, in the team's order; empty where there is no
-        team. Of a team the numbers above (return, mean_regret, mean_similarity) are the mean over
+      agents_regret: each agent's mean regret, in the team's order; empty where there is no
+        team. Of a team the numbers above (return, regret, similarity) are the mean over
         its agents.
     """
 
@@ -40,11 +40,11 @@ class Episode(NamedTuple):
     step: int
     episode_return: float
     length: int
-    mean_regret: float
-    mean_similarity: float
+    regret: float
+    similarity: float
     terminated: int
     wall_seconds: float
-    agents_mean_regret: tuple[float, ...] = ()
+    agents_regret: tuple[float, ...] = ()
 
 
 COLUMNS = tuple("return" if f == "episode_return" else f for f in Episode._fields[:-1])

@@ -99,7 +99,7 @@ def test_an_episode_has_the_scores_of_a_single_environment(spec: SMESpec) -> Non
         assert done.episode_return[lane] == pytest.approx(
             np.sum(np.array(rewards, float)), abs=1e-9
         )
-        assert done.mean_regret[lane] == pytest.approx(np.mean(regrets), abs=1e-9)
+        assert done.regret[lane] == pytest.approx(np.mean(regrets), abs=1e-9)
         assert done.similarity[lane] == pytest.approx(np.mean(similarities), abs=1e-9)
     if spec is HARD:
         assert len(set(done.length)) > 3
@@ -145,9 +145,9 @@ def test_the_copied_actor_has_the_scores_of_evaluate_policy_until_chaos_parts_th
 
 def test_per_step_means_weigh_an_episode_by_its_length() -> None:
     done = rollouts(nearly_optimal(HARD), materialize(HARD), start_states(0, 0, 12, 3))
-    expected = (done.mean_regret * done.length).sum() / done.length.sum()
-    assert done.per_step(done.mean_regret) == pytest.approx(expected)
-    assert done.per_step(done.mean_regret) != pytest.approx(done.mean_regret.mean())
+    expected = (done.regret * done.length).sum() / done.length.sum()
+    assert done.per_step(done.regret) == pytest.approx(expected)
+    assert done.per_step(done.regret) != pytest.approx(done.regret.mean())
 
 
 def test_start_states_are_new_at_each_evaluation_and_the_same_when_asked_again() -> None:

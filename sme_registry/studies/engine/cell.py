@@ -137,7 +137,7 @@ class _Book:
             (
                 steps,
                 float(done.episode_return.mean()),
-                done.per_step(done.mean_regret),
+                done.per_step(done.regret),
                 done.per_step(done.similarity),
                 float(done.length.mean()),
             )
@@ -147,7 +147,7 @@ class _Book:
     def curve(self) -> LearningCurve:
         """The learning curve so far."""
         columns = zip(*self.rows, strict=True) if self.rows else [()] * 5
-        names = ("steps", "episode_return", "mean_regret", "similarity", "length")
+        names = ("steps", "episode_return", "regret", "similarity", "length")
         return LearningCurve(**dict(zip(names, columns, strict=True)))
 
 

@@ -92,7 +92,7 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
         curve=LearningCurve(
             steps=tuple(score.step for score in record.evaluations),
             episode_return=tuple(score.episode_return for score in record.evaluations),
-            mean_regret=tuple(1.0 - score.episode_return / T for score in record.evaluations),
+            regret=tuple(1.0 - score.episode_return / T for score in record.evaluations),
             similarity=tuple(score.similarity for score in record.evaluations),
             length=(float(T),) * len(record.evaluations),
         ),

@@ -27,14 +27,14 @@ class LearningCurve(StrictModel):
     Attributes:
       steps: environment steps taken before the evaluation.
       episode_return: mean over its episodes, of at most T.
-      mean_regret: mean over all steps of its episodes of 1 − step reward.
+      regret: mean over all steps of its episodes of 1 − step reward.
       similarity: mean r̃ over all steps.
       length: mean length of its episodes.
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()
     episode_return: _Numbers = ()
-    mean_regret: _Numbers = ()
+    regret: _Numbers = ()
     similarity: _Numbers = ()
     length: _Numbers = ()
 

@@ -51,7 +51,7 @@ SEVERAL = "several axes"
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
 CURVES = {
     "episode_return": "return, % of optimum",
-    "mean_regret": "mean regret per step",
+    "regret": "mean regret per step",
 }
 STATISTICS: dict[str, Statistic] = {
     "iqm": statistics.iqm,

@@ -136,7 +136,7 @@ def test_evaluations_are_evenly_spaced_and_the_last_is_at_the_end(
     assert {len(column) for column in curve.to_dict().values()} == {4}
     assert all(0 <= value <= 20 for value in curve.episode_return)
     assert curve.length == (20.0,) * 4
-    for returned, regret in zip(curve.episode_return, curve.mean_regret, strict=True):
+    for returned, regret in zip(curve.episode_return, curve.regret, strict=True):
         assert returned == pytest.approx(20 * (1 - regret))
 
 
@@ -211,7 +211,7 @@ def test_a_learner_that_stops_early_is_refused() -> None:
 def test_a_reference_is_judged_as_often_as_a_learner_would_be() -> None:
     result = run_cell(cell("reference:optimal"))
     assert result.curve.steps == (32, 65, 98, 130)
-    assert result.curve.mean_regret == pytest.approx((0,) * 4, abs=1e-6)
+    assert result.curve.regret == pytest.approx((0,) * 4, abs=1e-6)
     assert result.online_regret is None
     assert result.timing.training == 0.0
     constant = run_cell(cell("reference:constant"))
