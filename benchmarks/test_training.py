@@ -11,8 +11,8 @@ import pytest
 import sme_registry
 from sme_registry import SMESpec, materialize
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.training.actor import actor
 from sme_registry.training.algorithms import one_thread
+from sme_registry.training.numpy_policy import numpy_policy
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -43,7 +43,9 @@ def test_evaluations_of_five_episodes(compare: Any, algorithm: str) -> None:
     def ours(times: int) -> None:
         for evaluation in range(times):  # the weights are copied anew each time
             rollouts(
-                actor(model, SPEC), task, start_states(0, evaluation, EPISODES, SPEC.state_dim)
+                numpy_policy(model, SPEC),
+                task,
+                start_states(0, evaluation, EPISODES, SPEC.state_dim),
             )
 
     def theirs(times: int) -> None:
@@ -61,14 +63,14 @@ def test_evaluations_of_five_episodes(compare: Any, algorithm: str) -> None:
 
 @pytest.mark.parametrize("algorithm", ROUND)
 def test_training_steps(compare: Any, algorithm: str) -> None:
-    from sme_registry.training.metered import MeteredVecEnv
+    from sme_registry.training.monitored_env import MonitoredVecEnv
 
     def training(env: Any) -> Any:
         model = learner(algorithm, env)
         model.learn(ROUND[algorithm])
         return lambda steps: model.learn(steps, reset_num_timesteps=False)
 
-    env, steps = MeteredVecEnv(SPEC, action_range="symmetric"), ROUND[algorithm]
+    env, steps = MonitoredVecEnv(SPEC, action_range="symmetric"), ROUND[algorithm]
     with one_thread():
         compare(
             f"{algorithm}, a step of training", "step", training(env), steps,

@@ -290,7 +290,7 @@ def test_the_probe_fits_what_a_network_can_be_and_not_what_it_cannot(
 ) -> None:
     torch = pytest.importorskip("torch")
     from sme_registry.diagnosis import networks
-    from sme_registry.training.actor import Perceptron
+    from sme_registry.training.numpy_policy import Perceptron
 
     def layers(*widths: int) -> Perceptron:
         pairs = itertools.pairwise(widths)

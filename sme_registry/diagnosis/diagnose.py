@@ -14,7 +14,7 @@ from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.document import plain_number
 from sme_registry.task import Task, materialize
-from sme_registry.training.actor import Perceptron
+from sme_registry.training.numpy_policy import Perceptron
 
 STATES, EPISODES = 8192, 64
 _SPREAD_STATES = 256

@@ -24,7 +24,7 @@ from sme_registry.errors import MissingDependencyError
 from sme_registry.evaluation import Policy
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
-from sme_registry.training.actor import Perceptron
+from sme_registry.training.numpy_policy import Perceptron
 
 GRADIENT_STEPS = 3000
 MOST_STATES, DEFAULT_STATES = 50_000, 20_000

@@ -23,7 +23,7 @@ from sme_registry.spec.study import Cell
 from sme_registry.task.draw import Array
 from sme_registry.training import RunRecord, checkpoint
 from sme_registry.training import episodes as episode_files
-from sme_registry.training.actor import actor
+from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.run import MODEL
 
 _FEWEST_DIGITS = 6
@@ -84,7 +84,7 @@ def of_policy(
     model = policy
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         model, name = load_sb3(policy), name or Path(policy).stem
-    found = actor(model, spec, action_range=action_range)
+    found = numpy_policy(model, spec, action_range=action_range)
     name = name or found.name
     return Subject(name, spec, found, {}, explore=_explorer(model, found))
 
@@ -117,7 +117,7 @@ def of_run(folder: str | Path) -> Subject:
             )
         note = f"The run is not finished: this is its checkpoint after {record.steps_done:,} steps."
     model = load_sb3(path)
-    policy = actor(model, record.spec, action_range=record.action_range)
+    policy = numpy_policy(model, record.spec, action_range=record.action_range)
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
     return Subject(
         folder.name or str(folder),
@@ -187,7 +187,9 @@ def of_cell(study: str | Path, key: str) -> Subject:
                 "the study in a new folder, with --keep-models."
             )
         model = load_sb3(path)
-    policy = actor(model, cell.spec, action_range=None if callable(model) else cell.action_range)
+    policy = numpy_policy(
+        model, cell.spec, action_range=None if callable(model) else cell.action_range
+    )
     log = Log("evaluations", step, regret) if len(step) else None
     return Subject(name, cell.spec, policy, plan, log, _explorer(model, policy))
 

@@ -16,8 +16,8 @@ from sme_registry import SMESpec, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.training.actor import Perceptron, actor
 from sme_registry.training.algorithms import one_thread
+from sme_registry.training.numpy_policy import Perceptron, numpy_policy
 
 PLAIN = SMESpec(state_dim=3, action_dim=2)
 # Payouts every 7 steps, a threshold, and an end at the first bad step.
@@ -129,7 +129,7 @@ def test_the_copied_actor_has_the_scores_of_evaluate_policy_until_chaos_parts_th
 ) -> None:
     model, brief = trained(algorithm, PLAIN), PLAIN.derive(horizon=6)
     states = start_states(0, 1, 20, 3)
-    fast = actor(model, PLAIN)
+    fast = numpy_policy(model, PLAIN)
     assert isinstance(fast.act, Perceptron)
     done = rollouts(fast, materialize(brief), states)
     returns, _ = evaluated_by_sb3(model, brief, states)

@@ -29,8 +29,8 @@ from sme_registry.studies.engine.algorithms import (
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.task import materialize
-from sme_registry.training.actor import actor
 from sme_registry.training.algorithms import one_thread, quiet
+from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import installed_versions
 
 Progress = Callable[[int, int], None]
@@ -157,7 +157,7 @@ def _follow(cell: Cell, reference: str, book: _Book) -> Policy:
         raise OptionError(
             f"hyperparameters={sorted(cell.hyperparameters)}: {cell.uses} has none. Leave them out."
         )
-    policy = actor(reference_policy(reference, cell.spec), cell.spec)
+    policy = numpy_policy(reference_policy(reference, cell.spec), cell.spec)
     for steps in book.due:
         book.evaluate(steps, policy)
         book.tell(steps)
@@ -166,15 +166,15 @@ def _follow(cell: Cell, reference: str, book: _Book) -> Policy:
 
 def _train(cell: Cell, book: _Book, model_path: Path | None) -> Policy:
     """Train the cell's learner, and evaluate it when that is due."""
-    from sme_registry.training.metered import MeteredVecEnv
+    from sme_registry.training.monitored_env import MonitoredVecEnv
 
-    env = MeteredVecEnv(cell.spec, action_range=cell.action_range)
+    env = MonitoredVecEnv(cell.spec, action_range=cell.action_range)
     learner = new_learner(
         cell.uses, env, seed=cell.seed, steps=cell.steps, hyperparameters=cell.hyperparameters
     )
 
     def evaluate_now(steps: int) -> None:
-        book.evaluate(steps, actor(learner, cell.spec, action_range=cell.action_range))
+        book.evaluate(steps, numpy_policy(learner, cell.spec, action_range=cell.action_range))
 
     def after_step(steps: int) -> None:
         while book.is_due(steps):
@@ -199,7 +199,7 @@ def _train(cell: Cell, book: _Book, model_path: Path | None) -> Policy:
         evaluate_now(env.steps)
     if model_path is not None:
         _save(learner, model_path)
-    return actor(learner, cell.spec, action_range=cell.action_range)
+    return numpy_policy(learner, cell.spec, action_range=cell.action_range)
 
 
 def _save(learner: Learner, path: Path) -> None:

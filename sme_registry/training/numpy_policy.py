@@ -1,13 +1,13 @@
-"""`actor`: what a trained model would do, as matrix products in NumPy; for evaluating it often.
+"""`numpy_policy`: a model's deterministic policy as matrix products in NumPy, for fast evaluation.
 
-A model of Stable-Baselines3 spends most of a short batch outside its network: in checks, in
-conversions, in PyTorch's dispatch. Its deterministic actions are a multilayer perceptron's,
+A Stable-Baselines3 model spends most of a short batch outside its network: in checks, in
+conversions, in PyTorch's dispatch. Its deterministic actions are those of a multilayer perceptron,
 
     x ← f(x W + b)  for each layer,  f one of identity, ReLU, tanh
 
-and are computed here as just that, in float32 as the model does. The sums run in another order, so
-the last bits of an action may differ from the model's, as they do between batch sizes of the model
-itself. A network that is none of these, or answers otherwise on a few probes, is asked itself.
+computed here in float32, as in the model. The sums run in another order, so the last bits of an
+action may differ from the model's, as they do between batch sizes of the model itself. Any other
+network, and one whose actions differ on a few probes, is called directly.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e
 
 @dataclass(frozen=True)
 class Perceptron:
-    """A multilayer perceptron with the weights that a model had when it was copied.
+    """A multilayer perceptron with a copy of a model's weights.
 
     Attributes:
-      layers: for each its `W [in, out]`, its `b [out]`, and the function of its outputs.
-      low: `[A]` of the action space; None where the outputs are actions as they are.
-      high: `[A]`, as `low`. Outputs in [−1, 1] are then spread over the action space.
+      layers: `W [in, out]`, `b [out]` and the activation (None: identity) of each layer.
+      low: `[A]`, lower bound of the action space. None: the outputs are the actions.
+      high: `[A]`, upper bound. Outputs in [−1, 1] are then scaled to the action space.
     """
 
     layers: tuple[tuple[Weights, Weights, Activation | None], ...]
@@ -48,7 +48,7 @@ class Perceptron:
     high: Weights | None = None
 
     def __call__(self, observations: Observation) -> Weights:
-        """Actions `[B, A]` float32 of observations `[B, obs]`, not clipped."""
+        """Actions `[B, A]` float32 for observations `[B, O]`, not clipped."""
         x: Weights = np.asarray(observations, np.float32)
         for W, b, activation in self.layers:
             x = x @ W
@@ -60,18 +60,19 @@ class Perceptron:
         return self.low + 0.5 * (x + 1.0) * (self.high - self.low)
 
 
-def actor(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Policy:
-    """The deterministic policy of a model as it now is; later training does not change it.
+def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Policy:
+    """The deterministic policy of a model with its current weights.
 
     Args:
-      model: a Stable-Baselines3 model, or whatever else `evaluate` takes. Only a model's network
-        of the known kind is copied; anything else is asked itself, as it is when it is asked.
-      spec: the task, of a single agent.
-      action_range: of its actions; None takes the model's own action space.
+      model: a Stable-Baselines3 model, or anything else that `evaluate` accepts. Only the network
+        of a model is copied, so later training does not change it; other policies are called
+        directly.
+      spec: a single-agent task.
+      action_range: of the policy's actions; None takes the model's own action space.
 
     Returns:
       A callable from observations `[B, S + 2]` to actions `[B, A]` in units of the unit range,
-      which the environment clips to it.
+      which the environment clips.
 
     Raises:
       SpecError: the task is a team's.
@@ -79,23 +80,24 @@ def actor(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Poli
     """
     policy = as_policy(model, spec, action_range=action_range)
     if not isinstance(policy, Policy):
-        raise SpecError("team: an actor is one agent's. Evaluate a team with `evaluate`.")
-    network = getattr(model, "policy", model)
-    copied = _perceptron(network)
-    if copied is None:
+        raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
+    perceptron = _perceptron(getattr(model, "policy", model))
+    if perceptron is None:
         return policy
     width = spec.state_dim + 2
     probes = streams.uniform(0, "actor/probes", _PROBES * width).reshape(_PROBES, width)
     observations = probes.astype(np.float32)
+    expected, actions = policy.act(observations), perceptron(observations)
     # A subclass may do more than its layers say. NaN counts as a difference.
-    own, ours = policy.act(observations), copied(observations)
-    same = own.shape == ours.shape and np.allclose(ours, own, rtol=_TOLERANCE, atol=_TOLERANCE)
-    return replace(policy, act=copied) if same else policy
+    same = expected.shape == actions.shape and np.allclose(
+        actions, expected, rtol=_TOLERANCE, atol=_TOLERANCE
+    )
+    return replace(policy, act=perceptron) if same else policy
 
 
 def _perceptron(network: Any) -> Perceptron | None:
-    """The network's layers, copied; None where it is not a multilayer perceptron."""
-    if "stable_baselines3.common.policies" not in sys.modules:  # then it is no model of theirs
+    """A copy of the network; None if it is not a multilayer perceptron."""
+    if "stable_baselines3.common.policies" not in sys.modules:  # not imported: not an SB3 model
         return None
     from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -105,7 +107,7 @@ def _perceptron(network: Any) -> Perceptron | None:
         return None
     try:
         extractor, parts = _parts(network)
-    except AttributeError:  # a policy of another make
+    except AttributeError:  # a policy class of another package
         return None
     if type(extractor) is not FlattenExtractor:
         return None
@@ -126,15 +128,15 @@ def _perceptron(network: Any) -> Perceptron | None:
 
 
 def _parts(network: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Whence the features come, and the modules from there to the action, in order."""
+    """The features extractor, and the modules from features to action, in order."""
     from torch import nn
 
-    own = getattr(network, "actor", None)
-    if own is None:  # PPO, A2C, TRPO: the mean of a Gaussian
+    actor = getattr(network, "actor", None)
+    if actor is None:  # PPO, A2C, TRPO: the mean of a Gaussian
         return network.pi_features_extractor, (network.mlp_extractor.policy_net, network.action_net)
-    if hasattr(own, "latent_pi"):  # SAC, TQC: the mean of a Gaussian, squashed
-        return own.features_extractor, (own.latent_pi, own.mu, nn.Tanh())
-    return own.features_extractor, (own.mu,)  # TD3, DDPG
+    if hasattr(actor, "latent_pi"):  # SAC, TQC: the mean of a Gaussian, squashed
+        return actor.features_extractor, (actor.latent_pi, actor.mu, nn.Tanh())
+    return actor.features_extractor, (actor.mu,)  # TD3, DDPG
 
 
 def _flat(modules: Iterable[Any]) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""The environment that keeps the books: `SMEVecEnv`'s numbers, and the right sums of them."""
+"""The monitored environment: the numbers of `SMEVecEnv`, and their sums."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ SPEC = SMESpec(state_dim=3, action_dim=2, k=2, D=0.01, horizon=3)
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_its_steps_are_those_of_a_batch_of_one(action_range: Literal["unit", "symmetric"]) -> None:
+def test_steps_equal_those_of_a_batch_of_one(action_range: Literal["unit", "symmetric"]) -> None:
     from sme_registry.sb3 import SMEVecEnv
-    from sme_registry.training.metered import MeteredVecEnv
+    from sme_registry.training.monitored_env import MonitoredVecEnv
 
     batch: Any = SMEVecEnv(SPEC, 1, action_range=action_range)
-    metered: Any = MeteredVecEnv(SPEC, action_range=action_range)
-    assert metered.action_space == batch.action_space
-    assert metered.observation_space == batch.observation_space
-    for env in (batch, metered):
+    monitored: Any = MonitoredVecEnv(SPEC, action_range=action_range)
+    assert monitored.action_space == batch.action_space
+    assert monitored.observation_space == batch.observation_space
+    for env in (batch, monitored):
         env.seed(7)
-    np.testing.assert_array_equal(metered.reset(), batch.reset())
-    heard: list[int] = []
-    metered.after_step = heard.append
-    centre = (metered.action_space.low[0] + 1.0) / 2.0  # whence some episodes last, and some end
+    np.testing.assert_array_equal(monitored.reset(), batch.reset())
+    calls: list[int] = []
+    monitored.after_step = calls.append
+    centre = (
+        monitored.action_space.low[0] + 1.0
+    ) / 2.0  # where some episodes end early and some do not
     noise = np.random.default_rng(0).normal(scale=0.2, size=(300, 1, 2))
     actions = (centre + noise).astype(np.float32)
     regrets, ends = [], set()
     for action in actions:
-        ours, theirs = metered.step(action), batch.step(action)
+        ours, theirs = monitored.step(action), batch.step(action)
         for mine, its in zip(ours[:3], theirs[:3], strict=True):
             np.testing.assert_array_equal(mine, its)
             assert mine.dtype == its.dtype
@@ -45,16 +47,16 @@ def test_its_steps_are_those_of_a_batch_of_one(action_range: Literal["unit", "sy
         if ours[2][0]:
             ends.add(info["TimeLimit.truncated"])
     assert ends == {True, False}
-    assert metered.steps == 300
-    assert heard == list(range(1, 301))
-    assert metered.regret == pytest.approx(sum(regrets))
-    assert metered.seconds > 0.0
+    assert monitored.steps == 300
+    assert calls == list(range(1, 301))
+    assert monitored.regret == pytest.approx(sum(regrets))
+    assert monitored.seconds > 0.0
 
 
-def test_it_begins_where_it_is_told() -> None:
-    from sme_registry.training.metered import MeteredVecEnv
+def test_reset_uses_the_state_in_the_options() -> None:
+    from sme_registry.training.monitored_env import MonitoredVecEnv
 
-    env: Any = MeteredVecEnv(SPEC, action_range="unit")
+    env: Any = MonitoredVecEnv(SPEC, action_range="unit")
     env.set_options({"state": [0.1, 0.2, 0.3]})
     np.testing.assert_allclose(env.reset()[0, :3], [0.1, 0.2, 0.3], atol=1e-7)
     assert env.reset()[0, 0] != pytest.approx(0.1)

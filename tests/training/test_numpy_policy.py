@@ -1,4 +1,4 @@
-"""A model's actions as matrix products; and the model itself where they are no such thing."""
+"""A model's policy in NumPy, and the model itself where its network is of another kind."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
-from sme_registry.training.actor import Perceptron, actor
+from sme_registry.training.numpy_policy import Perceptron, numpy_policy
 
 sb3 = pytest.importorskip("stable_baselines3")
 torch = pytest.importorskip("torch")
@@ -19,7 +19,7 @@ OBSERVATIONS = np.random.default_rng(0).random((200, 5), dtype=np.float32)
 Range = Literal["unit", "symmetric"]
 
 
-def model(
+def new_model(
     algorithm: Any, action_range: Range = "symmetric", noise: float = 0.2, **kwargs: Any
 ) -> Any:
     """An untrained model, its weights moved so far that some of its actions are clipped."""
@@ -28,21 +28,21 @@ def model(
     env = SMEVecEnv(SPEC, action_range=action_range)
     if algorithm.__name__ in ("TD3", "DDPG", "SAC", "TQC"):
         kwargs["buffer_size"] = 1
-    made = algorithm("MlpPolicy", env, seed=0, device="cpu", **kwargs)
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **kwargs)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for parameter in made.policy.parameters():
+        for parameter in model.policy.parameters():
             parameter += noise * torch.randn(parameter.shape, generator=generator)
-    return made
+    return model
 
 
-def predicted(made: Any) -> Any:
-    """What SB3's `predict` says, in the unit range."""
-    actions = made.predict(OBSERVATIONS, deterministic=True)[0].astype(np.float64)
-    return (actions + 1.0) / 2.0 if made.action_space.low[0] < 0 else actions
+def predicted(model: Any) -> Any:
+    """The actions of SB3's `predict`, in the unit range."""
+    actions = model.predict(OBSERVATIONS, deterministic=True)[0].astype(np.float64)
+    return (actions + 1.0) / 2.0 if model.action_space.low[0] < 0 else actions
 
 
-def found(name: str) -> Any:
+def algorithm_class(name: str) -> Any:
     """The class, of SB3 or else of sb3-contrib."""
     return getattr(sb3, name, None) or getattr(pytest.importorskip("sb3_contrib"), name)
 
@@ -50,26 +50,26 @@ def found(name: str) -> Any:
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
 @pytest.mark.parametrize("algorithm", ["PPO", "A2C", "TRPO", "TD3", "DDPG", "SAC", "TQC"])
 def test_the_copied_network_acts_as_predict_does(algorithm: str, action_range: Range) -> None:
-    made = model(found(algorithm), action_range)
-    copied = actor(made, SPEC)
+    model = new_model(algorithm_class(algorithm), action_range)
+    copied = numpy_policy(model, SPEC)
     assert isinstance(copied.act, Perceptron)
     assert copied.action_range == action_range
-    actions, expected = np.clip(copied(OBSERVATIONS), 0.0, 1.0), predicted(made)
+    actions, expected = np.clip(copied(OBSERVATIONS), 0.0, 1.0), predicted(model)
     np.testing.assert_allclose(actions, expected, rtol=0, atol=5e-6)
     assert expected.std() > 0.1
     if algorithm in ("PPO", "A2C", "TRPO"):  # an unbounded mean, which SB3 clips
         assert np.mean((expected == 0.0) | (expected == 1.0)) > 0.05
 
 
-def test_weights_are_those_of_when_it_was_copied() -> None:
-    made = model(sb3.TD3)
-    copied, before = actor(made, SPEC), predicted(made)
+def test_later_training_does_not_change_the_copy() -> None:
+    model = new_model(sb3.TD3)
+    copied, before = numpy_policy(model, SPEC), predicted(model)
     with torch.no_grad():
-        for parameter in made.policy.parameters():
+        for parameter in model.policy.parameters():
             parameter *= -1.0
     np.testing.assert_allclose(copied(OBSERVATIONS), before, atol=5e-6)
-    assert np.abs(predicted(made) - before).max() > 0.1
-    np.testing.assert_allclose(actor(made, SPEC)(OBSERVATIONS), predicted(made), atol=5e-6)
+    assert np.abs(predicted(model) - before).max() > 0.1
+    np.testing.assert_allclose(numpy_policy(model, SPEC)(OBSERVATIONS), predicted(model), atol=5e-6)
 
 
 @pytest.mark.parametrize(
@@ -79,28 +79,28 @@ def test_weights_are_those_of_when_it_was_copied() -> None:
         ("SAC", {"use_sde": True}),  # whose mean is clamped before tanh
     ],
 )
-def test_a_network_of_another_kind_is_asked_itself(algorithm: str, settings: Any) -> None:
-    made = model(getattr(sb3, algorithm), **settings)
-    asked = actor(made, SPEC)
-    assert not isinstance(asked.act, Perceptron)
-    np.testing.assert_allclose(np.clip(asked(OBSERVATIONS), 0, 1), predicted(made), atol=1e-7)
+def test_a_network_of_another_kind_is_called_directly(algorithm: str, settings: Any) -> None:
+    model = new_model(getattr(sb3, algorithm), **settings)
+    policy = numpy_policy(model, SPEC)
+    assert not isinstance(policy.act, Perceptron)
+    np.testing.assert_allclose(np.clip(policy(OBSERVATIONS), 0, 1), predicted(model), atol=1e-7)
 
 
-def test_a_network_that_does_more_than_its_layers_say_is_asked_itself() -> None:
-    made = model(sb3.TD3, noise=0.0)
-    plain = made.policy.actor.forward
-    made.policy.actor.forward = lambda observations: plain(observations) * 0.5
-    asked = actor(made, SPEC)
-    assert not isinstance(asked.act, Perceptron)
-    np.testing.assert_allclose(asked(OBSERVATIONS), predicted(made), atol=1e-7)
+def test_a_network_that_does_more_than_its_layers_say_is_called_directly() -> None:
+    model = new_model(sb3.TD3, noise=0.0)
+    plain = model.policy.actor.forward
+    model.policy.actor.forward = lambda observations: plain(observations) * 0.5
+    policy = numpy_policy(model, SPEC)
+    assert not isinstance(policy.act, Perceptron)
+    np.testing.assert_allclose(policy(OBSERVATIONS), predicted(model), atol=1e-7)
 
 
-def test_a_callable_is_its_own_actor() -> None:
-    policy = actor(lambda observations: observations[:, :2], SPEC)
+def test_a_callable_is_called_directly() -> None:
+    policy = numpy_policy(lambda observations: observations[:, :2], SPEC)
     np.testing.assert_array_equal(policy(OBSERVATIONS), OBSERVATIONS[:, :2].astype(np.float64))
 
 
-def test_a_team_has_no_single_actor() -> None:
+def test_a_team_is_rejected() -> None:
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match="an actor is one agent's"):
-        actor(lambda observations: observations[:, :1], team)
+    with pytest.raises(SpecError, match=r"^team: must be null"):
+        numpy_policy(lambda observations: observations[:, :1], team)

@@ -1,8 +1,7 @@
-"""`MeteredVecEnv`: the environment that a study's agents train in, which keeps the books.
+"""`MonitoredVecEnv`: a training environment that counts its steps, their regret and their time.
 
-Every learner steps its environment, whatever else it does. So what a run needs to know beside its
-learner is counted here: the steps, their exact regret, the time they took; and after each of them
-somebody may be told, to evaluate the learner when that is due. No learner needs a hook for it.
+Every learner steps its environment, so counting here needs no hook in the learner. `after_step` is
+called after each step, for example to evaluate the learner at fixed steps.
 
 Imports Stable-Baselines3; import it inside functions only.
 """
@@ -21,22 +20,22 @@ from sme_registry.sb3 import LanesVecEnv
 from sme_registry.spec import SMESpec
 
 
-class MeteredVecEnv(LanesVecEnv):
+class MonitoredVecEnv(LanesVecEnv):
     """One environment as an SB3 `VecEnv`, with its steps counted.
 
-    The same numbers, bit for bit, as `SMEVecEnv` with one environment. But its step is a single
-    environment's, without a batch around it: beside PPO's 0.5 ms a step that is worth having.
+    The same numbers, bit for bit, as `SMEVecEnv` with one environment, without the overhead of a
+    batch: next to PPO's 0.5 ms a step that saves time worth having.
 
     Args:
-      spec: the task, of a single agent.
+      spec: a single-agent task.
       action_range: "symmetric" or "unit".
 
     Attributes:
-      steps: taken so far.
-      regret: the sum of their regret.
-      seconds: of this thread's CPU time that they took.
-      after_step: called after each step with `steps`, and not in `seconds`; what it raises ends
-        the training.
+      steps: environment steps taken so far.
+      regret: sum of their regret.
+      seconds: CPU time of this thread spent in them.
+      after_step: called with `steps` after each step; its time is not in `seconds`. An exception
+        that it raises ends the training.
     """
 
     def __init__(self, spec: SMESpec, *, action_range: Literal["unit", "symmetric"]) -> None:
@@ -46,7 +45,7 @@ class MeteredVecEnv(LanesVecEnv):
         self.after_step: Callable[[int], None] = lambda steps: None
 
     def reset(self) -> Observation:
-        """Begin an episode, with the seed and options set before; `[1, S + 2]`."""
+        """Begin an episode with the seed and options set before; observations `[1, S + 2]`."""
         observation, _ = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._has_begun()
         return observation[None]
