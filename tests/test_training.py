@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import (
@@ -28,8 +27,7 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
-from sme_registry.terminal.interrupts import uninterrupted
-from sme_registry.terminal.progress import Meter, duration
+from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.training import ALGORITHMS, RunRecord, TrainingResult, train
 from sme_registry.training.algorithms import known_algorithm
 from sme_registry.training.episodes import COLUMNS, Episode, EpisodeLog, read_episodes
@@ -276,7 +274,7 @@ def test_an_interrupt_waits_until_what_is_being_saved_is_written() -> None:
     written, before = [], signal.getsignal(signal.SIGINT)
 
     def save() -> None:
-        with uninterrupted():
+        with defer_interrupts():
             signal.raise_signal(signal.SIGINT)
             written.append("checkpoint and record")
 
@@ -429,32 +427,6 @@ def test_a_csv_of_something_else_is_refused(tmp_path: Path) -> None:
     path.write_text("a,b\n1,2\n")
     with pytest.raises(OptionError, match="columns"):
         read_episodes(path)
-
-
-def test_the_meter_prints_lines_where_there_is_no_terminal() -> None:
-    text = io.StringIO()
-    with Meter("training", 10, console=Console(file=text, width=200)) as meter:
-        meter.update(4, "note")
-        meter.update(10, "note")
-    (line,) = text.getvalue().splitlines()
-    assert line.startswith("training: 10 of 10 steps")
-    assert line.endswith("done · note")
-
-
-def test_the_meter_draws_a_bar_in_a_terminal() -> None:
-    text = io.StringIO()
-    console = Console(file=text, force_terminal=True, width=160)
-    with Meter("training", 10, console=console) as meter:
-        meter.update(10, "mean regret 0.5")
-    assert "mean regret 0.5" in text.getvalue()
-    assert "10/10" in text.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7500, "2 h 5 min")]
-)
-def test_durations_are_in_words(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
 
 
 TEAM = SMESpec.from_dict(

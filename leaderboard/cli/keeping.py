@@ -12,7 +12,7 @@ from rich.markup import escape
 from leaderboard.cli.options import BoardFolder, ProtocolName, SuiteName, find_suite
 from leaderboard.errors import BoardError
 from sme_registry.errors import MissingDependencyError
-from sme_registry.terminal import Meter, err, out, print_json
+from sme_registry.terminal import Progress, err, out, print_json
 
 
 def init(
@@ -80,8 +80,8 @@ def score(
     if not waiting:
         out().print("Nothing waits to be scored.")
         return
-    with Meter("scoring", waiting, console=err(), unit="submissions") as meter:
-        run_scorers(board, workers, progress=meter.of)
+    with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
+        run_scorers(board, workers, progress=progress.update_of)
     with Store.open(board, read_only=True) as store:
         now = [entry.status for entry in store.entries() if entry.id not in before]
     counts = {name: now.count(name) for name in ("scored", "rejected", "waiting", "withdrawn")}
@@ -107,8 +107,8 @@ def site(
     target = board / "site" if out_folder is None else out_folder
     with Store.open(board, read_only=True) as store:
         total = len(store.entries())
-        with Meter("writing", total, console=err(), unit="pages") as meter:
-            index = write_site(store, target, progress=meter.of)
+        with Progress("writing", total, console=err(), unit="pages") as progress:
+            index = write_site(store, target, progress=progress.update_of)
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
 
 

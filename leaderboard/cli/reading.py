@@ -13,7 +13,7 @@ from rich.table import Table
 from leaderboard.cli.options import BoardFolder
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
-from sme_registry.terminal import Meter, err, fixed, out, print_json, print_pairs
+from sme_registry.terminal import Progress, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:
     from leaderboard.documents.result import Estimate, Result
@@ -247,10 +247,10 @@ def verify(
 
     from leaderboard.scoring.verify import verify as verify_board
 
-    meter = Meter("verifying", 1, console=err(), unit="rows", shown=not json)
-    with meter:
+    progress = Progress("verifying", 1, console=err(), unit="rows", shown=not json)
+    with progress:
         report = verify_board(
-            board, rescore=rescore, seed=seed, contains=contains, progress=meter.of
+            board, rescore=rescore, seed=seed, contains=contains, progress=progress.update_of
         )
     if json:
         print_json(asdict(report))

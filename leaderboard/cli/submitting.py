@@ -21,7 +21,7 @@ from leaderboard.cli.options import (
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.terminal import Meter, err, out, print_json
+from sme_registry.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
     from leaderboard.documents.result import Result
@@ -123,7 +123,7 @@ def new(
 
     folders = _expanded(runs)
     file = find_suite_file(suite)
-    with Meter("exporting", max(1, len(folders)), console=err(), unit="runs") as meter:
+    with Progress("exporting", max(1, len(folders)), console=err(), unit="runs") as progress:
         made = make_bundle(
             bundle,
             suite=file,
@@ -138,7 +138,7 @@ def new(
             statement=statement,
             runs_started=_started(started or []),
             force=force,
-            progress=meter.of,
+            progress=progress.update_of,
         )
     out().print(f"{made.signed.id}\n{len(made.signed.submission.runs)} runs", soft_wrap=True)
     out().print(f"Next: sme-leaderboard check {escape(str(bundle))}", soft_wrap=True)
@@ -214,8 +214,8 @@ def check(
         key="0" * 64,
     )
     check_submission(board, submission, datetime.datetime.now(datetime.UTC))
-    with Meter("scoring", len(submission.runs), console=err(), unit="states") as meter:
-        result = score_submission(board, submission, read.artefact, progress=meter.of)
+    with Progress("scoring", len(submission.runs), console=err(), unit="states") as progress:
+        result = score_submission(board, submission, read.artefact, progress=progress.update_of)
     if json:
         print_json(result.to_dict())
     _refuse_rejected(result)
@@ -264,8 +264,8 @@ def submit(
 
     if is_url(board):
         total = len(Bundle.read(bundle).signed.submission.runs)
-        with Meter("uploading", total, console=err(), unit="artefacts") as meter:
-            id = client.submit(board, bundle, SigningKey.read(key), progress=meter.of)
+        with Progress("uploading", total, console=err(), unit="artefacts") as progress:
+            id = client.submit(board, bundle, SigningKey.read(key), progress=progress.update_of)
     else:
         with Store.open(Path(board)) as store:
             id = intake.submit_bundle(store, bundle)

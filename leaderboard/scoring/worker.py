@@ -28,7 +28,7 @@ from leaderboard.scoring.score import score_submission
 from leaderboard.store import Claim, Store
 from leaderboard.store.store import LEASE_SECONDS
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
-from sme_registry.terminal.interrupts import hear, starting_deaf, uninterrupted
+from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts, unblock_interrupts
 
 Progress = Callable[[int, int], None]
 
@@ -184,7 +184,7 @@ def run_scorers(
                     not until_empty or (len(alive) < left and store.claimable())
                 ):
                     name = worker_name()
-                    with uninterrupted(), starting_deaf():  # or it would be nobody's
+                    with defer_interrupts(), block_interrupts():  # or it would be nobody's
                         alive[name] = _start(path, name, until_empty, lease_seconds)
                     if started is not None:
                         started(alive[name].process.pid or 0)
@@ -239,7 +239,7 @@ def _scorer_process(
     signal.signal(signal.SIGINT, interrupted)
     parent = multiprocessing.parent_process()
     try:
-        hear()
+        unblock_interrupts()
         run_scorer(
             path,
             worker=worker,

@@ -46,7 +46,7 @@ from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import MissingDependencyError, SMEError
-from sme_registry.terminal.interrupts import hear, starting_deaf
+from sme_registry.terminal.interrupts import block_interrupts, unblock_interrupts
 
 try:
     from fastapi import FastAPI, Request
@@ -653,7 +653,7 @@ def _scorers(path: str, workers: int) -> Iterator[None]:
     process = multiprocessing.get_context("spawn").Process(
         target=_mind_scorers, args=(path, workers), name="scorers"
     )
-    with starting_deaf():
+    with block_interrupts():
         process.start()
     try:
         yield
@@ -678,7 +678,7 @@ def _mind_scorers(path: str, workers: int) -> None:
     threading.Thread(target=_end_with_parent, name="end with the server", daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt):
         try:
-            hear()
+            unblock_interrupts()
             run_scorers(path, workers, until_empty=False)
         except SMEError as error:
             _log.error("no more scoring here: %s", error)

@@ -90,10 +90,10 @@ def make(
       sme dataset make Plane1 --nu 0.25 --coverage -0.2 --name sme/inner-v0 --out data
     """
     from sme_registry.datasets import make_dataset
-    from sme_registry.terminal.progress import Meter
+    from sme_registry.terminal.progress import Progress
 
     spec = resolve(task).derive(**names.overrides(set_ or []))
-    with Meter("collecting", transitions, unit="transitions", console=err()) as meter:
+    with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
         made = make_dataset(
             spec,
             nu,
@@ -106,7 +106,7 @@ def make(
             name=name,
             folder=out_folder,
             force=force,
-            progress=lambda done, total: meter.update(done),
+            progress=lambda done, total: progress.update(done),
         )
     if json:
         print_json(_summary(made))

@@ -80,13 +80,13 @@ def train(
     from sme_registry import offline
     from sme_registry.datasets import open_dataset
     from sme_registry.offline.hyperparameters import known_algorithm
-    from sme_registry.terminal.progress import Meter
+    from sme_registry.terminal.progress import Progress
 
     algorithm = known_algorithm(algorithm)
     opened = open_dataset(dataset, folder)
     if out_folder is None:
         out_folder = Path("runs") / f"{opened.id.rsplit('/', 1)[-1]}-{algorithm}-seed{seed}"
-    with Meter(f"training {algorithm.upper()}", max(1, steps), console=err()) as meter:
+    with Progress(f"training {algorithm.upper()}", max(1, steps), console=err()) as progress:
         result = offline.train_offline(
             opened,
             algorithm=algorithm,
@@ -98,7 +98,7 @@ def train(
             protocol=protocol,
             folder=out_folder,
             force=force,
-            progress=lambda done, total, note: meter.update(done, note),
+            progress=lambda done, total, note: progress.update(done, note),
         )
     if json:
         report = result.report.to_dict()

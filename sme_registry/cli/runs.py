@@ -73,7 +73,7 @@ def evaluate(
       sme evaluate runs/Team4-PPO-seed0/model.zip Team4
     """
     from sme_registry import evaluation
-    from sme_registry.terminal.progress import Meter
+    from sme_registry.terminal.progress import Progress
 
     spec = resolve(task).derive(**names.overrides(set_ or []))
     judged_by = evaluation.resolve_protocol(protocol)
@@ -83,14 +83,14 @@ def evaluate(
     found = find_policy(policy, spec)
     states = judged_by.states_per_region * len(judged_by.edges)
     shown = policy if policy in REFERENCES or ":" in policy else Path(policy).stem
-    with Meter("evaluating", states, unit="states", console=err()) as meter:
+    with Progress("evaluating", states, unit="states", console=err()) as progress:
         report = evaluation.evaluate(
             found,
             spec,
             judged_by,
             action_range=action_range,
             name=shown,
-            progress=lambda done, total: meter.update(done),
+            progress=lambda done, total: progress.update(done),
         )
     written = [] if target is None else [report.write(target), *_figures(report, found, target)]
     if json:

@@ -24,14 +24,12 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.spec.resolve import resolve
-from sme_registry.terminal.output import err, out, print_json
-from sme_registry.terminal.progress import duration
+from sme_registry.terminal import duration_range, err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.estimate import Span
     from sme_registry.studies.engine.runner import StudyStatus
 
-_SECONDS_PER_DAY = 86_400
 _LINES_OF_FAILURES = 20
 _BESIDE_FROM = ("path", "name", "description", "source", "force")
 
@@ -366,7 +364,7 @@ def plan(
     done = f", of which {len(cells) - len(waiting):,} have finished" if results else ""
     out().print(f"{len(cells):,} cells{done}. To run them takes about")
     for where, span in times.items():
-        out().print(f"  {where + ':':32}{_span(span)}")
+        out().print(f"  {where + ':':32}{duration_range(*span)}")
     guessed = sorted({cell.uses for cell in waiting if not estimator.knows(cell)})
     if guessed:
         out().print(
@@ -423,7 +421,7 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
             f"{cell.steps:,}",
             f"{cell.evaluations:,} × {cell.evaluation_episodes}",
             f"{len(cells):,}",
-            _span((low, high)),
+            duration_range(low, high),
         )
     return table
 
@@ -564,7 +562,8 @@ def _print_status(status: StudyStatus) -> None:
     if status.left.high > 0:
         here = available_cores()
         shared = type(status.left)(status.left.low / here, status.left.high / here)
-        out().print(f"left: {_span(status.left)} of one core, {_span(shared)} of the {here} here")
+        one, all_here = duration_range(*status.left), duration_range(*shared)
+        out().print(f"left: {one} of one core, {all_here} of the {here} here")
     if status.others:
         out().print(f"[dim]{status.others:,} results in the folder are of no cell of this plan[/]")
     for cell in status.failed[:_LINES_OF_FAILURES]:
@@ -632,18 +631,6 @@ def _budgets(texts: list[str] | None) -> tuple[int | None, dict[str, int]]:
             raise OptionError(f"--steps {text!r}: {name or 'all'} is given twice. Remove one.")
         found[name] = int(number)
     return found.pop("", None), found
-
-
-def _span(span: Span | tuple[float, float]) -> str:
-    """`3 min 10 s`, or `2 h 0 min to 4 h 5 min`."""
-    low, high = map(_days, span)
-    return low if low == high else f"{low} to {high}"
-
-
-def _days(seconds: float) -> str:
-    if seconds < 2 * _SECONDS_PER_DAY:
-        return duration(seconds)
-    return f"{seconds / _SECONDS_PER_DAY:.1f} days"
 
 
 def _unique(values: Any) -> list[str]:

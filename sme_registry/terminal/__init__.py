@@ -1,14 +1,16 @@
-"""What people see of a program: tables, plain JSON, progress, and errors as one line."""
+"""Terminal output: tables, plain JSON, progress, and errors as one line."""
 
 from sme_registry.terminal.commands import CommandGroup, application, version_option
-from sme_registry.terminal.output import err, failure, fixed, mark, out, print_json, print_pairs
-from sme_registry.terminal.progress import Meter, duration
+from sme_registry.terminal.numbers import duration, duration_range, fixed
+from sme_registry.terminal.output import err, failure, mark, out, print_json, print_pairs
+from sme_registry.terminal.progress import Progress
 
 __all__ = [
     "CommandGroup",
-    "Meter",
+    "Progress",
     "application",
     "duration",
+    "duration_range",
     "err",
     "failure",
     "fixed",

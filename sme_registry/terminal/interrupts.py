@@ -1,40 +1,46 @@
-"""Ctrl-C at moments where it would leave something half done, or nobody's."""
+"""Keep an interrupt (Ctrl-C) from leaving files half written or processes without an owner."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
 
 
 @contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """An interrupt (Ctrl-C) waits until the block is done, so that what it writes agrees.
+def defer_interrupts() -> Iterator[None]:
+    """Deliver an interrupt only after the block, so that the files it writes agree.
 
-    And inside `torch.save` it would turn into an error of PyTorch's about a broken archive.
+    Inside `torch.save`, an interrupt would become a PyTorch error about a broken archive.
     """
-    pressed: list[int] = []
-    handled = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, lambda *_: pressed.append(1)) if handled else None
+    received: list[int] = []
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, lambda *_: received.append(1)) if in_main_thread else None
     try:
         yield
     finally:
         if before is not None:
             signal.signal(signal.SIGINT, before)
-    if pressed:
+    if received:
         signal.raise_signal(signal.SIGINT)
 
 
 @contextlib.contextmanager
-def starting_deaf() -> Iterator[None]:
-    """Processes started inside hear no interrupt from their first instruction on.
+def block_interrupts() -> Iterator[None]:
+    """Processes started inside the block begin with interrupts blocked.
 
-    Without it one that comes while they still import ends them with a traceback of their own. A
-    terminal sends Ctrl-C to all of them.
+    A terminal sends Ctrl-C to all of them; one that is still importing would print a traceback.
+    `unblock_interrupts`, or ignoring the signal, ends the block in the child. Windows has no signal
+    masks, so there this does nothing.
     """
-    resource_tracker.ensure_running()  # which would lift the block
+    if sys.platform == "win32":
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # starting it later would unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -42,6 +48,7 @@ def starting_deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def hear() -> None:
-    """Hear interrupts from now on, and one that came before: for a process that started deaf."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+def unblock_interrupts() -> None:
+    """Accept interrupts in a process that began with them blocked, including one already sent."""
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,4 +1,4 @@
-"""What commands print: tables and plain JSON on standard output, everything else on the other."""
+"""What commands print: results on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _MARKS = {
     "passed": "[green]passed[/]",
     "warning": "[yellow]warning[/]",
     "refused": "[red]refused[/]",
-    "reported": "[dim]shown[/]",
+    "reported": "[dim]reported[/]",
 }
 
 
 class _Out(Console):
-    """Rich would exit with 1 where the reader has left; `app` decides that."""
+    """Leaves a broken pipe to `CommandGroup`; Rich would exit with code 1."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
 
 
 def out() -> Console:
-    """Standard output, looked up anew: tests and pipes replace it."""
+    """Standard output as it is now: tests and pipes replace it."""
     return _Out(file=sys.stdout, highlight=False)
 
 
@@ -47,7 +47,7 @@ def print_json(value: Any) -> None:
 
 
 def print_pairs(title: str, pairs: dict[str, object]) -> None:
-    """Names and values, one a line, under a title."""
+    """Names and values, one per line, under a title."""
     out().print(title)
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="cyan", no_wrap=True)
@@ -60,8 +60,3 @@ def print_pairs(title: str, pairs: dict[str, object]) -> None:
 def mark(outcome: str) -> str:
     """An outcome in its colour."""
     return _MARKS[outcome]
-
-
-def fixed(value: float, digits: int = 3) -> str:
-    """A number as every table shows it: fixed digits, and no negative zero."""
-    return f"{value:z.{digits}f}"

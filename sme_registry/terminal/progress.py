@@ -1,71 +1,72 @@
-"""How a long job shows where it is: a bar in a terminal, a line every few seconds elsewhere."""
+"""`Progress`: how far a long job is, as bars in a terminal or as a line every few seconds."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.markup import escape
+from rich.progress import BarColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+
+from sme_registry.terminal.numbers import duration
 
 SECONDS_BETWEEN_LINES = 5.0
 _SECONDS_BETWEEN_EQUAL_LINES = 60.0
+_SECONDS_BETWEEN_BARS = 0.5
+_PARTS_NAMED = 3  # in a line
 
 
-class Meter:
-    """Shows steps done, steps a second, the time left, and a note.
+class Progress:
+    """Shows steps done, the rate, the time left, a note, and the parts of the job that are running.
 
     Args:
-      what: the job, as in `training`.
+      title: the job, such as `training`.
       total: its steps.
-      done: those that an earlier session has done.
-      console: where to; None for standard error. Not a terminal: lines in place of a bar.
-      unit: of the steps.
+      done: steps that were done before it started.
+      console: where to print; None for standard error. If it is no terminal, lines replace bars.
+      unit: what a step is, in the plural.
+      seconds_left: estimates the time left; by default it follows from the rate.
       shown: False shows nothing.
     """
 
     def __init__(
         self,
-        what: str,
+        title: str,
         total: int,
         *,
         done: int = 0,
         console: Console | None = None,
         unit: str = "steps",
+        seconds_left: Callable[[], float] | None = None,
         shown: bool = True,
     ) -> None:
-        self._what, self._total, self._begun_at, self._unit = what, total, done, unit
+        self._title, self._unit = title, unit
+        self._total, self._done_before, self._done = total, done, done
         self._console = console or Console(stderr=True)
-        self._shown = shown
-        self._start = self._last_line = time.monotonic()
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._line = self._printed = ""
+        self._seconds_left, self._shown = seconds_left, shown
+        self._note = self._printed = ""
+        self._parts: dict[str, float] = {}
+        self._start = self._last = self._printed_at = time.monotonic()
+        self._bars: Bars | None = None
+        self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
-        self._start = self._last_line = time.monotonic()
+        self._start = self._last = time.monotonic()
         if self._shown and self._console.is_terminal:
-            self._bar = Progress(
+            self._bars = Bars(
                 TextColumn("{task.description}"),
                 BarColumn(bar_width=24),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[rate]}"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[note]}"),
+                TextColumn("{task.fields[text]}"),
                 console=self._console,
             )
-            self._task = self._bar.add_task(
-                self._what, total=self._total, completed=self._begun_at, rate="", note=""
+            self._tasks[""] = self._bars.add_task(
+                escape(self._title), total=self._total, completed=self._done, text=""
             )
-            self._bar.start()
+            self._bars.start()
         return self
 
     def __exit__(
@@ -74,68 +75,108 @@ class Meter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-        elif self._line and error is None:
+        for name in tuple(self._parts):
+            self._remove(name)
+        if self._bars is not None:
+            self._draw()
+            self._bars.stop()
+        elif self._shown and error is None and self._done_before < self._done >= self._total:
             self._print()
 
-    def update(self, done: int, note: str = "") -> None:
-        """Say where the job is; cheap enough to call at every step.
+    def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
+        """Set how far the job is; cheap enough to call at every step.
 
         Args:
-          done: steps done, over all sessions.
-          note: what else to show.
+          done: steps done, including those before the start.
+          note: more text to show; None keeps the last one.
+          total: steps of the job, if they have changed.
         """
-        if not self._shown:
-            return
+        self._done = done
+        self._note = self._note if note is None else note
+        self._total = self._total if total is None else total
+        self._refresh()
+
+    def update_of(self, done: int, total: int) -> None:
+        """Set how far the job is and how long it is, as callbacks `(done, total)` report it."""
+        self.update(done, total=total)
+
+    def start_part(self, name: str) -> None:
+        """Show a part of the job that runs from now on."""
+        self._parts[name] = 0.0
+        if self._bars is not None:
+            label = f"  {escape(name)}"
+            self._tasks[name] = self._bars.add_task(label, total=1.0, text="starting")
+        self._refresh()
+
+    def update_part(self, name: str, share: float, note: str = "") -> None:
+        """Set how far a part is, from 0 to 1."""
+        self._parts[name] = share
+        if self._bars is not None:
+            self._bars.update(self._tasks[name], completed=share, text=note)
+        self._refresh()
+
+    def end_part(self, name: str) -> None:
+        """Stop showing a part; of one that was never started this does nothing."""
+        self._remove(name)
+        self._refresh()
+
+    def message(self, text: str) -> None:
+        """Print a line of its own, above the bars."""
+        if self._shown:
+            self._console.print(escape(text), highlight=False, soft_wrap=True)
+
+    def _remove(self, name: str) -> None:
+        self._parts.pop(name, None)
+        if self._bars is not None and name in self._tasks:
+            self._bars.remove_task(self._tasks.pop(name))
+
+    def _refresh(self) -> None:
         now = time.monotonic()
-        rate = (done - self._begun_at) / max(now - self._start, 1e-9)
-        if self._bar is not None and self._task is not None:
-            self._bar.update(
-                self._task,
-                completed=min(done, self._total),
-                rate=self._rate(rate),
-                note=note,
-            )
-        elif now - self._last_line >= SECONDS_BETWEEN_LINES or done >= self._total:
-            left = (self._total - done) / rate if rate > 0 else 0.0
-            parts = [
-                f"{self._what}: {done:,} of {self._total:,} {self._unit}",
-                *([self._rate(rate)] if rate > 0 else []),
-                "done" if done >= self._total else f"{duration(left)} left" if rate > 0 else "…",
-            ]
-            self._line = " · ".join([*parts, note] if note else parts)
-            if done < self._total:  # the last line is printed once, at the end
-                self._print()
+        pause = SECONDS_BETWEEN_LINES if self._bars is None else _SECONDS_BETWEEN_BARS
+        if not self._shown or now - self._last < pause:
+            return
+        self._last = now
+        if self._bars is not None:
+            self._draw()
+        elif self._done < self._total:  # the last line is printed once, at the end
+            self._print()
 
-    def of(self, done: int, total: int) -> None:
-        """As `update`, for work that learns on its way how much there is."""
-        if total != self._total:
-            self._total = total
-            if self._bar is not None and self._task is not None:
-                self._bar.update(self._task, total=total)
-        self.update(done)
-
-    def _rate(self, rate: float) -> str:
-        """`280 steps/s`; of what takes longer than a second each, `3 s a run`."""
-        if 0 < rate < 1 and self._unit.endswith("s"):
-            return f"{duration(1 / rate)} a {self._unit[:-1]}"
-        return f"{rate:,.0f} {self._unit}/s"
+    def _draw(self) -> None:
+        assert self._bars is not None
+        done, text = min(self._done, self._total), " · ".join(self._summary())
+        self._bars.update(self._tasks[""], completed=done, total=self._total, text=text)
 
     def _print(self) -> None:
         now = time.monotonic()
-        if self._line == self._printed and now - self._last_line < _SECONDS_BETWEEN_EQUAL_LINES:
-            return
-        self._printed = self._line
-        self._console.print(self._line, highlight=False, soft_wrap=True)
-        self._last_line, self._line = time.monotonic(), ""
+        line = f"{self._title}: {' · '.join([*self._summary(), *self._running()])}"
+        if line != self._printed or now - self._printed_at >= _SECONDS_BETWEEN_EQUAL_LINES:
+            self._printed, self._printed_at = line, now
+            self.message(line)
+
+    def _summary(self) -> list[str]:
+        """`4 of 10 steps`, the rate, the time left, the note."""
+        rate = (self._done - self._done_before) / max(time.monotonic() - self._start, 1e-9)
+        parts = [f"{self._done:,} of {self._total:,} {self._unit}"]
+        if rate > 0 and self._seconds_left is None:
+            parts.append(_rate(rate, self._unit))
+        if self._done >= self._total:
+            parts.append("done")
+        elif self._seconds_left is not None:
+            parts.append(f"about {duration(self._seconds_left())} left")
+        elif rate > 0:
+            parts.append(f"about {duration((self._total - self._done) / rate)} left")
+        return [*parts, self._note] if self._note else parts
+
+    def _running(self) -> list[str]:
+        if not self._parts:
+            return []
+        parts = [f"{name} {share:.0%}" for name, share in self._parts.items()]
+        more = f", and {len(parts) - _PARTS_NAMED} more" if len(parts) > _PARTS_NAMED else ""
+        return [f"running: {', '.join(parts[:_PARTS_NAMED])}{more}"]
 
 
-def duration(seconds: float) -> str:
-    """`42 s`, `3 min 10 s`, `2 h 5 min`."""
-    whole = max(0, round(seconds))
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+def _rate(rate: float, unit: str) -> str:
+    """`280 steps/s`; where a step takes longer than a second, `3 s per run`."""
+    if rate < 1 and unit.endswith("s"):
+        return f"{duration(1 / rate)} per {unit[:-1]}"
+    return f"{rate:,.0f} {unit}/s"

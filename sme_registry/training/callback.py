@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sme_registry.terminal.progress import Meter
+from sme_registry.terminal.progress import Progress
 from sme_registry.training.episodes import Episode, EpisodeLog
 
 _RECENT = 20  # episodes in the running mean that the progress shows
@@ -25,7 +25,7 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
 
     Args:
       log: where episodes go.
-      meter: what shows the progress.
+      progress: what shows the progress.
       checkpoint: called with the steps done, every `checkpoint_every` steps.
       checkpoint_every: steps.
       wall_before: seconds of training in earlier sessions.
@@ -35,14 +35,14 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
     def __init__(
         self,
         log: EpisodeLog,
-        meter: Meter,
+        progress: Progress,
         checkpoint: Callable[[int], None],
         checkpoint_every: int,
         wall_before: float,
         agents: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._log, self._meter, self._checkpoint = log, meter, checkpoint
+        self._log, self._progress, self._checkpoint = log, progress, checkpoint
         self._every, self._wall_before = checkpoint_every, wall_before
         self._agents = tuple(agents)
         self._lanes_each = max(1, len(self._agents))
@@ -85,7 +85,7 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
             self._log_episode(int(lane), int(not infos[lane]["TimeLimit.truncated"]))
         if dones.any():
             self._note = self._running_mean()
-        self._meter.update(self.steps_done, self._note)
+        self._progress.update(self.steps_done, self._note)
         return True
 
     def _log_episode(self, lane: int, terminated: int) -> None:

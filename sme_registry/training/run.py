@@ -30,8 +30,8 @@ from sme_registry.io import write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import materialize
-from sme_registry.terminal.interrupts import uninterrupted
-from sme_registry.terminal.progress import Meter
+from sme_registry.terminal.interrupts import defer_interrupts
+from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
@@ -278,7 +278,7 @@ def _learn(
     wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
 
     def save_checkpoint(steps_done: int) -> None:
-        with uninterrupted():
+        with defer_interrupts():
             checkpoint.save(model, path)
             record.updated(**_so_far(steps_done, log, callback)).write(folder)
 
@@ -286,11 +286,11 @@ def _learn(
     rollout = 1 if "buffer_size" in settings else model.n_steps
     chunk = rollout * record.num_envs
     total = begun_at + -(-max(0, record.steps - begun_at) // chunk) * chunk
-    with Meter(
+    with Progress(
         f"training {record.algorithm}", total, done=begun_at, console=console, shown=progress
-    ) as meter:
+    ) as bar:
         callback = RunCallback(
-            log, meter, save_checkpoint, record.checkpoint_every, wall_before, names
+            log, bar, save_checkpoint, record.checkpoint_every, wall_before, names
         )
         try:
             if begun_at < record.steps:
@@ -307,7 +307,7 @@ def _learn(
     steps_done = int(model.num_timesteps) // record.agents
     record = record.updated(**_so_far(steps_done, log, callback))
     saved = io.BytesIO()
-    with uninterrupted():
+    with defer_interrupts():
         model.save(saved)
         write_atomically(folder / MODEL, saved.getvalue())
         record.write(folder)
@@ -328,14 +328,14 @@ def _evaluate(
     model: Any, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> EvaluationReport:
     states = record.protocol.states_per_region * len(record.protocol.edges)
-    with Meter("evaluating", states, console=console, unit="states", shown=progress) as meter:
+    with Progress("evaluating", states, console=console, unit="states", shown=progress) as bar:
         report = evaluate(
             model,
             record.spec,
             record.protocol,
             action_range=record.action_range,
             name=record.algorithm,
-            progress=lambda done, total: meter.update(done),
+            progress=lambda done, total: bar.update(done),
         )
     report.write(folder / EVALUATION)
     return report

@@ -32,7 +32,7 @@ from sme_registry.io import parse_json, to_json
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.terminal.interrupts import starting_deaf, uninterrupted
+from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts
 from sme_registry.training.record import installed_versions
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
@@ -192,7 +192,7 @@ class Processes:
                         more = cell is not _END
                         if not isinstance(cell, Cell):
                             break
-                        with uninterrupted():  # or what has just begun would be nobody's
+                        with defer_interrupts():  # or what has just begun would be nobody's
                             job = _Job.start(self._run, cell, self._keep_models, Path(scratch))
                             running[job.connection] = job
                     if not running:
@@ -207,7 +207,7 @@ class Processes:
                         else:
                             progress(job.cell, *message)
             finally:
-                with uninterrupted():
+                with defer_interrupts():
                     for job in running.values():
                         job.kill()
 
@@ -230,7 +230,7 @@ class _Job:
         ours, theirs = spawn.Pipe(duplex=False)
         log = scratch / f"{cell.digest.removeprefix('sha256:')}.log"
         process = spawn.Process(target=_child, args=(theirs, run, cell, keep_model, log))
-        with _one_thread(), starting_deaf():
+        with _one_thread(), block_interrupts():
             process.start()
         theirs.close()  # so that the pipe ends when the process does
         return cls(cell, process, ours, log)

@@ -32,15 +32,19 @@ from sme_registry.studies.engine.executors import (
 )
 from sme_registry.studies.engine.ledger import Ledger, Lock
 from sme_registry.studies.engine.offline_cell import offline_name
-from sme_registry.studies.engine.progress import Board, title
 from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.studies.engine.scaling import selected
-from sme_registry.terminal.progress import duration
+from sme_registry.terminal import Progress, duration
 from sme_registry.training.algorithms import ALGORITHMS, refuse_without_dependencies
 
 State = Literal["done", "running", "failed", "waiting"]
 STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
 EXECUTORS = ("processes", "in-process", "ray")
+
+
+def label(planned: PlannedCell) -> str:
+    """A cell's name for people: `PPO on k-25, run 3`."""
+    return f"{planned.algorithm} on {planned.class_name}, run {planned.run}"
 
 
 @dataclass(frozen=True)
@@ -320,7 +324,7 @@ class _Run:
         self._planned = planned
         results = ledger.results(planned)
         self._failures = ledger.failures(planned.keys() - results.keys())
-        self.finished = len(results)
+        self.finished, self._failed = len(results), 0
         self._notes = list(_of_other_versions(results.values()))
         if keep_models:
             self._notes += _without_model(results.values(), ledger)
@@ -333,14 +337,21 @@ class _Run:
         self._running: dict[str, tuple[Lock, float]] = {}  # lock, and when it began
         self._shares: dict[str, float] = {}
         self._unwritten: list[Outcome] = []
-        name = f"study {file.versioned_name}"
-        self._board = Board(name, len(planned), len(results), self.left, console, shown=shown)
-        ledger.warn = self._board.say
+        self._progress = Progress(
+            f"study {file.versioned_name}",
+            len(planned),
+            done=len(results),
+            console=console,
+            unit="cells",
+            seconds_left=self.left,
+            shown=shown,
+        )
+        ledger.warn = self._progress.message
 
     def announce(self, before: StudyFile | None) -> None:
         """Say what is done, what is reused, and what is to come."""
         if before is not None and before.digest != self._file.digest:
-            self._board.say(
+            self._progress.message(
                 f"The folder's plan was {before.versioned_name} ({before.digest[:19]}…) and is now "
                 f"{self._file.versioned_name} ({self._file.digest[:19]}…). Results of cells that "
                 "are in both are reused, the others stay in the folder."
@@ -355,16 +366,16 @@ class _Run:
         if self._waiting:
             at_once = self._executor.workers
             parts.append(f"{at_once} at once, about {duration(self.left())}")
-        self._board.say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
+        self._progress.message(f"study {self._file.versioned_name}: {' · '.join(parts)}")
         for note in self._notes:
-            self._board.say(note)
+            self._progress.message(note)
 
     def go(self) -> None:
         """Run everything that waits."""
         if not self._waiting:
             return
-        outcomes = self._executor.map(self._cells(), self._told)
-        with self._board:
+        outcomes = self._executor.map(self._cells(), self._report)
+        with self._progress:
             try:
                 for outcome in outcomes:
                     self._ended(outcome)
@@ -418,27 +429,33 @@ class _Run:
             failed_since = failure is not None and failure.attempts > (seen.attempts if seen else 0)
             if result is None and not failed_since:
                 self._running[key] = lock, time.monotonic()
-                self._board.began(planned)
+                self._progress.start_part(label(planned))
                 return planned.cell
             lock.release()
             self.finished += result is not None
-            self._board.ended(planned, failed=result is None)
+            self._end(planned, failed=result is None)
         return None
 
-    def _told(self, cell: Cell, done: int, total: int) -> None:
-        key = cell.digest
-        self._shares[key] = done / total if total else 0.0
-        self._board.told(self._planned[key], done, total)
+    def _report(self, cell: Cell, done: int, total: int) -> None:
+        share = done / total if total else 1.0
+        self._shares[cell.digest] = share
+        note = f"{done:,} of {total:,} steps" if done < total else "evaluating"
+        self._progress.update_part(label(self._planned[cell.digest]), share, note)
+
+    def _end(self, planned: PlannedCell, *, failed: bool) -> None:
+        self._failed += failed
+        self._progress.end_part(label(planned))
+        self._progress.update(self.finished, f"{self._failed} failed" if self._failed else "")
 
     def _ended(self, outcome: Outcome) -> None:
         planned = self._planned[outcome.cell.digest]
         if outcome.failure is not None:
-            self._board.say(f"failed: {title(planned)}: {outcome.failure.error}")
+            self._progress.message(f"failed: {label(planned)}: {outcome.failure.error}")
         try:
             self._write(outcome)
         except OptionError as error:
             self._unwritten.append(outcome)
-            self._board.say(
+            self._progress.message(
                 f"{error} No cell is begun until there is room; what has finished is kept in "
                 "memory, and is lost only if this process ends before it could be written."
             )
@@ -456,4 +473,4 @@ class _Run:
         if outcome.result is not None:
             self.finished += 1
             self._estimator.observe(outcome.result, time.monotonic() - began)
-        self._board.ended(self._planned[key], failed=outcome.result is None)
+        self._end(self._planned[key], failed=outcome.result is None)

@@ -1,0 +1,67 @@
+"""What a long job shows while it runs, and how durations are written."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from sme_registry.terminal import Progress, duration, duration_range
+
+
+def test_without_a_terminal_it_prints_lines() -> None:
+    text = io.StringIO()
+    with Progress("training", 10, console=Console(file=text, width=200)) as progress:
+        progress.update(4, "note")
+        progress.update(10, "note")
+    (line,) = text.getvalue().splitlines()
+    assert line.startswith("training: 10 of 10 steps")
+    assert line.endswith("done · note")
+
+
+def test_in_a_terminal_it_draws_a_bar() -> None:
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=True, width=160)
+    with Progress("training", 10, console=console) as progress:
+        progress.update(10, "mean regret 0.5")
+    assert "mean regret 0.5" in text.getvalue()
+    assert "10 of 10 steps" in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7500, "2 h 5 min"), (302_400, "3.5 days")],
+)
+def test_durations_are_in_words(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
+
+
+def test_two_equal_bounds_are_one_duration() -> None:
+    assert duration_range(60, 60.2) == "1 min 0 s"
+    assert duration_range(60, 7500) == "1 min 0 s to 2 h 5 min"
+
+
+def test_running_parts_are_named_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sme_registry.terminal.progress.SECONDS_BETWEEN_LINES", 0.0)
+    text = io.StringIO()
+    console = Console(file=text, width=200)
+    with Progress("study", 9, unit="cells", console=console, seconds_left=lambda: 61.0) as progress:
+        for number in range(5):
+            progress.start_part(f"cell {number}")
+        progress.update_part("cell 0", 0.5)
+        progress.end_part("cell 4")
+    assert "study: 0 of 9 cells · about 1 min 1 s left · running: cell 0 50%, cell 1 0%, " in (
+        text.getvalue()
+    )
+    assert ", and 2 more" in text.getvalue()
+    assert "cell 4" not in text.getvalue().splitlines()[-1]
+
+
+def test_nothing_is_printed_where_nothing_is_to_be_shown_or_done() -> None:
+    text = io.StringIO()
+    with Progress("training", 10, console=Console(file=text), shown=False) as progress:
+        progress.update(10)
+    with Progress("scoring", 0, console=Console(file=text)):
+        pass
+    assert text.getvalue() == ""
