@@ -21,7 +21,7 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.offline import ALGORITHMS, train_offline
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import named_after
-from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineScores, Timing
+from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineResult, Timing
 from sme_registry.task import materialize
 
 OFFLINE = "offline:"
@@ -97,14 +97,14 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
             length=(float(T),) * len(record.evaluations),
         ),
         report=result.report,
-        offline=OfflineScores(
+        offline=OfflineResult(
             nu=nu,
             transitions=transitions,
-            dataset=record.dataset_digest,
-            behaviour=record.behaviour.similarity,
-            behaviour_sd=record.behaviour.similarity_sd,
-            score=record.score,
-            score_sd=record.evaluations[-1].similarity_sd,
+            dataset_digest=record.dataset_digest,
+            behaviour_similarity=record.behaviour.similarity,
+            behaviour_similarity_sd=record.behaviour.similarity_sd,
+            similarity=record.score,
+            similarity_sd=record.evaluations[-1].similarity_sd,
         ),
         timing=Timing(
             total=ended - begun,

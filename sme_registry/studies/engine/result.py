@@ -1,10 +1,10 @@
-"""`CellResult`: what a finished run of a study left, one file for each.
+"""`CellResult`: the result of one finished run of a study, one file each.
 
 STUDY/plan.json               the plan, as a `StudyFile`
 STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place when whole
 STUDY/failed/<64 hex>.json    cells that raised, with the error; a retry removes it
-STUDY/locks/<64 hex>          held, by the operating system, while a cell runs
-STUDY/models/<64 hex>.zip     trained models, where they are kept
+STUDY/locks/<64 hex>          locked by the operating system while a cell runs
+STUDY/models/<64 hex>.zip     trained models, if they are kept
 STUDY/report/                 what `sme study report` writes
 """
 
@@ -22,14 +22,15 @@ _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 
 
 class LearningCurve(StrictModel):
-    """Evaluations while training, evenly spaced; every list of one length.
+    """Evaluations during training, evenly spaced; all lists have the same length.
 
     Attributes:
-      steps: environment steps taken before the evaluation.
-      episode_return: mean over its episodes, of at most T.
-      regret: mean over all steps of its episodes of 1 − step reward.
-      similarity: mean r̃ over all steps.
-      length: mean length of its episodes.
+      steps: training steps before the evaluation: environment steps, or gradient steps of an
+        offline learner.
+      episode_return: mean return of its episodes, in [0, T].
+      regret: mean of 1 − step reward over all steps of its episodes, in [0, 1].
+      similarity: mean r̃ over all steps of its episodes, in [0, 1].
+      length: mean length of its episodes in steps, in [1, T].
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()
@@ -40,7 +41,7 @@ class LearningCurve(StrictModel):
 
 
 class Timing(StrictModel):
-    """Where the time of a run went, in seconds of one core; no part of what is reproducible."""
+    """CPU seconds of a run, by task; the only part of a result that is not reproducible."""
 
     total: Real
     training: Real
@@ -49,24 +50,26 @@ class Timing(StrictModel):
     steps_per_second: Real
 
 
-class OfflineScores(StrictModel):
-    """What a cell that learns from data adds: mean r̃ of who made the data, and of who learnt.
+class OfflineResult(StrictModel):
+    """What an offline cell adds: the similarity of the behaviour policy and of the learner.
 
     Attributes:
-      nu: ν of the behaviour policy.
-      transitions: N of the data set.
-      dataset: digest of its arrays.
-      behaviour, behaviour_sd: mean and standard deviation of r̃ over the set's transitions.
-      score, score_sd: the same over all steps of the last live episodes.
+      nu: ν of the behaviour policy, in [0, 1].
+      transitions: number of transitions in the data set.
+      dataset_digest: digest of its arrays.
+      behaviour_similarity: mean r̃ over the transitions of the data set, in [0, 1].
+      behaviour_similarity_sd: its standard deviation over transitions.
+      similarity: mean r̃ over all steps of the last evaluation's episodes, in [0, 1].
+      similarity_sd: its standard deviation over steps.
     """
 
     nu: Real
     transitions: Integer
-    dataset: Digest
-    behaviour: Real
-    behaviour_sd: Real
-    score: Real
-    score_sd: Real
+    dataset_digest: Digest
+    behaviour_similarity: Real
+    behaviour_similarity_sd: Real
+    similarity: Real
+    similarity_sd: Real
 
 
 class CellResult(StrictModel):
@@ -74,13 +77,14 @@ class CellResult(StrictModel):
 
     Attributes:
       key: the cell's digest.
-      cell: the cell, whole.
+      cell: the complete cell.
       curve: its learning curve.
       report: its evaluation within and out of distribution, with the references.
-      online_regret: mean regret over all steps of training; null where nothing was trained.
-      offline: of a cell that learns from a data set; null where it learns by acting.
-      timing: where the time went.
-      versions: of the packages that the numbers depend on.
+      online_regret: mean regret over all training steps, in [0, 1]; null for references and
+        offline learners.
+      offline: similarities of an offline cell; null for all others.
+      timing: CPU seconds by task.
+      versions: versions of the packages that the numbers depend on.
     """
 
     schema_version: SchemaVersion = 1
@@ -89,13 +93,13 @@ class CellResult(StrictModel):
     curve: LearningCurve
     report: EvaluationReport
     online_regret: Real | None = None
-    offline: OfflineScores | None = None
+    offline: OfflineResult | None = None
     timing: Timing
     versions: dict[str, str]
 
 
 class CellFailure(StrictModel):
-    """A run that raised: what, and the last lines of where."""
+    """A run that raised an error: its message and the last lines of its traceback."""
 
     schema_version: SchemaVersion = 1
     key: Digest

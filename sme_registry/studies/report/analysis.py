@@ -24,7 +24,7 @@ from sme_registry import statistics
 from sme_registry.evaluation import RegionReport
 from sme_registry.spec import StudyAlgorithm, StudyFile, SuiteClass
 from sme_registry.statistics import Array, Statistic
-from sme_registry.studies.engine.result import CellResult, OfflineScores
+from sme_registry.studies.engine.result import CellResult, OfflineResult
 from sme_registry.studies.report.tables import (
     OFFLINE_INTERVAL,
     Aggregate,
@@ -397,13 +397,13 @@ class _Study:
     def offline_data(self) -> Iterator[OfflineData]:
         """Who made the data, by class and ν; each data set once, however many learnt from it."""
         for (class_name, nu), runs in self._offline().items():
-            sets = {scores.dataset: scores for scores, _ in runs}.values()
+            sets = {scores.dataset_digest: scores for scores, _ in runs}.values()
             yield OfflineData(
                 class_name,
                 nu,
                 len(sets),
-                float(np.mean([scores.behaviour for scores in sets])),
-                float(np.mean([scores.behaviour_sd for scores in sets])),
+                float(np.mean([scores.behaviour_similarity for scores in sets])),
+                float(np.mean([scores.behaviour_similarity_sd for scores in sets])),
                 float(np.mean([_of_constant(run.result) for _, run in runs])),
             )
 
@@ -414,7 +414,7 @@ class _Study:
             own = [scores for scores, run in runs if learners[run.place[1]] == name]
             if not own:
                 continue
-            changes = tuple(scores.score - scores.behaviour for scores in own)
+            changes = tuple(scores.similarity - scores.behaviour_similarity for scores in own)
             low = high = None
             if len(own) >= OFFLINE_INTERVAL:
                 seed = self._seed("offline", name, class_name, f"{nu:g}")
@@ -426,17 +426,17 @@ class _Study:
                 nu,
                 name,
                 len(own),
-                float(np.mean([scores.score for scores in own])),
-                float(np.mean([scores.score_sd for scores in own])),
+                float(np.mean([scores.similarity for scores in own])),
+                float(np.mean([scores.similarity_sd for scores in own])),
                 float(np.mean(changes)),
                 low,
                 high,
                 changes,
             )
 
-    def _offline(self) -> dict[tuple[str, float], list[tuple[OfflineScores, Run]]]:
+    def _offline(self) -> dict[tuple[str, float], list[tuple[OfflineResult, Run]]]:
         """Runs that learnt from data, by class in the plan's order and by rising ν."""
-        found: dict[tuple[str, float], list[tuple[OfflineScores, Run]]] = {}
+        found: dict[tuple[str, float], list[tuple[OfflineResult, Run]]] = {}
         for runs in self._places.values():
             for run in runs:
                 if (scores := run.result.offline) is not None:

@@ -47,9 +47,9 @@ def test_a_cell_learns_from_the_data_of_its_seed_and_is_judged_as_every_cell(lea
         }
     )
     data = collect(recipe, materialize(done.cell.spec), {})
-    assert done.offline.dataset == data.digest
-    assert done.offline.behaviour == float(data.similarities.mean())
-    assert done.offline.score == done.curve.similarity[-1]
+    assert done.offline.dataset_digest == data.digest
+    assert done.offline.behaviour_similarity == float(data.similarities.mean())
+    assert done.offline.similarity == done.curve.similarity[-1]
     again = run_cell(cell(f"offline:{learner}"))
     assert (again.curve, again.report, again.offline) == (done.curve, done.report, done.offline)
 
@@ -59,8 +59,8 @@ def test_more_noise_makes_worse_data_and_other_cells() -> None:
     assert noisy.key != clean.key
     assert noisy.offline is not None
     assert clean.offline is not None
-    assert clean.offline.behaviour == pytest.approx(1.0)
-    assert noisy.offline.behaviour < 0.97
+    assert clean.offline.behaviour_similarity == pytest.approx(1.0)
+    assert noisy.offline.behaviour_similarity < 0.97
 
 
 def test_bad_offline_cells_are_refused_in_words() -> None:

@@ -13,7 +13,7 @@ import pytest
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.engine.result import CellResult, OfflineScores
+from sme_registry.studies.engine.result import CellResult, OfflineResult
 from sme_registry.studies.report.analysis import ALL, CURVES, analyse
 from sme_registry.studies.report.exports import number
 from sme_registry.studies.report.tables import Analysis, Curve
@@ -61,14 +61,14 @@ def results(file: StudyFile) -> dict[str, CellResult]:
         nu = float(str(cell.hyperparameters["nu"]))
         behaviour = 1.0 - nu / 6.0 + 0.001 * place.run
         change = CHANGES[place.algorithm.split()[0], place.class_name] + 0.0005 * (place.run - 2)
-        scores = OfflineScores(
+        scores = OfflineResult(
             nu=nu,
             transitions=1000,
-            dataset=f"sha256:{hash_of(place.class_name, nu, place.run):064x}",
-            behaviour=behaviour,
-            behaviour_sd=0.1,
-            score=behaviour + change,
-            score_sd=0.01 * (1 + place.run),
+            dataset_digest=f"sha256:{hash_of(place.class_name, nu, place.run):064x}",
+            behaviour_similarity=behaviour,
+            behaviour_similarity_sd=0.1,
+            similarity=behaviour + change,
+            similarity_sd=0.01 * (1 + place.run),
         )
         own = {"key": cell.digest, "cell": cell, "offline": scores}
         found[cell.digest] = judged[spec].model_copy(update=own)
