@@ -23,6 +23,7 @@ from sme_registry.registration import (
     register_catalogue,
     save,
 )
+from sme_registry.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from sme_registry.envs.team import env, parallel_env
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from sme_registry.evaluation.report import EvaluationReport
     from sme_registry.spec import EvaluationProtocol, SMESpec
     from sme_registry.task import Task, materialize
-
-__version__ = "0.1.0"
 
 __all__ = [
     "EvaluationProtocol",

@@ -43,7 +43,7 @@ def test_an_unknown_attribute_is_an_attribute_error():
 
 
 MODULES = [
-    "envs.batch", "envs.team", "errors", "files", "registration", "spec", "spec.catalogue",
+    "envs.batch", "envs.team", "errors", "io", "registration", "spec", "spec.catalogue",
     "spec.document", "spec.envelope",
     "spec.protocol", "spec.resolve", "spec.sme_spec", "spec.suite", "task", "task.draw",
     "task.fingerprint", "task.memory", "task.step", "task.streams", "task.task",

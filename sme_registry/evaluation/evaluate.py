@@ -8,10 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-import platform
-import sys
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +21,7 @@ from sme_registry.evaluation.policies import as_policy
 from sme_registry.evaluation.regions import Observations, Uniform, observations
 from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
 from sme_registry.evaluation.score import Score
+from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, SMESpec, catalogue
 from sme_registry.spec.resolve import resolve
 from sme_registry.task import Task, materialize
@@ -124,7 +122,10 @@ def evaluate(
             name: AgentReport(regions=own.pop(_POLICY), references=own)
             for name, own in of_agents.items()
         },
-        versions=_versions(fast),
+        versions=versions(
+            ["numpy", "scipy", "gymnasium", *(["numba"] if fast.backend == "numba" else [])],
+            if_imported=_POLICY_LIBRARIES,
+        ),
     )
 
 
@@ -150,7 +151,7 @@ def resolve_protocol(
 
 
 _POLICY = ""  # the key of the policy in question among the references' names
-_POLICIES_OWN = ("torch", "stable_baselines3", "onnxruntime")
+_POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 _WHOLE = ""  # the key of all action channels among the agents' names
 
 
@@ -199,17 +200,3 @@ def _fitted_on(
     optimal = np.concatenate([batch.optimal for batch in kept])[:wanted]
     agents = zip(task.observed, task.owned, strict=True)
     return references.fit(s, optimal, agents), itertools.chain(kept, batches)
-
-
-def _versions(fast: Engine) -> dict[str, str]:
-    """What the numbers depend on; a policy's own libraries only where it brought them in."""
-    from sme_registry import __version__
-
-    packages = ["numpy", "scipy", "gymnasium"]
-    packages += ["numba"] if fast.backend == "numba" else []
-    packages += [name for name in _POLICIES_OWN if name in sys.modules]
-    return {
-        "sme_registry": __version__,
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in packages},
-    }

@@ -1,17 +1,31 @@
-"""Files: strict JSON, atomic writes, imports by name."""
+"""Files and arguments: strict JSON, atomic writes, folders, locks, versions, argument checks."""
 
+from sme_registry.io.checks import choice, integer_in
 from sme_registry.io.files import TEMPORARY, atomic_file, temporary_beside, write_atomically
+from sme_registry.io.folders import build_folder, claim_folder, refuse_existing, sync_folder
 from sme_registry.io.imports import import_object
+from sme_registry.io.installed import versions
 from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
+from sme_registry.io.locks import Lock, file_lock, is_locked
 
 __all__ = [
     "MAX_DOCUMENT_BYTES",
     "TEMPORARY",
+    "Lock",
     "atomic_file",
+    "build_folder",
+    "choice",
+    "claim_folder",
+    "file_lock",
     "import_object",
+    "integer_in",
+    "is_locked",
     "parse_json",
     "read_json",
+    "refuse_existing",
+    "sync_folder",
     "temporary_beside",
     "to_json",
+    "versions",
     "write_atomically",
 ]

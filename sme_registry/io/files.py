@@ -1,7 +1,7 @@
 """Atomic writes: a file is written completely or not at all.
 
-Every file this package writes goes through `atomic_file`, most by `write_atomically`: into a
-temporary file beside the target, then renamed over it. A killed process leaves the old file and at
+All files are written through `atomic_file`, most of them by `write_atomically`: to a temporary file
+next to the target, which then replaces the target. A killed process leaves the old file and at
 most a temporary file that `TEMPORARY` matches.
 """
 
@@ -16,29 +16,29 @@ from typing import BinaryIO
 
 from sme_registry.errors import OptionError
 
-TEMPORARY = ".*.tmp*"  # the star at the end: SQLite's own files beside one of ours
+TEMPORARY = ".*.tmp*"  # the last star: SQLite adds suffixes for its own temporary files
 
 
 def temporary_beside(path: Path) -> Path:
-    """A new name beside `path`, in its file system, that `TEMPORARY` matches."""
+    """A new path in the folder of `path`, which `TEMPORARY` matches."""
     return path.with_name(f".{path.name[:64]}.{secrets.token_hex(4)}.tmp")
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """A stream whose bytes become `path` when the block ends well, and nothing otherwise.
+    """A stream whose content becomes `path` if the block succeeds; otherwise nothing changes.
 
     Args:
-      path: the target, in a folder that is there.
+      path: the target; its folder must exist.
       new: link instead of rename, so that an existing file is never replaced.
 
     Raises:
-      OSError: the disk is full, the folder cannot be written to, or (`new`) the name is taken;
-        what stood there is untouched.
+      OSError: the disk is full, the folder is not writable, or with `new` the target exists; an
+        existing target is unchanged.
     """
     temporary = temporary_beside(path)
     try:
-        # Not mkstemp, whose 0600 would hide results from colleagues; the umask is the user's.
+        # Not mkstemp, whose mode 0600 hides results from colleagues: the user's umask decides.
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         with os.fdopen(handle, "wb") as stream:
             yield stream
@@ -54,7 +54,7 @@ def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
-    """Write a file whole or not at all; the folder is made where it is missing.
+    """Write a file completely or not at all; its folder is created if it is missing.
 
     Args:
       path: the target; an existing file is replaced.
@@ -64,7 +64,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
       The path written.
 
     Raises:
-      OptionError: the folder cannot be made or written to; what stood there is untouched.
+      OptionError: the folder cannot be created or written to; an existing file is unchanged.
     """
     path = Path(path)
     try:
@@ -73,8 +73,13 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
         with atomic_file(path) as stream:
             stream.write(data)
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
-        reason = getattr(error, "strerror", None) or str(error)
-        raise OptionError(
-            f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
-        ) from None
+        raise unwritable(path, error) from None
     return path
+
+
+def unwritable(path: Path, error: Exception) -> OptionError:
+    """The error for a file or folder that cannot be written."""
+    reason = getattr(error, "strerror", None) or str(error)
+    return OptionError(
+        f"{path}: cannot be written: {reason}. Give a path in a folder that you may write to."
+    )

@@ -1,5 +1,6 @@
 """Documents: what is frozen, hashed and shared."""
 
+from sme_registry.spec.arguments import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.spec.document import (
     Digest,
     Document,
@@ -17,6 +18,8 @@ from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import Suite, SuiteClass
 
 __all__ = [
+    "ACTION_RANGES",
+    "ActionRange",
     "AgentSpec",
     "Cell",
     "Digest",
@@ -28,9 +31,11 @@ __all__ = [
     "Name",
     "PlannedCell",
     "ProtocolFile",
+    "ProtocolLike",
     "Real",
     "SMESpec",
     "SchemaVersion",
+    "SpecLike",
     "StrictModel",
     "StudyAlgorithm",
     "StudyFile",

@@ -1,6 +1,7 @@
 """Terminal output: tables, plain JSON, progress, and errors as one line."""
 
 from sme_registry.terminal.commands import CommandGroup, application, version_option
+from sme_registry.terminal.latex import escape_latex
 from sme_registry.terminal.numbers import duration, duration_range, fixed
 from sme_registry.terminal.output import err, failure, mark, out, print_json, print_pairs
 from sme_registry.terminal.progress import Progress
@@ -12,6 +13,7 @@ __all__ = [
     "duration",
     "duration_range",
     "err",
+    "escape_latex",
     "failure",
     "fixed",
     "mark",

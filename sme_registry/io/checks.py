@@ -1,0 +1,73 @@
+"""Checks of arguments, with one form of message: name, value, allowed values, remedy."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Collection
+from typing import Any
+
+from sme_registry.errors import OptionError, SMEError, did_you_mean
+
+
+def integer_in(
+    name: str,
+    value: Any,
+    low: int,
+    high: int | None = None,
+    *,
+    advice: str = "",
+    error: type[SMEError] = OptionError,
+) -> int:
+    """Check an integer argument. NumPy's integers count, booleans and floats do not.
+
+    Args:
+      name: of the argument, as the message calls it.
+      value: what was given.
+      low: the smallest allowed value.
+      high: the largest allowed value; None if there is no limit.
+      advice: a sentence that the message ends with, such as "Leave it out for 0."
+      error: the type of error to raise.
+
+    Returns:
+      The value as Python's int.
+
+    Raises:
+      SMEError: of that type: not an integer, or outside [low, high].
+    """
+    try:
+        number = None if type(value).__name__ in ("bool", "bool_") else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < low or (high is not None and number > high):
+        allowed = f"of at least {low:,}" if high is None else f"in [{low:,}, {high:,}]"
+        raise error(f"{name}={value!r:.60}: must be an integer {allowed}.{advice and f' {advice}'}")
+    return number
+
+
+def choice(
+    name: str,
+    value: Any,
+    allowed: Collection[str],
+    *,
+    error: type[SMEError] = OptionError,
+) -> str:
+    """Check an argument that must be one of a few names, such as "unit" or "symmetric".
+
+    Args:
+      name: of the argument, as the message calls it.
+      value: what was given.
+      allowed: the names, in the order in which the message lists them.
+      error: the type of error to raise.
+
+    Returns:
+      The value.
+
+    Raises:
+      SMEError: of that type: none of them; says which is near.
+    """
+    if isinstance(value, str) and value in allowed:
+        return value
+    *others, last = map(repr, allowed)
+    names = f"{', '.join(others)} or {last}" if others else last
+    near = did_you_mean(value, allowed) if isinstance(value, str) else ""
+    raise error(f"{name}={value!r:.60}: must be {names}.{near}")
