@@ -85,14 +85,14 @@ def to_csv(
     Arguments as of `to_json`.
     """
     regions = range(len(board.protocol.edges))
-    columns = [*METRICS, *(f"regret_{region}" for region in regions)]
+    columns = [*METRICS, *(f"normalised_regret_{region}" for region in regions)]
     stream = io.StringIO()
     # Text always in quotes: where a spreadsheet splits at semicolons, too, it stays one cell.
     writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\r\n")
     for index, row in enumerate(rows):
         scores = row.entry.scores
         assert scores is not None  # whatever is in a ranking has some
-        estimates = [getattr(scores, name) for name in METRICS] + list(scores.profile)
+        estimates = [getattr(scores, name) for name in METRICS] + list(scores.normalised_regret)
         cells: dict[str, Any] = {**_facts(row), "ranked_by": metric}
         for column, estimate in zip(columns, estimates, strict=True):
             cells |= {
@@ -120,10 +120,11 @@ def to_latex(
     """
     lines = [f"% {name}: {_latex(str(value))}" for name, value in _of(board, head, date).items()]
     lines += [
-        f"% ranked by {metric}; regret: 0 optimal, 1 the constant policy; 95 % intervals",
+        f"% ranked by {metric}; regrets: 0 optimal, 1 the constant policy; 95 % intervals",
         r"\begin{tabular}{rllrrr}",
         r"\toprule",
-        r"Rank & Method & By & WD regret $N_0$ & OOD regret $A$ & OOD decay $D$ \\",
+        r"Rank & Method & By & WD regret $N_0$ & OOD regret $\bar{N}$ "
+        r"& OOD decay $\bar{N} - N_0$ \\",
         r"\midrule",
     ]
     for row in rows:
@@ -133,7 +134,10 @@ def to_latex(
         if row.first != row.last:
             rank += f"--{row.last}"
         cells = [rank, _latex(f"{entry.method} {entry.version}"), _latex(entry.submitter)]
-        cells += [_interval(estimate) for estimate in (scores.wd, scores.ood, scores.decay)]
+        cells += [
+            _interval(estimate)
+            for estimate in (scores.wd_regret, scores.ood_regret, scores.ood_decay)
+        ]
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""What may be told of one submission."""
+"""`public_view`: what the board publishes about one submission."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from leaderboard.store import EntryRow, Store
 
 
 @dataclass(frozen=True)
-class Told:
-    """What may be told of one submission.
+class PublicView:
+    """What the board publishes about one submission.
 
     Attributes:
       entry: its row.
-      signed: as it was signed.
-      result: None where there is none, or where its scores are withheld.
-      withheld: why they are; empty where they are not.
-      withdrawal: None where it stands.
+      signed: the submission as signed.
+      result: None before scoring, and while its scores are withheld.
+      withheld: why the scores are withheld; empty if they are not.
+      withdrawal: None unless the submission is withdrawn.
     """
 
     entry: EntryRow
@@ -31,7 +31,7 @@ class Told:
     withdrawal: SignedWithdrawal | None
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as plain data."""
+        """The view as plain data."""
         return {
             "id": self.entry.id,
             "status": self.entry.status,
@@ -43,8 +43,8 @@ class Told:
         }
 
 
-def told(store: Store, entry: EntryRow) -> Told:
-    """What may be told of a submission: its scores only where the board shows any number."""
+def public_view(store: Store, entry: EntryRow) -> PublicView:
+    """The public view of a submission; it has scores only while the board is publishable."""
     result = store.result(entry.id)
     withheld = ""
     if result is not None and result.scores is not None:
@@ -52,4 +52,6 @@ def told(store: Store, entry: EntryRow) -> Told:
             refuse_unpublishable(store.entries())
         except NotPublishable as error:
             result, withheld = None, str(error)
-    return Told(entry, store.submission(entry.id), result, withheld, store.withdrawal(entry.id))
+    return PublicView(
+        entry, store.submission(entry.id), result, withheld, store.withdrawal(entry.id)
+    )

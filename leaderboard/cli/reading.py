@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from leaderboard.scoring.ranking import RankedRow
     from leaderboard.store import EntryRow, Store
 
-Metric = Literal["wd", "ood", "decay"]
+Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 _TITLES = {
-    "wd": "WD regret N₀",
-    "ood": "OOD regret A",
-    "decay": "OOD decay D",
+    "wd_regret": "WD regret N₀",
+    "ood_regret": "OOD regret N̄",
+    "ood_decay": "OOD decay N̄ − N₀",
 }
 _SHORTEST_ID = 4
 
@@ -32,8 +32,11 @@ _SHORTEST_ID = 4
 def rank(
     board: BoardFolder = Path("board"),
     metric: Annotated[
-        Metric, typer.Option(help="wd: inside the cube; ood: outside; decay: the loss.")
-    ] = "wd",
+        Metric,
+        typer.Option(
+            help="wd_regret: inside the training cube; ood_regret: outside it; ood_decay: loss."
+        ),
+    ] = "wd_regret",
     json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="As CSV.")] = False,
     latex: Annotated[bool, typer.Option("--latex", help="As a LaTeX table.")] = False,
@@ -45,7 +48,7 @@ def rank(
 
     Examples:
 
-      sme-leaderboard rank board --metric ood
+      sme-leaderboard rank board --metric ood_regret
 
       sme-leaderboard rank board --csv > ranking.csv
     """
@@ -83,13 +86,17 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
     table.add_column("rank", justify="right", no_wrap=True)
     table.add_column("method")
     table.add_column("by")
-    for name, title in (("wd", "N₀"), ("ood", "A"), ("decay", "D")):
+    for name, title in (("wd_regret", "N₀"), ("ood_regret", "N̄"), ("ood_decay", "N̄ − N₀")):
         table.add_column(title, justify="right", no_wrap=True, style="bold" * (name == metric))
     table.add_column("runs", justify="right")
     for row in rows:
         entry = row.entry
         assert entry.scores is not None
-        shown = {"wd": entry.scores.wd, "ood": entry.scores.ood, "decay": entry.scores.decay}
+        shown = {
+            "wd_regret": entry.scores.wd_regret,
+            "ood_regret": entry.scores.ood_regret,
+            "ood_decay": entry.scores.ood_decay,
+        }
         table.add_row(
             notes.get(row.reason, "") if row.first is None else ranks(row.first, row.last),
             escape(f"{entry.method} {entry.version}".strip()),
@@ -128,12 +135,12 @@ def show(
       sme-leaderboard show board 3f2a
     """
     from leaderboard.exports import one_line
-    from leaderboard.public_view import told
+    from leaderboard.public_view import public_view
     from leaderboard.store import Store
 
     with Store.open(board, read_only=True) as store:
         entry = find_entry(store, id)
-        about = told(store, entry)
+        about = public_view(store, entry)
     if json:
         print_json(about.to_dict())
         return
@@ -178,12 +185,15 @@ def _profile_table(result: Result) -> Table:
         table.add_column(name, justify="right")
     scores = result.scores
     for label, value in {
-        "WD regret N₀": scores.wd,
-        "OOD regret A": scores.ood,
-        "OOD decay D": scores.decay,
-        "slope on ε": scores.slope,
-        "points of r̃ lost": scores.points,
-        **{f"N in OOD {m}" if m else "N in WD": value for m, value in enumerate(scores.profile)},
+        "WD regret N₀": scores.wd_regret,
+        "OOD regret N̄": scores.ood_regret,
+        "OOD decay N̄ − N₀": scores.ood_decay,
+        "Regret slope": scores.regret_slope,
+        "Similarity loss (points)": scores.similarity_loss,
+        **{
+            f"N in OOD {m}" if m else "N in WD": value
+            for m, value in enumerate(scores.normalised_regret)
+        },
     }.items():
         table.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
     return table
@@ -191,11 +201,14 @@ def _profile_table(result: Result) -> Table:
 
 def _class_table(result: Result) -> Table:
     table = Table(title="by class", title_justify="left")
-    for name in ("class", "runs", "N₀", "A"):
+    for name in ("class", "runs", "N₀", "N̄"):
         table.add_column(name, justify="left" if name == "class" else "right")
     for member in result.classes:
         table.add_row(
-            escape(member.name), str(member.runs), fixed(member.wd, 4), fixed(member.ood, 4)
+            escape(member.name),
+            str(member.runs),
+            fixed(member.wd_regret, 4),
+            fixed(member.ood_regret, 4),
         )
     return table
 

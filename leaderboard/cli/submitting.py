@@ -231,9 +231,9 @@ def _refuse_rejected(result: Result) -> None:
 def _print_scores(result: Result) -> None:
     assert result.scores is not None
     for label, value in {
-        "WD regret N₀": result.scores.wd,
-        "OOD regret A": result.scores.ood,
-        "OOD decay D": result.scores.decay,
+        "WD regret N₀": result.scores.wd_regret,
+        "OOD regret N̄": result.scores.ood_regret,
+        "OOD decay N̄ − N₀": result.scores.ood_decay,
     }.items():
         out().print(f"{label:14s} {value.value:.4f}  ({value.low:.4f} to {value.high:.4f})")
     if not result.enough_runs:

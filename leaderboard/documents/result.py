@@ -1,16 +1,16 @@
-"""`Result`: what scoring a submission found. A function of submission, artefacts and protocol.
+"""`Result`: the outcome of scoring a submission, a function of submission, artefacts and protocol.
 
 Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the constant ½ on the same states:
 
     N_m = ρ_m / ρ⁰_m         normalised regret: 0 the optimum, 1 the constant policy
     N₀                       WD regret
-    A = mean N₁ … N_M        OOD regret
-    D = A − N₀               OOD decay
-    slope                    of N_m on ε_m, least squares over m = 0 … M
-    points                   100 (r̃_WD − mean r̃_OOD), the paper's form
+    N̄ = mean N₁ … N_M        OOD regret
+    N̄ − N₀                   OOD decay
+    regret slope             of N_m on ε_m, least squares over m = 0 … M
+    similarity loss          100 (r̃_WD − mean r̃_OOD) points, the paper's form
 
-A run that failed, or was started and not listed, scores 1 in every region and every metric, that
-is 100 points: what nobody can look at is not taken to hold outside.
+A run that failed, or was started and not listed, scores 1 in every region and every metric, and
+loses 100 points of similarity: a missing policy never improves a score.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sme_registry.spec import (
     explained,
 )
 
-METRICS = ("wd", "ood", "decay", "slope", "points")
+METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 
 
@@ -43,22 +43,23 @@ class RunScore(StrictModel):
       class_name: the suite's class that the instance belongs to.
       artefact: digest of the policy; null where the run failed.
       evaluation_seed: of the states, derived from protocol, spec and artefact; null likewise.
-      regret: N_m of each region, WD first.
+      normalised_regret: N_m of each region, WD first.
       similarity: mean r̃ of each region; null where there is no policy.
-      wd, ood, decay, slope, points: as this module's head says.
+      wd_regret, ood_regret, ood_decay, regret_slope, similarity_loss: defined at the head of this
+        module.
     """
 
     spec: Digest | None
     class_name: Name
     artefact: Digest | None
     evaluation_seed: Integer | None
-    regret: _Regions
+    normalised_regret: _Regions
     similarity: _Regions | None
-    wd: Real
-    ood: Real
-    decay: Real
-    slope: Real
-    points: Real
+    wd_regret: Real
+    ood_regret: Real
+    ood_decay: Real
+    regret_slope: Real
+    similarity_loss: Real
 
 
 class Estimate(StrictModel):
@@ -73,35 +74,36 @@ class ClassScore(StrictModel):
     """One class of the suite: interquartile means over its runs.
 
     Attributes:
-      runs: how many were counted, failed and missing ones included.
-      submitted: how many had a policy.
+      runs: number of runs counted, including failed and missing ones.
+      submitted: number of runs with a policy.
+      normalised_regret: of each region, WD first.
     """
 
     name: Name
     runs: Integer
     submitted: Integer
-    wd: Real
-    ood: Real
-    profile: _Regions
+    wd_regret: Real
+    ood_regret: Real
+    normalised_regret: _Regions
 
 
 class Scores(StrictModel):
     """θ of each metric: the mean over classes of the interquartile mean within a class.
 
     Attributes:
-      profile: θ of N_m of each region, WD first.
+      normalised_regret: θ of N_m of each region, WD first.
     """
 
-    wd: Estimate
-    ood: Estimate
-    decay: Estimate
-    slope: Estimate
-    points: Estimate
-    profile: Annotated[tuple[Estimate, ...], Field(strict=False, min_length=2)]
+    wd_regret: Estimate
+    ood_regret: Estimate
+    ood_decay: Estimate
+    regret_slope: Estimate
+    similarity_loss: Estimate
+    normalised_regret: Annotated[tuple[Estimate, ...], Field(strict=False, min_length=2)]
 
 
 class Result(Document):
-    """What became of a submission: scored, or rejected with a code.
+    """The outcome of a submission: scored, or rejected with a code.
 
     Attributes:
       submission: its id.
@@ -110,9 +112,9 @@ class Result(Document):
       code, message: why it was rejected; empty where it was scored.
       scores, classes, runs: null and empty where it was rejected.
       enough_runs: whether each class has the runs that ranking needs.
-      oracle_like: OOD regret ≤ 0.01, or WD regret ≤ 0.02 with a flat profile: the page asks for
-        code.
-      versions: of the packages that the numbers depend on.
+      oracle_like: OOD regret ≤ 0.01, or WD regret ≤ 0.02 and |OOD decay| ≤ 0.01: the page asks
+        for code.
+      versions: of the packages on which the numbers depend.
     """
 
     schema_version: SchemaVersion = 1
@@ -132,7 +134,7 @@ class Result(Document):
     @model_validator(mode="after")
     def _status_fits(self) -> Self:
         if (self.status == "scored") != (self.scores is not None):
-            raise explained("scores: must be there exactly where status is 'scored'. Correct it.")
+            raise explained("scores: required if status is 'scored', not allowed otherwise.")
         if (self.status == "rejected") != (self.code in CODES):
-            raise explained("code: must be there exactly where status is 'rejected'. Correct it.")
+            raise explained("code: required if status is 'rejected', not allowed otherwise.")
         return self

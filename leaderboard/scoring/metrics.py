@@ -19,31 +19,37 @@ Array = npt.NDArray[np.float64]
 
 
 def run_metrics(
-    regret: Sequence[float], similarity: Sequence[float] | None, levels: Sequence[float]
+    normalised_regret: Sequence[float], similarity: Sequence[float] | None, levels: Sequence[float]
 ) -> dict[str, float]:
     """The metrics of one run by name, as `result` defines them.
 
     Args:
-      regret: N_m of each region, WD first.
+      normalised_regret: N_m of each region, WD first.
       similarity: mean r̃ of each region in [0, 1]; None where there is no policy.
       levels: ε_m, 0 for WD.
 
     Returns:
-      `wd`, `ood`, `decay` and `slope`, dimensionless, and `points`, in hundredths of r̃. Without
-      a policy each is 1 (100 points), whatever N_m: were D that of N_m = 1 everywhere, 0, it would
-      pay to leave out runs.
+      `wd_regret`, `ood_regret`, `ood_decay` and `regret_slope`, dimensionless, and
+      `similarity_loss`, in points (hundredths of r̃). Without a policy each is 1 (100 points), and
+      not what N_m = 1 everywhere gives: a decay of 0 would reward leaving out runs.
     """
     if similarity is None:
-        return {"wd": 1.0, "ood": 1.0, "decay": 1.0, "slope": 1.0, "points": 100.0}
-    N, r = np.asarray(regret), np.asarray(similarity)
+        return {
+            "wd_regret": 1.0,
+            "ood_regret": 1.0,
+            "ood_decay": 1.0,
+            "regret_slope": 1.0,
+            "similarity_loss": 100.0,
+        }
+    N, r = np.asarray(normalised_regret), np.asarray(similarity)
     offset = np.asarray(levels) - np.mean(levels)
     wd, ood = float(N[0]), float(N[1:].mean())
     return {
-        "wd": wd,
-        "ood": ood,
-        "decay": ood - wd,
-        "slope": float(offset @ (N - wd) / (offset @ offset)),  # exactly 0 where N is flat
-        "points": 100.0 * float(r[0] - r[1:].mean()),
+        "wd_regret": wd,
+        "ood_regret": ood,
+        "ood_decay": ood - wd,
+        "regret_slope": float(offset @ (N - wd) / (offset @ offset)),  # exactly 0 where N is flat
+        "similarity_loss": 100.0 * float(r[0] - r[1:].mean()),
     }
 
 

@@ -19,7 +19,7 @@ from leaderboard.errors import NotPublishable
 from leaderboard.scoring.metrics import rank_ranges
 from leaderboard.store import EntryRow
 
-Metric = Literal["wd", "ood", "decay"]
+Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 
 REFERENCES = {"optimal": 0.0, "constant": 1.0}  # N_m of each reference row, by its method's name
 TOLERANCE = 1e-6
@@ -52,7 +52,7 @@ def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
 
     Args:
       entries: of a board, in any order.
-      metric: "wd" for N₀, "ood" for A, "decay" for D; the lower the better.
+      metric: "wd_regret" (N₀), "ood_regret" (N̄) or "ood_decay" (N̄ − N₀); lower is better.
 
     Returns:
       The rows; those with equal scores in the order in which they were received.
@@ -106,14 +106,14 @@ def refuse_unpublishable(entries: list[EntryRow]) -> None:
 def _to_hold(scores: Scores, regret: float) -> Iterator[tuple[str, float, float]]:
     """What, how much, and how much it must be, of a reference row with this regret everywhere.
 
-    Without the points of r̃: the constant policy's similarity is not the same in all regions.
+    Excludes the similarity loss: the constant policy's similarity differs between regions.
     """
-    for region, estimate in enumerate(scores.profile):
-        yield f"profile.{region}", estimate.value, regret
-    yield "wd", scores.wd.value, regret
-    yield "ood", scores.ood.value, regret
-    yield "decay", scores.decay.value, 0.0
-    yield "slope", scores.slope.value, 0.0
+    for region, estimate in enumerate(scores.normalised_regret):
+        yield f"normalised_regret.{region}", estimate.value, regret
+    yield "wd_regret", scores.wd_regret.value, regret
+    yield "ood_regret", scores.ood_regret.value, regret
+    yield "ood_decay", scores.ood_decay.value, 0.0
+    yield "regret_slope", scores.regret_slope.value, 0.0
 
 
 def _estimate(scores: Scores, metric: Metric) -> Estimate:
@@ -127,6 +127,6 @@ def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> str:
         return IS_REFERENCE
     if not entry.enough_runs:
         return TOO_FEW_RUNS
-    if metric == "decay" and scores.wd.high > LEARNED:
+    if metric == "ood_decay" and scores.wd_regret.high > LEARNED:
         return NOT_LEARNED
     return ""

@@ -33,9 +33,9 @@ Progress = Callable[[int, int], None]
 Instances = dict[str, tuple[str, SMESpec]]
 
 ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
-"""Oracle-like: A at most the first, or N₀ at most the second and |D| at most the third."""
+"""Oracle-like: N̄ at most the first, or N₀ at most the second and |N̄ − N₀| at most the third."""
 
-_NOT_NEGATIVE = ("wd", "ood")
+_NOT_NEGATIVE = ("wd_regret", "ood_regret")
 # Loaded beside the scorer by chance; no number of a result comes from them.
 _BESIDE = ("stable_baselines3", "torch")
 
@@ -240,16 +240,16 @@ def _levels(board: BoardDocument) -> tuple[float, ...]:
 def _run_score(
     board: BoardDocument, class_name: str, report: EvaluationReport, digest: str
 ) -> RunScore:
-    regret = tuple(region.normalised_regret for region in report.regions)
+    regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
     return RunScore(
         spec=report.spec_digest,
         class_name=class_name,
         artefact=digest,
         evaluation_seed=report.protocol.seed,
-        regret=regret,
+        normalised_regret=regrets,
         similarity=similarity,
-        **run_metrics(regret, similarity, _levels(board)),
+        **run_metrics(regrets, similarity, _levels(board)),
     )
 
 
@@ -261,15 +261,15 @@ def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunSc
       class_name: the suite's class that it was started in.
       spec: digest of the instance; null where the run is not listed.
     """
-    regret = (1.0,) * len(board.protocol.edges)
+    regrets = (1.0,) * len(board.protocol.edges)
     return RunScore(
         spec=spec,
         class_name=class_name,
         artefact=None,
         evaluation_seed=None,
-        regret=regret,
+        normalised_regret=regrets,
         similarity=None,
-        **run_metrics(regret, None, _levels(board)),
+        **run_metrics(regrets, None, _levels(board)),
     )
 
 
@@ -278,9 +278,9 @@ def _class_score(name: str, runs: list[RunScore]) -> ClassScore:
         name=name,
         runs=len(runs),
         submitted=sum(run.artefact is not None for run in runs),
-        wd=float(iqm([run.wd for run in runs])),
-        ood=float(iqm([run.ood for run in runs])),
-        profile=tuple(iqm([run.regret for run in runs]).tolist()),
+        wd_regret=float(iqm([run.wd_regret for run in runs])),
+        ood_regret=float(iqm([run.ood_regret for run in runs])),
+        normalised_regret=tuple(iqm([run.normalised_regret for run in runs]).tolist()),
     )
 
 
@@ -288,7 +288,10 @@ def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Score
     """θ of each metric and each region, with its interval."""
     classes = {
         name: np.array(
-            [[*(getattr(run, metric) for metric in METRICS), *run.regret] for run in runs]
+            [
+                [*(getattr(run, metric) for metric in METRICS), *run.normalised_regret]
+                for run in runs
+            ]
         )
         for name, runs in by_class.items()
     }
@@ -303,13 +306,14 @@ def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Score
         for value, low, high in zip(value.tolist(), low.tolist(), high.tolist(), strict=True)
     ]
     return Scores(
-        **dict(zip(METRICS, estimates, strict=False)), profile=tuple(estimates[len(METRICS) :])
+        **dict(zip(METRICS, estimates, strict=False)),
+        normalised_regret=tuple(estimates[len(METRICS) :]),
     )
 
 
 def _oracle_like(scores: Scores) -> bool:
-    return scores.ood.value <= ORACLE_OOD or (
-        scores.wd.value <= ORACLE_WD and abs(scores.decay.value) <= FLAT
+    return scores.ood_regret.value <= ORACLE_OOD or (
+        scores.wd_regret.value <= ORACLE_WD and abs(scores.ood_decay.value) <= FLAT
     )
 
 

@@ -353,7 +353,7 @@ def _verify_numbers(store: Store, fresh: Index, count: _Counter) -> int:
             where = f"results/{hex_of(id)}.json"
             _verify_runs(store, result, where)
             for number, run in enumerate(result.runs):
-                metrics = run_metrics(run.regret, run.similarity, levels)
+                metrics = run_metrics(run.normalised_regret, run.similarity, levels)
                 for name, value in metrics.items():
                     if not _close(value, getattr(run, name), EXACT):
                         raise TamperedError(where, f"runs.{number}.{name}: is not of its regions")
@@ -399,7 +399,7 @@ def _rescore(store: Store, id: str) -> None:
     if anew.status != stored.status:
         raise TamperedError(where, f"scored anew it is rejected: {anew.code}: {anew.message}")
     for number, (run, found) in enumerate(zip(anew.runs, stored.runs, strict=True)):
-        for name in ("regret", "similarity"):
+        for name in ("normalised_regret", "similarity"):
             if not _close(getattr(run, name), getattr(found, name), RESCORED):
                 raise TamperedError(
                     where, f"runs.{number}.{name}: scored anew it differs by more than {RESCORED}"

@@ -355,7 +355,7 @@ def _senseless(entry: LogEntry, what: str) -> TamperedError:
 
 def _scores_text(scores: Scores) -> str:
     """Scores as lists of numbers: read back 1,000 at a time, so without names."""
-    estimates = [getattr(scores, metric) for metric in METRICS] + list(scores.profile)
+    estimates = [getattr(scores, metric) for metric in METRICS] + list(scores.normalised_regret)
     return json.dumps([[each.value, each.low, each.high] for each in estimates])
 
 
@@ -368,7 +368,7 @@ def _scores(text: str) -> Scores:
     ]
     count = len(METRICS)
     named = dict(zip(METRICS, estimates[:count], strict=True))
-    return Scores.model_construct(None, **named, profile=tuple(estimates[count:]))
+    return Scores.model_construct(None, **named, normalised_regret=tuple(estimates[count:]))
 
 
 def _entry_row(row: tuple[Any, ...]) -> EntryRow:

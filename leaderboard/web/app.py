@@ -6,7 +6,7 @@
     POST /api/submissions          202 taken, 200 known already
     GET  /api/submissions/<hex>    status and result, whose scores the reference rows may withhold
     POST /api/withdrawals          200
-    GET  /api/board?metric=wd      the ranking
+    GET  /api/board?metric=wd_regret  the ranking
     GET  /api/log?start=0          a hundred entries of the signed log
     GET  /healthz                  whether the server lives
 
@@ -40,7 +40,7 @@ from leaderboard import exports, intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.submission import MAX_BYTES, SignedSubmission
 from leaderboard.errors import BoardError, NotPublishable, Rejection
-from leaderboard.public_view import told
+from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store
@@ -271,7 +271,7 @@ class _Served:
             raise Rejection(
                 "unknown_submission", f"submission={id}: is not on this board. Check the id."
             )
-        return told(self._store, entry).to_dict()
+        return public_view(self._store, entry).to_dict()
 
     async def post_withdrawal(self, request: Request) -> Response:
         text = await _document(request, "withdrawal")
@@ -283,7 +283,7 @@ class _Served:
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
-        given = request.query_params.get("metric", "wd")
+        given = request.query_params.get("metric", "wd_regret")
         metric = next((name for name in METRICS if name == given), None)
         if metric is None:
             raise Refusal(

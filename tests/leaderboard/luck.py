@@ -47,7 +47,7 @@ def gains(store: Store, submission: Submission, draws: int) -> dict[str, tuple[f
                 regret = [region.normalised_regret for region in report.regions]
                 similarity = [region.similarity for region in report.regions]
                 metrics.append(run_metrics(regret, similarity, levels))
-        found[name] = (gain(metrics, "wd"), gain(metrics, "ood"))
+        found[name] = (gain(metrics, "wd_regret"), gain(metrics, "ood_regret"))
     return found
 
 
@@ -60,7 +60,9 @@ def main() -> None:
             if submission.method.knowledge != "generic":
                 continue
             for name, (wd, ood) in gains(store, submission, draws).items():
-                print(f"{submission.method.name:8} {name:16} N0 {wd:.2%}  A {ood:.2%}", flush=True)
+                print(
+                    f"{submission.method.name:8} {name:16} N0 {wd:.2%}  OOD {ood:.2%}", flush=True
+                )
 
 
 if __name__ == "__main__":

@@ -108,8 +108,8 @@ def test_from_a_key_to_a_page() -> None:
 
     shown = json.loads(good("show", "board", id, "--json"))
     # One of its two runs failed, and scores 1: the IQM of two is their mean.
-    alone = shown["result"]["runs"][0]["wd"]
-    assert shown["result"]["scores"]["wd"]["value"] == pytest.approx((alone + 1.0) / 2)
+    alone = shown["result"]["runs"][0]["wd_regret"]
+    assert shown["result"]["scores"]["wd_regret"]["value"] == pytest.approx((alone + 1.0) / 2)
     assert "A Lab" in good("show", "board", id.removeprefix("sha256:")[:8])
 
     assert "Whole" in good("verify", "board", "--rescore", "1")
@@ -204,7 +204,7 @@ def test_show_withholds_scores_until_the_references_are_right_and_says_why() -> 
     good("score", "board")
     assert "WD regret" in good("show", "board", id)
     plain = json.loads(good("show", "board", id, "--json"))
-    assert plain["result"]["scores"]["wd"]["value"] > 0
+    assert plain["result"]["scores"]["wd_regret"]["value"] > 0
     assert plain["withheld"] == ""
 
 
@@ -224,7 +224,7 @@ def test_an_altered_result_ends_with_3_and_is_named() -> None:
     make_board()
     good("score", "board")
     path = sorted(Path("board/results").iterdir())[0]
-    path.write_text(path.read_text().replace('"wd"', '"dw"', 1))
+    path.write_text(path.read_text().replace('"wd_regret"', '"dw"', 1))
     assert path.name in fails(3, "verify", "board")
 
 

@@ -23,10 +23,10 @@ def test_three_algorithms_are_ranked_between_the_references_with_ten_runs_a_clas
         assert store.document.suite == catalogue.find(SuiteFile, "smoke-v1").suite
         entries = store.entries()
         refuse_unpublishable(entries)
-        ranked = [row for row in ranking(entries, "wd") if row.first is not None]
+        ranked = [row for row in ranking(entries, "wd_regret") if row.first is not None]
         assert {row.entry.method for row in ranked} == {"PPO", "SAC", "TD3"}
         for row in ranked:
             result = store.result(row.entry.id)
             assert result is not None
             assert [member.runs for member in result.classes] == [10, 10, 10]
-            assert 0.0 < result.scores.wd.low <= result.scores.wd.high < 1.0
+            assert 0.0 < result.scores.wd_regret.low <= result.scores.wd_regret.high < 1.0

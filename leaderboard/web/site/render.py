@@ -1,11 +1,11 @@
 """The pages of a board, each a function of the store; `write_site` writes them all.
 
-    index.html, ood.html, decay.html    the board by N₀, A and D
+    index.html, ood_regret.html, ood_decay.html    the board by each metric
     submissions/<64 hex>.html, .json    of each submission; results/<64 hex>.json
     compare.html, board-data.js         chosen entries over one another, drawn by static/board.js
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify
     method.html                         the formulas
-    board.json, .csv, .tex              the board as data, by N₀; ood.* and decay.* by A and D
+    board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
 Whatever a submitter wrote is escaped by Jinja2, which does so for every value that is not marked
 as safe; marked are only the drawings, which hold numbers and what they escaped themselves.
@@ -62,7 +62,7 @@ _TYPES = {
 _TABLES = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
 _LOG_PAGE = re.compile(r"log-(0|[1-9][0-9]{0,8})\.html")
 
-MetricKey = Literal["wd", "ood", "decay"]
+MetricKey = Literal["wd_regret", "ood_regret", "ood_decay"]
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Metric:
 
 METRICS = (
     Metric(
-        "wd",
+        "wd_regret",
         "index.html",
         "board",
         "N₀",
@@ -99,24 +99,24 @@ METRICS = (
         "policy's: 0 is optimal, 1 is no better than always answering ½.",
     ),
     Metric(
-        "ood",
-        "ood.html",
-        "ood",
-        "A",
-        "OOD regret A",
+        "ood_regret",
+        "ood_regret.html",
+        "ood_regret",
+        "N̄",
+        "OOD regret N̄",
         "beyond the training cube",
         "The same share, averaged over the shells around the training cube: how good the policy "
         "still is in states that training never shows.",
     ),
     Metric(
-        "decay",
-        "decay.html",
-        "decay",
-        "D",
-        "OOD decay D",
+        "ood_decay",
+        "ood_decay.html",
+        "ood_decay",
+        "N̄ − N₀",
+        "OOD decay N̄ − N₀",
         "what is lost on the way out",
-        "D = A − N₀: how much of what was learned inside is lost outside. 0 is no loss, "
-        "and less is a gain.",
+        "The OOD regret minus the WD regret: how much of what was learned inside the training cube "
+        "is lost outside. 0 is no loss; a negative value is a gain.",
         (("optimal", 0.0), ("constant", 0.0)),
     ),
 )
@@ -176,7 +176,7 @@ class Pages:
         ranking.refuse_unpublishable(entries)
         return entries
 
-    def board(self, metric: MetricKey = "wd") -> str:
+    def board(self, metric: MetricKey = "wd_regret") -> str:
         """The board by a metric.
 
         Raises:
@@ -189,7 +189,9 @@ class Pages:
         ends = [end for estimate in shown for end in (estimate.low, estimate.high)]
         scale = charts.Scale.of([*ends, *(value for _, value in tab.references)])
         marks = charts.reference_lines(scale, tab.references)
-        spark = charts.Scale.of([0.0, 1.0, *(e.value for score in scores for e in score.profile)])
+        spark = charts.Scale.of(
+            [0.0, 1.0, *(e.value for score in scores for e in score.normalised_regret)]
+        )
         lines = [self._line(row, tab, scale, marks, spark) for row in rows if row.entry.scores]
         ranked = [line for line in lines if line.rank and not line.entry.reference]
         competing = [entry for entry in self.entries if not entry.reference]
@@ -231,9 +233,13 @@ class Pages:
         chart: str = ""
         classes: list[tuple[object, str]] = []
         if result is not None and scores is not None:
-            chart = charts.profile_chart(scores.profile, edges, "profile", submission.method.name)
-            scale = charts.Scale.of([0.0, 1.0, *(n for c in result.classes for n in c.profile)])
-            classes = [(c, charts.sparkline(c.profile, scale)) for c in result.classes]
+            chart = charts.profile_chart(
+                scores.normalised_regret, edges, "profile", submission.method.name
+            )
+            scale = charts.Scale.of(
+                [0.0, 1.0, *(n for c in result.classes for n in c.normalised_regret)]
+            )
+            classes = [(c, charts.sparkline(c.normalised_regret, scale)) for c in result.classes]
         return self._render(
             "submission.html",
             here="",
@@ -308,17 +314,25 @@ class Pages:
         def rounded(estimate: Estimate) -> list[float]:
             return [round(x, 5) + 0.0 for x in (estimate.value, estimate.low, estimate.high)]
 
-        keys = ("wd", "ood", "decay", "slope", "points")
+        keys = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
         data = {
             "regions": charts.region_labels(self.document.protocol.edges),
-            "metrics": ["WD regret N₀", "OOD regret A", "OOD decay D", "Slope", "Points"],
+            "metrics": [
+                "WD regret N₀",
+                "OOD regret N̄",
+                "OOD decay N̄ − N₀",
+                "Regret slope",
+                "Similarity loss",
+            ],
             "entries": [
                 {
                     "id": hex_of(entry.id),
                     "name": f"{entry.method} {entry.version}",
                     "by": entry.submitter,
                     "scores": [rounded(getattr(entry.scores, key)) for key in keys],
-                    "profile": [rounded(estimate) for estimate in entry.scores.profile],
+                    "normalised_regret": [
+                        rounded(estimate) for estimate in entry.scores.normalised_regret
+                    ],
                 }
                 for entry in self.entries
                 if entry.scores is not None and entry.status == "scored"
@@ -327,7 +341,7 @@ class Pages:
         return f"window.boardData = {json.dumps(data, separators=(',', ':'))};\n"
 
     def read(self, path: str) -> bytes | None:
-        """A file of the site by its path below the site's root, such as `ood.html`.
+        """A file of the site by its path below the site's root, such as `ood_regret.html`.
 
         Raises:
           NotPublishable: as `entries` says.
@@ -355,7 +369,7 @@ class Pages:
             yield _log_page(number)
         yield "board-data.js"
         yield from (f"{tab.stem}.{kind}" for tab in METRICS for kind in _TABLES)
-        yield from ("log.html", "method.html", "compare.html", "decay.html", "ood.html")
+        yield from ("log.html", "method.html", "compare.html", "ood_decay.html", "ood_regret.html")
         yield "index.html"
 
     def _page(self, name: str) -> bytes | None:
@@ -481,7 +495,7 @@ class Pages:
             high=charts.number(estimate.high),
             estimate=estimate,
             bar=charts.interval_bar(estimate, scale, marks),
-            spark=charts.sparkline([e.value for e in entry.scores.profile], spark),
+            spark=charts.sparkline([e.value for e in entry.scores.normalised_regret], spark),
             steps=steps_text(entry.steps),
             code_link=code_link,
             flags=tuple(flags),

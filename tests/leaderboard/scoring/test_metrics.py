@@ -31,17 +31,17 @@ def test_metrics_of_a_run_are_those_written_out_by_hand() -> None:
         (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
     )
 
-    assert found["wd"] == 0.1
-    assert found["ood"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
-    assert found["decay"] == pytest.approx(0.4 - 0.1)
-    assert found["slope"] == pytest.approx(0.1 / 0.2)
-    assert found["points"] == pytest.approx(100 * (0.95 - 0.8))
+    assert found["wd_regret"] == 0.1
+    assert found["ood_regret"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
+    assert found["ood_decay"] == pytest.approx(0.4 - 0.1)
+    assert found["regret_slope"] == pytest.approx(0.1 / 0.2)
+    assert found["similarity_loss"] == pytest.approx(100 * (0.95 - 0.8))
 
 
 def test_slope_is_that_of_the_least_squares_line() -> None:
     regret = np.random.default_rng(1).random(6)
 
-    slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["slope"]
+    slope = run_metrics(tuple(regret), tuple(1 - regret), LEVELS)["regret_slope"]
 
     assert slope == pytest.approx(np.polynomial.Polynomial.fit(LEVELS, regret, 1).convert().coef[1])
 
@@ -52,13 +52,25 @@ def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
 ) -> None:
     found = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
 
-    assert found == {"wd": 1.0, "ood": 1.0, "decay": 0.0, "slope": 0.0, "points": 0.0}
+    assert found == {
+        "wd_regret": 1.0,
+        "ood_regret": 1.0,
+        "ood_decay": 0.0,
+        "regret_slope": 0.0,
+        "similarity_loss": 0.0,
+    }
 
 
 def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
     found = run_metrics((1.0,) * 6, None, LEVELS)
 
-    assert found == {"wd": 1.0, "ood": 1.0, "decay": 1.0, "slope": 1.0, "points": 100.0}
+    assert found == {
+        "wd_regret": 1.0,
+        "ood_regret": 1.0,
+        "ood_decay": 1.0,
+        "regret_slope": 1.0,
+        "similarity_loss": 100.0,
+    }
 
 
 # Over runs

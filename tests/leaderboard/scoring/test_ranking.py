@@ -45,12 +45,12 @@ def scores(wd: float, ood: float, arm: float = 0.05) -> Scores:
         return Estimate(value=value, low=value - arm, high=value + arm)
 
     return Scores(
-        wd=around(wd),
-        ood=around(ood),
-        decay=around(ood - wd),
-        slope=around(0.0),
-        points=around(1.0),
-        profile=(around(wd), *(around(ood) for _ in range(5))),
+        wd_regret=around(wd),
+        ood_regret=around(ood),
+        ood_decay=around(ood - wd),
+        regret_slope=around(0.0),
+        similarity_loss=around(1.0),
+        normalised_regret=(around(wd), *(around(ood) for _ in range(5))),
     )
 
 
@@ -96,7 +96,7 @@ def test_entries_stand_in_order_with_the_ranks_that_their_intervals_leave_open()
         entry(6, scores(0.80, 0.9)),
     ]
 
-    rows = ranking(entries, "wd")
+    rows = ranking(entries, "wd_regret")
 
     assert [(row.entry.sequence, row.first, row.last) for row in rows] == [
         (4, 1, 2),
@@ -112,16 +112,16 @@ def test_each_metric_has_its_own_order() -> None:
 
     orders = {
         metric: [row.entry.sequence for row in ranking(entries, metric)]
-        for metric in ("wd", "ood", "decay")
+        for metric in ("wd_regret", "ood_regret", "ood_decay")
     }
 
-    assert orders == {"wd": [3, 4, 5], "ood": [5, 4, 3], "decay": [5, 4, 3]}
+    assert orders == {"wd_regret": [3, 4, 5], "ood_regret": [5, 4, 3], "ood_decay": [5, 4, 3]}
 
 
 def test_equal_scores_stand_in_the_order_in_which_they_came() -> None:
     entries = [entry(sequence, scores(0.3, 0.4)) for sequence in (9, 4, 7)]
 
-    assert [row.entry.sequence for row in ranking(entries, "wd")] == [4, 7, 9]
+    assert [row.entry.sequence for row in ranking(entries, "wd_regret")] == [4, 7, 9]
 
 
 def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> None:
@@ -131,7 +131,7 @@ def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> Non
         entry(4, scores(0.3, 0.4)),
     ]
 
-    rows = ranking(entries, "wd")
+    rows = ranking(entries, "wd_regret")
 
     assert [(row.entry.sequence, row.first, row.last, row.reason) for row in rows] == [
         (1, None, None, IS_REFERENCE),
@@ -144,13 +144,13 @@ def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> Non
 def test_what_has_not_certainly_learned_has_no_rank_by_decay() -> None:
     unsure, sure = entry(3, scores(0.46, 0.46)), entry(4, scores(0.45, 0.6))
 
-    rows = ranking([unsure, sure], "decay")
+    rows = ranking([unsure, sure], "ood_decay")
 
     assert [(row.entry.sequence, row.first, row.reason) for row in rows] == [
         (3, None, NOT_LEARNED),
         (4, 1, ""),
     ]
-    assert [row.first for row in ranking([unsure, sure], "wd")] == [1, 1]
+    assert [row.first for row in ranking([unsure, sure], "wd_regret")] == [1, 1]
 
 
 def test_only_what_is_scored_and_stands_is_there() -> None:
@@ -160,7 +160,7 @@ def test_only_what_is_scored_and_stands_is_there() -> None:
         entry(5, scores(0.1, 0.2), status="withdrawn"),
     ]
 
-    assert ranking(entries, "wd") == []
+    assert ranking(entries, "wd_regret") == []
 
 
 def test_a_thousand_entries_are_ranked_in_less_than_50_ms(
@@ -171,7 +171,7 @@ def test_a_thousand_entries_are_ranked_in_less_than_50_ms(
 
     def seconds() -> float:
         start = time.process_time()
-        assert len(ranking(entries, "wd")) == 1000
+        assert len(ranking(entries, "wd_regret")) == 1000
         return time.process_time() - start
 
     best = min(seconds() for _ in range(5))
@@ -218,7 +218,7 @@ def test_a_reference_row_that_is_not_scored_holds_everything_back(status: Any) -
         refuse_unpublishable([REFERENCES[0], replace(REFERENCES[1], status=status)])
 
 
-@pytest.mark.parametrize("name", ["wd", "ood", "decay", "slope", 0, 3, 5])
+@pytest.mark.parametrize("name", ["wd_regret", "ood_regret", "ood_decay", "regret_slope", 0, 3, 5])
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("off", [2e-6, -2e-6])
 def test_a_reference_row_off_in_any_region_or_metric_holds_everything_back(
@@ -228,9 +228,9 @@ def test_a_reference_row_off_in_any_region_or_metric_holds_everything_back(
     found = rows[which].scores
     assert found is not None
     if isinstance(name, int):
-        profile = list(found.profile)
+        profile = list(found.normalised_regret)
         profile[name] = moved(profile[name], off)
-        changed = found.model_copy(update={"profile": tuple(profile)})
+        changed = found.model_copy(update={"normalised_regret": tuple(profile)})
     else:
         changed = found.model_copy(update={name: moved(getattr(found, name), off)})
     rows[which] = replace(rows[which], scores=changed)
@@ -247,7 +247,7 @@ def test_the_constant_policy_may_lose_points_outside() -> None:
     found = REFERENCES[1].scores
     assert found is not None
     points = Estimate(value=2.2, low=2.0, high=2.4)
-    row = replace(REFERENCES[1], scores=found.model_copy(update={"points": points}))
+    row = replace(REFERENCES[1], scores=found.model_copy(update={"similarity_loss": points}))
 
     refuse_unpublishable([REFERENCES[0], row])
 
@@ -260,11 +260,11 @@ HOSTILE = '=HYPERLINK("http://x","y")'
 def hostile_rows() -> list[Any]:
     evil = entry(3, scores(0.3, 0.2), method=HOSTILE, submitter="a;=1+1\r\n=2", version="-1")
     tex = entry(4, scores(0.6, 0.7), method=r"\input{/etc/passwd} 50% & $x_1^2$ #~", version="+1")
-    return ranking([*REFERENCES, evil, tex], "wd")
+    return ranking([*REFERENCES, evil, tex], "wd_regret")
 
 
 def test_no_cell_of_the_csv_is_a_formula() -> None:
-    text = to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE)
+    text = to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
     lines = list(csv.DictReader(io.StringIO(text)))
 
     assert len(lines) == 4
@@ -279,37 +279,41 @@ def test_no_cell_of_the_csv_is_a_formula() -> None:
 
 
 def test_text_that_is_a_negative_number_is_no_number_in_the_csv() -> None:
-    lines = list(csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE))))
+    lines = list(
+        csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)))
+    )
 
     assert lines[1]["version"] == "'-1"
-    assert float(lines[1]["decay"]) == pytest.approx(-0.1)
+    assert float(lines[1]["ood_decay"]) == pytest.approx(-0.1)
 
 
 @pytest.mark.parametrize(
     "start", ["=", "+", "-", "@", "\t=", " =", "\r=", "＝", "|", "%", "\x00=", "\u202e="]
 )
 def test_no_text_that_a_spreadsheet_may_run_begins_a_cell(start: str) -> None:
-    rows = ranking([entry(3, scores(0.1, 0.2), submitter=f"{start}cmd")], "wd")
+    rows = ranking([entry(3, scores(0.1, 0.2), submitter=f"{start}cmd")], "wd_regret")
 
-    (line,) = csv.DictReader(io.StringIO(to_csv(rows, "wd", BOARD, HEAD, DATE)))
+    (line,) = csv.DictReader(io.StringIO(to_csv(rows, "wd_regret", BOARD, HEAD, DATE)))
 
     assert line["submitter"] == f"'{start[-1]}cmd"
 
 
 def test_the_csv_has_every_score_with_its_interval() -> None:
-    lines = list(csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd", BOARD, HEAD, DATE))))
+    lines = list(
+        csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)))
+    )
 
     assert [line["first"] for line in lines] == ["", "1", "2", ""]
     found = lines[1]
-    assert [float(found[name]) for name in ("wd", "wd_low", "wd_high")] == pytest.approx(
-        [0.3, 0.25, 0.35]
-    )
-    assert float(found["regret_0"]) == pytest.approx(0.3)
-    assert float(found["regret_5_high"]) == pytest.approx(0.25)
+    assert [
+        float(found[name]) for name in ("wd_regret", "wd_regret_low", "wd_regret_high")
+    ] == pytest.approx([0.3, 0.25, 0.35])
+    assert float(found["normalised_regret_0"]) == pytest.approx(0.3)
+    assert float(found["normalised_regret_5_high"]) == pytest.approx(0.25)
 
 
 def test_latex_shows_what_was_written_and_runs_none_of_it() -> None:
-    text = to_latex(hostile_rows(), "wd", BOARD, HEAD, DATE)
+    text = to_latex(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
 
     line = next(line for line in text.splitlines() if "passwd" in line)
     assert line == (
@@ -320,18 +324,18 @@ def test_latex_shows_what_was_written_and_runs_none_of_it() -> None:
 
 
 def test_a_name_of_two_lines_cannot_leave_its_line_of_latex() -> None:
-    rows = ranking([entry(3, scores(0.1, 0.2), submitter="a\n\\end{tabular}\u2028b")], "wd")
+    rows = ranking([entry(3, scores(0.1, 0.2), submitter="a\n\\end{tabular}\u2028b")], "wd_regret")
 
-    lines = to_latex(rows, "wd", BOARD, HEAD, DATE).splitlines()
+    lines = to_latex(rows, "wd_regret", BOARD, HEAD, DATE).splitlines()
 
     assert sum("tabular" in line for line in lines) == 3
     assert r"a \textbackslash{}end\{tabular\} b" in "\n".join(lines)
 
 
 def test_the_json_has_the_whole_scores() -> None:
-    plain = json.loads(to_json(hostile_rows(), "wd", BOARD, HEAD, DATE))
+    plain = json.loads(to_json(hostile_rows(), "wd_regret", BOARD, HEAD, DATE))
 
-    assert plain["metric"] == "wd"
+    assert plain["metric"] == "wd_regret"
     assert [row["not_ranked"] for row in plain["rows"]] == ["reference", "", "", "reference"]
     assert Scores.from_dict(plain["rows"][1]["scores"]) == scores(0.3, 0.2)
     assert plain["rows"][1]["method"] == HOSTILE
@@ -339,7 +343,7 @@ def test_the_json_has_the_whole_scores() -> None:
 
 @pytest.mark.parametrize("write", [to_csv, to_latex, to_json])
 def test_every_file_says_what_it_is_of(write: Any) -> None:
-    text = write(hostile_rows(), "wd", BOARD, HEAD, DATE).replace(r"\_", "_")
+    text = write(hostile_rows(), "wd_regret", BOARD, HEAD, DATE).replace(r"\_", "_")
 
     for said in (
         "small_suite-v1",

@@ -127,7 +127,11 @@ def test_a_copy_of_the_optimal_policy_scores_zero_and_is_flagged() -> None:
 
     assert result.status == "scored"
     assert result.scores is not None
-    for estimate in (result.scores.wd, result.scores.ood, *result.scores.profile):
+    for estimate in (
+        result.scores.wd_regret,
+        result.scores.ood_regret,
+        *result.scores.normalised_regret,
+    ):
         assert 0.0 <= estimate.low <= estimate.value <= estimate.high < 1e-6
     assert result.oracle_like
 
@@ -136,9 +140,13 @@ def test_the_constant_policy_scores_one_and_has_no_decay() -> None:
     result = score(constant_onnx, constant_onnx, constant_onnx)
 
     assert result.scores is not None
-    for estimate in (result.scores.wd, result.scores.ood, *result.scores.profile):
+    for estimate in (
+        result.scores.wd_regret,
+        result.scores.ood_regret,
+        *result.scores.normalised_regret,
+    ):
         assert (estimate.low, estimate.value, estimate.high) == (1.0, 1.0, 1.0)
-    assert result.scores.decay.value == result.scores.slope.value == 0.0
+    assert result.scores.ood_decay.value == result.scores.regret_slope.value == 0.0
     assert not result.oracle_like
 
 
@@ -157,10 +165,10 @@ def test_a_run_has_the_numbers_that_anyone_can_recompute() -> None:
         regret = [region.normalised_regret for region in report.regions]
         similarity = [region.similarity for region in report.regions]
         assert run.evaluation_seed == seed
-        assert run.regret == pytest.approx(regret, abs=1e-6)
+        assert run.normalised_regret == pytest.approx(regret, abs=1e-6)
         assert run.similarity == pytest.approx(similarity, abs=1e-6)
-        assert run.ood == pytest.approx(np.mean(regret[1:]), abs=1e-6)
-        assert run.points == pytest.approx(
+        assert run.ood_regret == pytest.approx(np.mean(regret[1:]), abs=1e-6)
+        assert run.similarity_loss == pytest.approx(
             100 * (similarity[0] - np.mean(similarity[1:])), abs=1e-4
         )
 
@@ -187,11 +195,11 @@ def test_failed_and_unlisted_runs_score_one() -> None:
     ]
     for run in result.runs:
         if run.artefact is None:
-            assert run.regret == (1.0,) * 6
+            assert run.normalised_regret == (1.0,) * 6
             assert run.similarity is run.evaluation_seed is None
             assert [getattr(run, name) for name in METRICS] == [1.0, 1.0, 1.0, 1.0, 100.0]
     # Of four runs the best and the worst are cut, which leaves two that score 1.
-    assert shallow.wd == 1.0
+    assert shallow.wd_regret == 1.0
 
 
 def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
@@ -205,7 +213,7 @@ def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
             class_name=class_name,
             artefact=digest_of(LINEAR),
             evaluation_seed=0,
-            regret=regret,
+            normalised_regret=regret,
             similarity=similarity,
             **run_metrics(regret, similarity, levels),
         )
@@ -213,7 +221,7 @@ def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
     slopes = [0.1 * number for number in range(1, 9)]
     runs = [run(name, slope) for name in ("shallow", "deep") for slope in slopes]
     withheld = [
-        run if run.slope < 0.45 else failed_run(BOARD, run.class_name, None) for run in runs
+        run if run.regret_slope < 0.45 else failed_run(BOARD, run.class_name, None) for run in runs
     ]
     honest, chosen = (result_of(BOARD, "sha256:" + "0" * 64, each, {}) for each in (runs, withheld))
 
@@ -227,9 +235,9 @@ def test_no_interval_of_a_regret_reaches_below_zero() -> None:
     result = score(optimal_onnx, None, optimal_onnx)
 
     assert result.scores is not None
-    assert result.scores.wd.low == result.scores.profile[5].low == 0.0
-    assert result.scores.wd.value == pytest.approx(0.25, abs=1e-6)
-    assert result.scores.decay.low < 0.0  # a difference may be negative
+    assert result.scores.wd_regret.low == result.scores.normalised_regret[5].low == 0.0
+    assert result.scores.wd_regret.value == pytest.approx(0.25, abs=1e-6)
+    assert result.scores.ood_decay.low < 0.0  # a difference may be negative
 
 
 def test_ranking_needs_enough_runs_in_each_class() -> None:
@@ -359,11 +367,20 @@ def test_a_sandbox_ended_from_outside_judges_nothing() -> None:
 def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
     wd: float, ood: float, expected: bool
 ) -> None:
-    values = {"wd": wd, "ood": ood, "decay": round(ood - wd, 9), "slope": 0.0, "points": 0.0}
+    values = {
+        "wd_regret": wd,
+        "ood_regret": ood,
+        "ood_decay": round(ood - wd, 9),
+        "regret_slope": 0.0,
+        "similarity_loss": 0.0,
+    }
     estimates = {name: Estimate(value=x, low=x, high=x) for name, x in values.items()}
     assert tuple(values) == METRICS
 
-    assert _oracle_like(Scores(**estimates, profile=(estimates["wd"],) * 2)) is expected
+    assert (
+        _oracle_like(Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2))
+        is expected
+    )
 
 
 def test_versions_are_those_that_the_numbers_come_from_not_what_else_is_loaded(

@@ -295,9 +295,9 @@ def test_an_altered_result_is_named(board, number, harm):
     if harm == "deleted":
         path.unlink()
     elif harm == "score":
-        alter(path, lambda plain: plain["scores"]["wd"].update(value=0.0))
+        alter(path, lambda plain: plain["scores"]["wd_regret"].update(value=0.0))
     elif harm == "regret":
-        alter(path, lambda plain: plain["runs"][0].update(wd=0.0))
+        alter(path, lambda plain: plain["runs"][0].update(wd_regret=0.0))
     else:
         alter(path, lambda plain: plain.update(status="rejected", code="onnx_op", scores=None))
     assert found(board) == where(board, path)
@@ -400,12 +400,12 @@ def test_a_board_that_lies_and_signs_it_is_found_out(board, lie):
     result = Result.from_dict(json.loads(path.read_text()))
     run = result.runs[0]
     if lie == "scores":
-        alter(path, lambda plain: plain["scores"]["wd"].update(value=0.0, low=0.0, high=0.0))
+        alter(path, lambda plain: plain["scores"]["wd_regret"].update(value=0.0, low=0.0, high=0.0))
     else:
         better = {
             "runs": {"artefact": "sha256:" + "1" * 64},
             "seed": {"evaluation_seed": 1},
-            "run's metrics": {"wd": 0.0},
+            "run's metrics": {"wd_regret": 0.0},
         }[lie]
         runs = (run.model_copy(update=better), *result.runs[1:])
         anew = result_of(folder.read(), id, runs, result.versions)
@@ -432,8 +432,8 @@ def test_a_board_that_spares_a_run_without_a_policy_is_found_out(tmp_path, kind,
     first, without = result.runs
     spared = {
         "leaves it out": [],
-        "scores it 0": [without.model_copy(update={"regret": (0.0,) * 6})],
-        "gives it the constant's decay": [without.model_copy(update={"decay": 0.0})],
+        "scores it 0": [without.model_copy(update={"normalised_regret": (0.0,) * 6})],
+        "gives it the constant's decay": [without.model_copy(update={"ood_decay": 0.0})],
     }[lie]
     anew = result_of(folder.read(), signed.id, [first, *spared], result.versions)
     path.write_text(to_json(anew.to_dict()))
@@ -449,9 +449,9 @@ def test_a_board_that_lies_about_its_runs_is_found_out_by_scoring_them_anew(boar
     levels = [high for _, high in folder.read().protocol.edges]
 
     def lied(run):
-        regret = tuple(0.999 * value for value in run.regret)
+        regret = tuple(0.999 * value for value in run.normalised_regret)
         metrics = run_metrics(regret, run.similarity, levels)
-        return run.model_copy(update={"regret": regret, **metrics})
+        return run.model_copy(update={"normalised_regret": regret, **metrics})
 
     anew = result_of(folder.read(), id, [lied(run) for run in result.runs], result.versions)
     path.write_text(to_json(anew.to_dict()))

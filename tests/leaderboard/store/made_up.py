@@ -42,7 +42,7 @@ def made_up_result(store: Store, id: str, *, code: str = "", level: float = 0.5)
                 evaluation_seed=evaluation_seed(
                     document.protocol.digest, run.spec, run.artefact.sha256
                 ),
-                regret=regret,
+                normalised_regret=regret,
                 similarity=similarity,
                 **run_metrics(regret, similarity, levels),
             )

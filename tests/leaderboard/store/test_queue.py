@@ -29,7 +29,7 @@ def test_a_claim_that_ran_out_is_claimed_again_and_the_late_result_refused(store
     assert not store.finish(late, made_up_result(store, late.id, level=0.1))
     assert store.result(late.id) is None
     assert store.finish(second, made_up_result(store, second.id, level=0.2))
-    assert store.entry(second.id).scores.wd.value == pytest.approx(0.2)
+    assert store.entry(second.id).scores.wd_regret.value == pytest.approx(0.2)
     assert not store.finish(second, made_up_result(store, second.id, level=0.3))
     assert not store.finish(late, made_up_result(store, late.id, level=0.3))
     assert [entry.event for entry in store.log()] == ["opened", "received", "result"]

@@ -97,7 +97,16 @@ def files_of(store: Store) -> list[str]:
 
 @pytest.mark.parametrize(
     "path",
-    ["/", "/index.html", "/ood", "/decay.html", "/compare", "/log", "/method", "/board.csv"],
+    [
+        "/",
+        "/index.html",
+        "/ood_regret",
+        "/ood_decay.html",
+        "/compare",
+        "/log",
+        "/method",
+        "/board.csv",
+    ],
 )
 def test_pages_are_served(published: tuple[str, dict[str, str]], path: str) -> None:
     answer = HTTP.get(published[0] + path, headers=BROWSER)
@@ -174,7 +183,7 @@ def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
 
 
 def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
-    for path in ("/", "/ood", "/log", "/api/board"):
+    for path in ("/", "/ood_regret", "/log", "/api/board"):
         answer = HTTP.get(url + path, headers=JSON)
         assert refusal(answer) == (503, "not_publishable")
         assert "'optimal'" in answer.json()["message"]
@@ -202,7 +211,7 @@ def test_the_server_says_that_it_lives(published: tuple[str, dict[str, str]]) ->
     assert HTTP.get(f"{published[0]}/healthz").json() == {"status": "ok"}
 
 
-@pytest.mark.parametrize("metric", ["wd", "ood", "decay"])
+@pytest.mark.parametrize("metric", ["wd_regret", "ood_regret", "ood_decay"])
 def test_the_board_as_data_is_in_order(published: tuple[str, dict[str, str]], metric: str) -> None:
     board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
     values = [row["scores"][metric]["value"] for row in board["rows"]]
@@ -240,7 +249,7 @@ def test_a_submission_is_told_with_its_result(published: tuple[str, dict[str, st
     rejected = HTTP.get(f"{url}/api/submissions/{hex_of(ids['rejected'])}").json()
     waiting = HTTP.get(f"{url}/api/submissions/{hex_of(ids['waiting'])}").json()
     assert scored["status"] == "scored"
-    assert scored["result"]["scores"]["wd"]["value"] < 0.2
+    assert scored["result"]["scores"]["wd_regret"]["value"] < 0.2
     assert scored["submission"]["method"]["name"] == "SAC"
     assert (rejected["status"], rejected["result"]["code"]) == ("rejected", "onnx_op")
     assert (waiting["status"], waiting["result"]) == ("waiting", None)
@@ -267,7 +276,7 @@ def test_scores_are_withheld_until_the_references_are_right(url: str, store: Sto
         own = store.folder.signing_key()
         boards.submit(store, own, name, [level] * 6, family="reference", spread=0.0)
     told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
-    assert told["result"]["scores"]["profile"][0]["value"] > 0
+    assert told["result"]["scores"]["normalised_regret"][0]["value"] > 0
     assert told["withheld"] == ""
 
 

@@ -99,7 +99,14 @@ def opened(chromium):
 
 
 def all_pages(ids):
-    yield from ("index.html", "ood.html", "decay.html", "method.html", "log.html", "compare.html")
+    yield from (
+        "index.html",
+        "ood_regret.html",
+        "ood_decay.html",
+        "method.html",
+        "log.html",
+        "compare.html",
+    )
     yield f"compare.html?id={ids['sac'][:16]}&id={ids['long'][:16]}&id={ids['hostile'][:16]}"
     yield from (f"submissions/{digits}.html" for digits in ids.values())
 
@@ -133,9 +140,11 @@ def test_the_tabs_lead_from_one_ranking_to_another(served, opened):
     page = opened(served + "index.html")
     tabs = page.get_by_role("navigation", name="Ranked by")
     expect(tabs.get_by_role("link", name="WD regret")).to_have_attribute("aria-current", "page")
-    tabs.get_by_role("link", name="OOD decay D").click()
-    expect(page).to_have_url(re.compile(r"decay\.html$"))
-    expect(tabs.get_by_role("link", name="OOD decay D")).to_have_attribute("aria-current", "page")
+    tabs.get_by_role("link", name="OOD decay N̄ − N₀").click()
+    expect(page).to_have_url(re.compile(r"ood_decay\.html$"))
+    expect(tabs.get_by_role("link", name="OOD decay N̄ − N₀")).to_have_attribute(
+        "aria-current", "page"
+    )
     expect(page.get_by_text("Ranked only where the upper bound of N₀")).to_be_visible()
 
 

@@ -188,7 +188,7 @@ function ticksOf(values) {
 
 function chart(chosen, regions, label) {
   const [width, height, left, right, top, bottom] = [720, 380, 60, 708, 22, 316];
-  const ticks = ticksOf(chosen.flatMap((entry) => entry.profile.flat()));
+  const ticks = ticksOf(chosen.flatMap((entry) => entry.normalised_regret.flat()));
   const [low, high] = [ticks[0], ticks[ticks.length - 1]];
   const y = (value) => bottom - ((bottom - top) * (value - low)) / (high - low);
   const step = (right - left) / regions.length;
@@ -223,9 +223,9 @@ function chart(chosen, regions, label) {
   );
   chosen.forEach((entry, series) => {
     const group = make("g", { class: `overlay series-${series}` });
-    const points = entry.profile.map(([value], region) => `${x(region, series)},${y(value)}`);
+    const points = entry.normalised_regret.map(([value], region) => `${x(region, series)},${y(value)}`);
     group.append(make("polyline", { class: "line", points: points.join(" ") }));
-    entry.profile.forEach(([value, from, to], region) => {
+    entry.normalised_regret.forEach(([value, from, to], region) => {
       const at = x(region, series);
       group.append(
         make("path", { class: "whisker", d: `M${at} ${y(from)}V${y(to)}M${at - 3} ${y(from)}h6M${at - 3} ${y(to)}h6` }),
@@ -260,11 +260,11 @@ function table(chosen, regions, metrics) {
   };
   const body = make("tbody", {});
   metrics.forEach((name, index) => {
-    body.append(row(name, chosen.map((entry) => entry.scores[index]), name === "Points" ? 2 : 3));
+    body.append(row(name, chosen.map((entry) => entry.scores[index]), name === "Similarity loss" ? 2 : 3));
   });
   regions.forEach((name, index) => {
     const text = index === 0 ? "N, WD" : `N, ε ${name}`;
-    body.append(row(text, chosen.map((entry) => entry.profile[index]), 3));
+    body.append(row(text, chosen.map((entry) => entry.normalised_regret[index]), 3));
   });
   const caption = make(
     "caption",

@@ -161,20 +161,20 @@ def _result(
         scores.append(_run(member, run, regret, epsilons, index))
     for member in submission.runs_started:
         scores += [_run(member, None, np.ones(len(epsilons)), epsilons, 0) for _ in range(missing)]
-    regrets = np.array([score.regret for score in scores])
+    regrets = np.array([score.normalised_regret for score in scores])
     half = spread * np.array([1.0, 0.6, 1.4])
     classes = []
     for member in submission.runs_started:
         own = [score for score in scores if score.class_name == member]
-        mean = np.mean([score.regret for score in own], axis=0)
+        mean = np.mean([score.normalised_regret for score in own], axis=0)
         classes.append(
             ClassScore(
                 name=member,
                 runs=len(own),
                 submitted=sum(score.artefact is not None for score in own),
-                wd=float(mean[0]),
-                ood=float(mean[1:].mean()),
-                profile=tuple(mean.tolist()),
+                wd_regret=float(mean[0]),
+                ood_regret=float(mean[1:].mean()),
+                normalised_regret=tuple(mean.tolist()),
             )
         )
     mean = regrets.mean(axis=0)
@@ -182,12 +182,12 @@ def _result(
         **common,
         status="scored",
         scores=Scores(
-            wd=_estimate(mean[0], half[0], 0.0),
-            ood=_estimate(mean[1:].mean(), half[0], 0.0),
-            decay=_estimate(mean[1:].mean() - mean[0], half[1]),
-            slope=_estimate(np.polyfit(epsilons, mean, 1)[0], half[1]),
-            points=_estimate(25 * (mean[1:].mean() - mean[0]), 10 * half[1]),
-            profile=tuple(_estimate(value, half[2], 0.0) for value in mean),
+            wd_regret=_estimate(mean[0], half[0], 0.0),
+            ood_regret=_estimate(mean[1:].mean(), half[0], 0.0),
+            ood_decay=_estimate(mean[1:].mean() - mean[0], half[1]),
+            regret_slope=_estimate(np.polyfit(epsilons, mean, 1)[0], half[1]),
+            similarity_loss=_estimate(25 * (mean[1:].mean() - mean[0]), 10 * half[1]),
+            normalised_regret=tuple(_estimate(value, half[2], 0.0) for value in mean),
         ),
         classes=tuple(classes),
         runs=tuple(scores),
@@ -207,13 +207,13 @@ def _run(
         class_name=member,
         artefact=run.artefact.sha256 if run is not None and run.artefact else None,
         evaluation_seed=2**52 + 7919 * index if policy else None,
-        regret=tuple(regret.tolist()),
+        normalised_regret=tuple(regret.tolist()),
         similarity=tuple((1 - 0.25 * regret).tolist()) if policy else None,
-        wd=wd,
-        ood=ood,
-        decay=ood - wd,
-        slope=float(np.polyfit(epsilons, regret, 1)[0]),
-        points=25 * (ood - wd) if policy else 0.0,
+        wd_regret=wd,
+        ood_regret=ood,
+        ood_decay=ood - wd,
+        regret_slope=float(np.polyfit(epsilons, regret, 1)[0]),
+        similarity_loss=25 * (ood - wd) if policy else 0.0,
     )
 
 

@@ -160,7 +160,7 @@ def test_every_link_leads_to_a_file_of_the_site_or_to_https(pages, site):
 
 def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
     store, _ = board
-    for name in ("index.html", "ood.html", "decay.html"):
+    for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         words = pages[name].words
         assert "This board proves performance, never learning." in words
         assert "specs are public, so π* is computable by anyone" in words
@@ -168,16 +168,16 @@ def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
             assert digest in words
         assert store.document.key in words
         assert store.head[1] in words
-    assert "Ranked only where the upper bound of N₀ is at most 0.5" in pages["decay.html"].words
+    assert "Ranked only where the upper bound of N₀ is at most 0.5" in pages["ood_decay.html"].words
     assert "Ranked only where" not in pages["index.html"].words
 
 
 def test_the_method_page_says_how_failures_and_intervals_count(pages):
     words = pages["method.html"].words
-    assert "every metric: N₀ = A = D = slope = 1, and 100 points" in words
+    assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
     assert "gains nothing" not in words
     assert "symmetric: θ ± the longer arm" in words
-    assert "best value there is" not in pages["decay.html"].words  # D may be negative
+    assert "best value there is" not in pages["ood_decay.html"].words  # D may be negative
 
 
 def test_the_log_page_says_what_a_kept_digest_is_good_for(pages, board):
@@ -216,7 +216,7 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
 
 
 def test_what_has_not_learned_is_listed_by_decay_and_not_ranked(site):
-    rows = {name: (rank, row) for rank, name, row in rows_of((site / "decay.html").read_text())}
+    rows = {name: (rank, row) for rank, name, row in rows_of((site / "ood_decay.html").read_text())}
     rank, row = rows["A method with quite a long name (ensemble of 16 critics)"]
     assert rank == "–"
     assert "WD regret not certainly below 0.5" in row
@@ -269,7 +269,7 @@ def test_latex_has_no_negative_zero(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         boards.submit(store, SigningKey.generate(), "Near", [4e-7, *[0.0] * 5], spread=0.0)
         pages = Pages(store)
-        assert any(entry.scores.decay.value < 0 for entry in pages.entries)
+        assert any(entry.scores.ood_decay.value < 0 for entry in pages.entries)
         assert "-0.000" not in pages.read("board.tex").decode()
 
 
@@ -323,8 +323,13 @@ def test_the_comparison_has_every_entry_that_stands_and_no_other(board, site):
     assert not shown & {ids[name] for name in ("rejected", "waiting", "gone")}
     sac = next(entry for entry in data["entries"] if entry["id"] == hex_of(ids["sac"]))
     scores = store.result(ids["sac"]).scores
-    assert sac["profile"][2] == pytest.approx(
-        [scores.profile[2].value, scores.profile[2].low, scores.profile[2].high], abs=1e-5
+    assert sac["normalised_regret"][2] == pytest.approx(
+        [
+            scores.normalised_regret[2].value,
+            scores.normalised_regret[2].low,
+            scores.normalised_regret[2].high,
+        ],
+        abs=1e-5,
     )
     assert data["regions"] == ["WD", "0–0.2", "0.2–0.4", "0.4–0.6", "0.6–0.8", "0.8–1"]
 
@@ -336,13 +341,13 @@ def test_the_same_board_gives_the_same_bytes_and_leaves_equal_files_alone(board,
     second = {p.relative_to(tmp_path): p for p in tmp_path.rglob("*") if p.is_file()}
     assert first == {name: path.read_bytes() for name, path in second.items()}
     before = {path: path.stat().st_ino for path in second.values()}
-    (tmp_path / "ood.html").write_text("half a pa")
+    (tmp_path / "ood_regret.html").write_text("half a pa")
     (tmp_path / "mine.txt").write_text("not the site's")
     write_site(store, tmp_path)
     after = {path: path.stat().st_ino for path in second.values()}
     changed = [path.name for path in before if before[path] != after[path]]
-    assert changed == ["ood.html"]
-    assert (tmp_path / "ood.html").read_bytes() == (site / "ood.html").read_bytes()
+    assert changed == ["ood_regret.html"]
+    assert (tmp_path / "ood_regret.html").read_bytes() == (site / "ood_regret.html").read_bytes()
     assert (tmp_path / "mine.txt").exists()
 
 
@@ -474,7 +479,7 @@ def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
 
 def test_an_empty_board_is_a_page_that_says_so(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
-        page = Page(Pages(store).board("wd"))
+        page = Page(Pages(store).board("wd_regret"))
     assert "No entry is ranked yet." in page.words
     assert "0 ranked of 0 submitted" in page.words
 
@@ -528,7 +533,7 @@ def test_a_thousand_entries_take_little_time(board, tmp_path, record_property, m
     times = []
     for _ in range(10):
         start = time.process_time()
-        text = Pages(store).board("wd")
+        text = Pages(store).board("wd_regret")
         times.append(time.process_time() - start)
     assert text.count('class="spark"') == 1002
     monkeypatch.undo()
