@@ -1,12 +1,12 @@
 # Two commands on a machine with Python 3.11, make and pip:  make demo   and   make test
-# Everything is installed into .venv, in the versions of constraints.txt.
+# Both install everything into .venv, in the versions pinned in constraints.txt.
 
 VENV := .venv
 BOARD := runs/board
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-# The first interpreter that is new enough; `make PYTHON=/path/to/python3.11 test` chooses one.
+# The first sufficiently new interpreter; override with `make PYTHON=/path/to/python3.11 test`.
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
@@ -17,43 +17,43 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 help:            ## show this list
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
 
-install: $(INSTALLED)  ## the virtual environment, with everything in it
+install: $(INSTALLED)  ## create the virtual environment with all dependencies
 
-demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, put it on a leaderboard
+demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, submit it to a local leaderboard
 	$(VENV)/bin/sme demo
 	$(VENV)/bin/sme-leaderboard demo
 
-serve: $(INSTALLED)    ## a leaderboard on this machine: the pages, and an API that takes submissions
+serve: $(INSTALLED)    ## serve a leaderboard on this machine: pages and submission API
 	@test -f $(BOARD)/board.json || $(VENV)/bin/sme-leaderboard init $(BOARD)
 	$(VENV)/bin/sme-leaderboard serve $(BOARD)
 
-test: $(INSTALLED)     ## the whole test suite, as CI runs it
+test: $(INSTALLED)     ## run the whole test suite, as CI does
 	$(PY) -m pytest -n auto
 
-check: $(INSTALLED)    ## style, formatting, types, and which module may import which
+check: $(INSTALLED)    ## check style, formatting, types and import contracts
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-bench: $(INSTALLED)    ## speed beside peers measured in the same run
+bench: $(INSTALLED)    ## measure speed against peers in the same run
 	$(PY) -m pytest benchmarks --benchmark-enable --benchmark-quiet -q
 
-docs: $(INSTALLED)     ## write the generated pages of docs/ anew
+docs: $(INSTALLED)     ## regenerate the generated pages of docs/
 	$(PY) docs/generate.py
 
 clean:                 ## remove the virtual environment, caches and built packages
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .benchmarks
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamp is written last, so an installation that was cut short is done again.
+# The stamp is written last, so an interrupted installation is repeated.
 $(INSTALLED): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed; python3, python3.11 and python" \
-	"are absent or older. Install it, or name it: make PYTHON=/path/to/python3.11"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is required, but python3, python3.11 and python" \
+	"are missing or older. Install it, or run: make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -c '$(NEW_ENOUGH)' >/dev/null 2>&1 || { echo "PYTHON=$(PYTHON): must be Python 3.11" \
 	"or newer. It says: $$($(PYTHON) --version 2>&1 | tail -n 1)"; exit 1; }
 	@$(PY) -c '$(NEW_ENOUGH)' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { rm -rf $(VENV); \
-	echo "No virtual environment could be made: this Python lacks its module venv, or pip." \
-	"On Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
+	echo "Cannot create a virtual environment: this Python lacks the module venv or pip." \
+	"On Debian and Ubuntu, run: apt-get install python3-venv"; exit 1; }
 	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@touch $@
