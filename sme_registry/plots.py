@@ -23,8 +23,7 @@ from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.evaluation.report import LABELS
 from sme_registry.io import write_atomically
 from sme_registry.spec import SMESpec, catalogue
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_spec, materialize
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
@@ -200,7 +199,7 @@ def similarity_map(
       UnknownNameError, SpecError: no such task, or a field out of range.
       MissingDependencyError: Matplotlib is not installed.
     """
-    spec = resolve(spec_or_id)
+    spec = load_spec(spec_or_id)
     if spec.state_dim != 2:
         raise OptionError(
             f"state_dim={spec.state_dim}: must be 2 for a map. Take a task such as SME/Plane1-v1."

@@ -72,14 +72,13 @@ def register(spec: SMESpec, name: str) -> str:
     Raises:
       OptionError: the name has other characters.
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
-      FingerprintMismatchError: the spec is of a file whose numbers are not the ones drawn here.
     """
     from sme_registry.spec import as_spec
     from sme_registry.spec.catalogue import NAMESPACE
     from sme_registry.spec.resolve import registered, resolve
     from sme_registry.task.streams import DYNAMICS_VERSION
 
-    spec = _verified(as_spec(spec))
+    spec = as_spec(spec)
     short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):
         raise OptionError(
@@ -88,10 +87,11 @@ def register(spec: SMESpec, name: str) -> str:
         )
     env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
     if _is_registered(env_id):
-        if resolve(env_id) == spec:
+        existing = resolve(env_id).spec
+        if existing == spec:
             return env_id
         raise NameTakenError(
-            f"{env_id!r} stands for another spec ({resolve(env_id).digest[:19]}…). Choose another "
+            f"{env_id!r} stands for another spec ({existing.digest[:19]}…). Choose another "
             "name: a released id never changes its numbers."
         )
     _register(env_id, spec.to_dict(), spec.team is not None)
@@ -99,25 +99,20 @@ def register(spec: SMESpec, name: str) -> str:
     return env_id
 
 
-def _verified(spec: SMESpec) -> SMESpec:
-    """The spec, checked against its file's fingerprint, which an EnvSpec's kwargs cannot carry."""
-    if spec._fingerprint is not None:
-        from sme_registry.task import materialize
-
-        materialize(spec)
-    return spec
-
-
 def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec:
     """The spec of an id, a file's path, or a digest; see `sme_registry.spec.resolve.resolve`.
 
-    Raises:
-      UnknownNameError: nothing has this name; says what is near.
-      MalformedDocumentError, SpecError, DigestMismatchError: the file is not a valid one.
-    """
-    from sme_registry.spec.resolve import resolve
+    The task of a file is drawn here, to check that this machine draws its published numbers.
 
-    return resolve(id_or_path_or_digest)
+    Raises:
+      UnknownNameError: no task has this name; the message suggests the nearest.
+      MalformedDocumentError, SpecError, DigestMismatchError: the file is invalid.
+      FingerprintMismatchError: this machine draws other numbers than the file publishes.
+      ResourceLimitError: the file's task would not fit in memory.
+    """
+    from sme_registry.task import load_spec
+
+    return load_spec(id_or_path_or_digest)
 
 
 def save(
@@ -147,7 +142,8 @@ def save(
     """
     from sme_registry.spec import as_spec
     from sme_registry.spec.envelope import EnvFile
-    from sme_registry.task import fingerprint, materialize
+    from sme_registry.task import materialize
+    from sme_registry.task.fingerprint import fingerprint_of
 
     spec = as_spec(spec)
     file = EnvFile.from_dict(
@@ -157,7 +153,7 @@ def save(
             "tags": tags,
             "spec": spec.to_dict(),
             "digest": spec.digest,
-            "fingerprint": fingerprint.take(materialize(spec)).to_dict(),
+            "fingerprint": fingerprint_of(materialize(spec)).to_dict(),
         },
         str(path),
     )
@@ -178,20 +174,19 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
 
     Raises:
       UnknownNameError, SpecError: see `load`.
-      FingerprintMismatchError: the spec is of a file whose numbers are not the ones drawn here.
+      FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
     """
     from sme_registry.envs.naming import content_id
     from sme_registry.spec import SMESpec
-    from sme_registry.spec.resolve import resolve
+    from sme_registry.task import load_spec
 
-    resolved = _verified(resolve(spec))
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
-    resolved = resolved.derive(**overrides)
+    derived = load_spec(spec).derive(**overrides)
     return EnvSpec(
-        id=content_id(resolved),
+        id=content_id(derived),
         entry_point=_ENTRY_POINT,
         vector_entry_point=_VECTOR_ENTRY_POINT,
-        kwargs={"spec": resolved.to_dict(), **kwargs},
+        kwargs={"spec": derived.to_dict(), **kwargs},
     )
 
 

@@ -32,8 +32,7 @@ from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
 from sme_registry.registration import make_vec
 from sme_registry.spec import SMESpec
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -272,7 +271,7 @@ class SMETeamVecEnv(LanesVecEnv):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
-        task = materialize(resolve(spec_or_id).derive(**overrides))
+        task = load_task(spec_or_id, **overrides)
         self._width = shared_action_dim(task)
         action_space, self._rescaled = action_ranges.space(action_range, self._width)
         shape = (shared_observation_dim(task),)

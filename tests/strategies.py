@@ -54,4 +54,4 @@ def spec_fields(draw: st.DrawFn, team: bool | None = None) -> dict[str, Any]:
 
 def specs(team: bool | None = None) -> st.SearchStrategy[SMESpec]:
     """Valid specs; `team` says whether they have one (None: either)."""
-    return spec_fields(team).map(SMESpec.parse)
+    return spec_fields(team).map(SMESpec.from_dict)

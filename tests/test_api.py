@@ -46,7 +46,7 @@ MODULES = [
     "envs.batch", "envs.team", "errors", "io", "registration", "spec", "spec.catalogue",
     "spec.document", "spec.envelope",
     "spec.protocol", "spec.resolve", "spec.sme_spec", "spec.suite", "task", "task.draw",
-    "task.fingerprint", "task.memory", "task.step", "task.streams", "task.task",
+    "task.fingerprint", "task.memory", "task.step", "task.loading", "task.streams", "task.task",
 ]  # fmt: skip
 
 

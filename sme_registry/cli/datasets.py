@@ -10,10 +10,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from sme_registry import load
 from sme_registry.cli import names
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import catalogue
-from sme_registry.spec.resolve import resolve
 from sme_registry.terminal.output import err, failure, out, print_json, print_pairs
 
 app = typer.Typer(
@@ -92,7 +92,7 @@ def make(
     from sme_registry.datasets import make_dataset
     from sme_registry.terminal.progress import Progress
 
-    spec = resolve(task).derive(**names.overrides(set_ or []))
+    spec = load(task).derive(**names.overrides(set_ or []))
     with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
         made = make_dataset(
             spec,

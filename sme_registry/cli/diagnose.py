@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from sme_registry import load
 from sme_registry.cli import names
 from sme_registry.cli.policies import find_policy
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json, write_atomically
-from sme_registry.spec.resolve import resolve
 from sme_registry.terminal.output import err, out, print_json
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _subject(
     if cell is not None and task is not None:
         raise OptionError("--cell: is of a study, and --task of a policy. Give one of them.")
     if task is not None:
-        spec = resolve(task).derive(**names.overrides(set_ or []))
+        spec = load(task).derive(**names.overrides(set_ or []))
         shown = run if os.sep not in run else None
         return diagnosis.of_policy(
             find_policy(run, spec), spec, action_range=action_range, name=shown

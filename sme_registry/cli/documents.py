@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from rich.markup import escape
 from rich.table import Table
 
+from sme_registry import load
 from sme_registry.cli import names
 from sme_registry.errors import OptionError, SMEError, UnknownNameError
 from sme_registry.io import read_json
@@ -28,7 +29,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.resolve import known_specs, resolve, with_fingerprint
+from sme_registry.spec.resolve import known_specs
 from sme_registry.terminal.output import err, mark, out, print_json, print_pairs
 
 Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
@@ -489,7 +490,7 @@ def new(
         raise OptionError(f"{path}: must end in .json, by which every command knows a path.")
     if path.exists() and not force:
         raise OptionError(f"{path}: is there already. Give another path, or --force to replace it.")
-    origin = resolve(base) if base is not None else SMESpec()
+    origin = load(base) if base is not None else SMESpec()
     fields |= _team_fields(origin, fields, team, agents, channels_each, team_reward)
     spec = origin.derive(**fields)
 
@@ -597,7 +598,7 @@ def _validated(path: Path) -> dict[str, Any]:
         result["kind"] = next(kind for kind, of in names.KINDS.items() if isinstance(file, of))
         result |= {"name": file.versioned_name, "digest": file.digest}
         if isinstance(file, EnvFile):
-            materialize(with_fingerprint(file))
+            materialize(file.spec, file.fingerprint)
         elif isinstance(file, SuiteFile):
             _ = file.suite.instances
         elif isinstance(file, StudyFile):
@@ -644,6 +645,8 @@ def certify(
 
 
 def _tasks_of(name: str) -> list[tuple[str, SMESpec]]:
+    from sme_registry.task import materialize
+
     found = names.find_any(name)
     if isinstance(found, SuiteFile):
         return [
@@ -654,8 +657,9 @@ def _tasks_of(name: str) -> list[tuple[str, SMESpec]]:
     if isinstance(found, ProtocolFile | StudyFile):
         kind = "protocol" if isinstance(found, ProtocolFile) else "study"
         raise UnknownNameError(f"{name!r}: is a {kind}. Give a task or a suite.")
-    spec = found if isinstance(found, SMESpec) else with_fingerprint(cast(EnvFile, found))
-    return [(name, spec)]
+    if isinstance(found, EnvFile):
+        materialize(found.spec, found.fingerprint)
+    return [(name, found if isinstance(found, SMESpec) else cast(EnvFile, found).spec)]
 
 
 def _print_line(label: str, made: Any) -> None:

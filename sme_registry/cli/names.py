@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import (
@@ -16,7 +15,7 @@ from sme_registry.errors import (
 from sme_registry.io import parse_json, read_json
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.envelope import Envelope
-from sme_registry.spec.resolve import refuse_bare_spec, resolve
+from sme_registry.spec.resolve import is_path, refuse_bare_spec, resolve
 
 # The first of a name is what is meant by it: `smoke` is a suite, and the study of that name is what
 # `sme study` takes.
@@ -33,20 +32,15 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
 
     Raises:
       MalformedDocumentError: not strict JSON, or no file of ours.
-      SpecError, DigestMismatchError: see `Envelope.open`.
+      SpecError, DigestMismatchError: see `Envelope.from_dict`.
     """
     data = read_json(path)
     for kind in KINDS.values():
         if isinstance(data, dict) and kind.content in data:
-            return kind.open(data, os.fspath(path))
+            return kind.from_dict(data, os.fspath(path))
     refuse_bare_spec(data, os.fspath(path))
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
-
-
-def is_path(name: str) -> bool:
-    """Whether this is a path rather than a name, by the same rule as `resolve`."""
-    return name.endswith(".json") or (os.sep in name and Path(name).is_file())
 
 
 def find_any(name: str) -> Envelope | SMESpec:
@@ -62,7 +56,7 @@ def find_any(name: str) -> Envelope | SMESpec:
         if name in (file.name, file.versioned_name, file.digest):
             return file
     try:
-        spec = resolve(name)
+        spec = resolve(name).spec
     except UnknownNameError as error:
         short = name.rsplit("/", 1)[-1]
         hint = did_you_mean(short, [file.name for _, file in every])

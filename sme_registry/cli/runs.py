@@ -10,11 +10,11 @@ from typing import Annotated, Any, cast
 import typer
 from rich.markup import escape
 
+from sme_registry import load
 from sme_registry.cli import names
 from sme_registry.cli.policies import REFERENCES, find_policy
 from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
-from sme_registry.spec.resolve import resolve
 from sme_registry.terminal.output import err, out, print_json
 
 TaskName = Annotated[str, typer.Argument(metavar="TASK", help="A name, a path, or a digest.")]
@@ -75,7 +75,7 @@ def evaluate(
     from sme_registry import evaluation
     from sme_registry.terminal.progress import Progress
 
-    spec = resolve(task).derive(**names.overrides(set_ or []))
+    spec = load(task).derive(**names.overrides(set_ or []))
     judged_by = evaluation.resolve_protocol(protocol)
     target = None if out_folder is None else out_folder / "evaluation.json"
     if target is not None and target.exists() and not force:
@@ -192,7 +192,7 @@ def train(
     from sme_registry import training
 
     changed = names.overrides(set_ or [])
-    spec = resolve(task).derive(**changed)
+    spec = load(task).derive(**changed)
     algorithm = training.known_algorithm(algorithm or training.default_algorithm(spec))
     if out_folder is None:
         out_folder = Path("runs") / f"{_label(task, spec, bool(changed))}-{algorithm}-seed{seed}"

@@ -12,7 +12,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli import names, study_report
+from sme_registry import load
+from sme_registry.cli import study_report
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.io import read_json
 from sme_registry.spec import (
@@ -23,7 +24,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec.resolve import is_path
 from sme_registry.terminal import duration_range, err, out, print_json
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ def new(
         file = StudyFile.sealed(plan.to_dict(), str(path), **{"name": path.stem, **own})
     else:
         _refuse_beside_from(context)
-        data = read_json(source) if names.is_path(source) else _find(source).to_dict()
+        data = read_json(source) if is_path(source) else _find(source).to_dict()
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.sealed(data, source, **{**({} if named else {"name": path.stem}), **own})
     # What is only not installed here may be where the plan is run.
@@ -257,12 +258,12 @@ def _made(
 
 
 def _suite_classes(name: str) -> Sequence[SuiteClass]:
-    file = SuiteFile.read(name) if names.is_path(name) else catalogue.find(SuiteFile, name)
+    file = SuiteFile.read(name) if is_path(name) else catalogue.find(SuiteFile, name)
     return file.suite.classes
 
 
 def _class(task: str) -> SuiteClass:
-    spec = resolve(task)
+    spec = load(task)
     fields = spec.to_dict()
     seed = fields.pop("seed")
     title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
@@ -602,7 +603,7 @@ def _find(name: str) -> StudyFile:
     Raises:
       UnknownNameError, SpecError: there is none, or it is no plan.
     """
-    return StudyFile.read(name) if names.is_path(name) else catalogue.find(StudyFile, name)
+    return StudyFile.read(name) if is_path(name) else catalogue.find(StudyFile, name)
 
 
 def _scaled(

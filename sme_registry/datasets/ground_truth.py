@@ -34,8 +34,7 @@ from sme_registry.evaluation.rollouts import LANES
 from sme_registry.evaluation.rollouts import rollouts as roll_out
 from sme_registry.spec import SMESpec
 from sme_registry.spec.document import plain_number
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, load_task
 from sme_registry.task.draw import Array
 
 CONFIDENCE = 0.95
@@ -123,12 +122,11 @@ def exact_return(
       OptionError: another argument is out of range, or the policy draws and `rollouts` is 1.
       PolicyError: the policy cannot be used.
     """
-    resolved = resolve(spec)
-    task = _single(materialize(resolved))
+    task = _single(load_task(spec))
     gamma = _number("gamma", gamma, 0.0, 1.0)
     rollouts = int(_number("rollouts", rollouts, 1, 10**6, whole=True))
-    asked = as_policy(policy, resolved, action_range=action_range)
-    where, first = _positions(resolved, states, t, r_cum, actions)
+    asked = as_policy(policy, task.spec, action_range=action_range)
+    where, first = _positions(task.spec, states, t, r_cum, actions)
     if rollouts == 1:
         _refuse_random(asked, task, where)
     states, t, r_cum = where

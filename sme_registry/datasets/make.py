@@ -17,8 +17,7 @@ from sme_registry.datasets.scores import reference_scores
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_spec, materialize
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "h5py", "minari")
 
@@ -80,7 +79,7 @@ def make_dataset(
     behaviours = tuple(behaviour_of(what, weight, action_range) for what, weight in acting)
     recipe = DatasetRecipe.from_dict(
         {
-            "spec": resolve(spec_or_id),
+            "spec": load_spec(spec_or_id),
             "behaviours": behaviours,
             "transitions": transitions,
             "seed": seed,

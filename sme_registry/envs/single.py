@@ -17,8 +17,7 @@ from sme_registry.envs.naming import renamed_by_content
 from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown, single_agent
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, load_task
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
@@ -62,7 +61,7 @@ class SMEEnv(gymnasium.Env[Observation, Action]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
         self.render_mode = render_mode
-        self._task = single_agent(materialize(resolve(spec).derive(**overrides)))
+        self._task = single_agent(load_task(spec, **overrides))
         S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
         space, self._rescaled = actions.space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)

@@ -25,8 +25,7 @@ from sme_registry.envs.batch import Advanced, Array, Batch, Observation
 from sme_registry.envs.options import checked_seed, initial_states
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import SMESpec
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, load_task
 
 _ONE = np.zeros(1, np.int64)  # the only lane
 
@@ -76,7 +75,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
         self.render_mode = render_mode
-        self._task = materialize(resolve(spec).derive(**overrides))
+        self._task = load_task(spec, **overrides)
         self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
         self._every_column = np.concatenate(columns)

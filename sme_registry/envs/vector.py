@@ -21,8 +21,7 @@ from sme_registry.envs.single import Observation
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
 from sme_registry.spec import SMESpec
 from sme_registry.spec.document import plain_number
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, load_task
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
@@ -80,7 +79,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self.mode = _autoreset_mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
         self.render_mode = None
-        self._task = single_agent(materialize(resolve(spec).derive(**overrides)))
+        self._task = single_agent(load_task(spec, **overrides))
         sme = self._task.spec
         if max_episode_steps is not None and max_episode_steps < sme.horizon:
             raise WrapperError(

@@ -23,8 +23,7 @@ from sme_registry.evaluation.report import AgentReport, EvaluationReport, Region
 from sme_registry.evaluation.score import Score
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, SMESpec, catalogue
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task, load_spec, materialize
 from sme_registry.task.draw import Array
 
 Progress = Callable[[int, int], None]
@@ -66,7 +65,7 @@ def evaluate(
       OptionError: `action_range` is none, or a shell is too thin for float32 observations.
       ResourceLimitError: the task would not fit in memory.
     """
-    spec = resolve(spec_or_id)
+    spec = load_spec(spec_or_id)
     protocol = resolve_protocol(protocol)
     asked = as_policy(policy, spec, action_range=action_range, name=name)
     task = materialize(spec)

@@ -43,8 +43,7 @@ from sme_registry.offline.hyperparameters import (
 from sme_registry.offline.policy import Layer, OfflinePolicy
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel, plain_number
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import Task, materialize, streams
+from sme_registry.task import Task, load_spec, materialize, streams
 from sme_registry.training.record import installed_versions
 
 if TYPE_CHECKING:
@@ -238,7 +237,7 @@ def train_offline(
     episodes = _whole("episodes", episodes, 1, 4096)
     target = _claimed(folder, force)
     source = _opened(data, spec)
-    resolved = _single(resolve(source.recipe.spec if source is not None else spec))  # type: ignore[arg-type]
+    resolved = _single(load_spec(source.recipe.spec if source is not None else spec))  # type: ignore[arg-type]
     judged_by = resolve_protocol(
         protocol if protocol is not None else source.recipe.protocol if source else "paper-v1"
     )
@@ -400,10 +399,9 @@ def _opened(data: Any, spec: Any) -> Dataset | None:
             f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."
         )
     opened = data if isinstance(data, Dataset) else open_dataset(data)
-    if spec is not None and resolve(spec).digest != opened.record.spec_digest:
+    if spec is not None and (digest := load_spec(spec).digest) != opened.record.spec_digest:
         raise OptionError(
-            f"spec={resolve(spec).digest[:19]}…: the set is of {opened.record.spec_digest[:19]}…. "
-            "Leave it out."
+            f"spec={digest[:19]}…: the set is of {opened.record.spec_digest[:19]}…. Leave it out."
         )
     return opened
 

@@ -134,15 +134,6 @@ class StrictModel(BaseModel):
         """Every field as plain JSON data."""
         return self.model_dump(mode="json")
 
-    # Pydantic's own equality also compares private attributes, which are no part of the document.
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        return bool(self.__dict__ == other.__dict__)
-
-    def __hash__(self) -> int:
-        return hash((type(self), *self.__dict__.values()))
-
 
 class Document(StrictModel):
     """What has an identity: equal documents have equal digests, and the other way round."""

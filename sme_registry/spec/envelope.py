@@ -53,8 +53,8 @@ class Envelope(StrictModel):
         return f"{self.name}-v{self.version}"
 
     @classmethod
-    def open(cls, data: Any, source: str) -> Self:
-        """Validate an envelope and that its digest is its document's.
+    def from_dict(cls, data: Any, source: str = "") -> Self:
+        """Validate an envelope, including that its digest is its document's.
 
         Args:
           data: plain data.
@@ -64,22 +64,23 @@ class Envelope(StrictModel):
           SpecError: a field is wrong or missing.
           DigestMismatchError: the digest is of another document.
         """
-        remedy = cls.remedy.format(source=source)
+        name = source or cls.__name__
+        remedy = cls.remedy.format(source=name)
         document: Any = cls.model_fields[cls.content].annotation
         if isinstance(data, dict) and data and "digest" not in data:
-            alone = data.keys() <= document.model_fields.keys()
-            if alone or cls.content in data:
+            is_bare_document = data.keys() <= document.model_fields.keys()
+            if is_bare_document or cls.content in data:
                 raise SpecError(
-                    f"{source}: digest: missing: must be that of the {cls.content}. To have it, "
-                    f"{remedy}."
+                    f"{name}: digest: missing: must be the digest of the {cls.content}. To add "
+                    f"it, {remedy}."
                 )
-        envelope = cls.from_dict(data, source)
-        found = getattr(envelope, cls.content).digest
-        if found != envelope.digest:
+        envelope = super().from_dict(data, source)
+        expected = getattr(envelope, cls.content).digest
+        if envelope.digest != expected:
             raise DigestMismatchError(
-                f"{source}: digest={envelope.digest!r}: its {cls.content} has {found!r}. The "
-                f"{cls.content} or the digest was changed after it was written: take the file "
-                f"again from its source, or {remedy}."
+                f"{name}: digest={envelope.digest!r}: its {cls.content} has {expected!r}. The "
+                f"{cls.content} or the digest was changed after the file was written: take the "
+                f"file again from its source, or {remedy}."
             )
         return envelope
 
@@ -92,7 +93,7 @@ class Envelope(StrictModel):
           SpecError: a field is wrong.
           DigestMismatchError: the digest is of another document.
         """
-        return cls.open(read_json(path), str(path))
+        return cls.from_dict(read_json(path), str(path))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file, whole or not at all.

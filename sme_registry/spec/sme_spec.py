@@ -6,15 +6,17 @@ C_π* `complexity` (L), T `horizon`, H `hidden_width`.
 
 from __future__ import annotations
 
+import os
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import (
     Field,
     PlainSerializer,
     PlainValidator,
-    PrivateAttr,
+    ValidationInfo,
     WithJsonSchema,
+    field_validator,
     model_validator,
 )
 
@@ -157,6 +159,21 @@ class Setting(Document):
     policy_init: Literal["semi_orthogonal", "unit_variance"] = "semi_orthogonal"
     team: TeamSpec | None = None
 
+    @field_validator("team")
+    @classmethod
+    def _every_channel_is_all(cls, team: TeamSpec | None, info: ValidationInfo) -> TeamSpec | None:
+        """Write the list of all channels as "all": the same team must be the same document."""
+        if team is None or "state_dim" not in info.data:
+            return team
+        every_channel = tuple(range(info.data["state_dim"]))
+        agents = tuple(
+            agent.model_copy(update={"observes": "all"})
+            if agent.observes == every_channel
+            else agent
+            for agent in team.agents
+        )
+        return team.model_copy(update={"agents": agents})
+
     @model_validator(mode="after")
     def _team_fits(self) -> Self:
         if self.team is None:
@@ -174,13 +191,6 @@ class Setting(Document):
                     f"[0, state_dim={self.state_dim}). Remove channel {agent.observes[-1]}, or "
                     "raise state_dim."
                 )
-        # The list of all channels and "all" are the same team, so they must be the same document.
-        everything = tuple(range(self.state_dim))
-        agents = tuple(
-            agent.model_copy(update={"observes": "all"}) if agent.observes == everything else agent
-            for agent in self.team.agents
-        )
-        self.__dict__["team"] = self.team.model_copy(update={"agents": agents})
         return self
 
 
@@ -191,10 +201,6 @@ class SMESpec(Setting):
     """
 
     seed: Seed = 0
-
-    # What a file publishes of the drawn numbers; checked when the task is materialised. It
-    # travels with the spec that was read from that file and is no part of its identity.
-    _fingerprint: Any = PrivateAttr(default=None)
 
     @property
     def content_name(self) -> str:
@@ -211,6 +217,10 @@ class SMESpec(Setting):
           SpecError: an unknown field, or a value outside its range.
         """
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
+
+
+# What names a task: a spec, its fields, an id, a digest, or the path of a file.
+SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]
 
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:

@@ -1,7 +1,17 @@
 """From a spec to numbers and equations: the NumPy definition of every task."""
 
 from sme_registry.task.draw import Layer
+from sme_registry.task.loading import load_spec, load_task, materialize
 from sme_registry.task.step import Step, observe, step
-from sme_registry.task.task import Task, materialize
+from sme_registry.task.task import Task
 
-__all__ = ["Layer", "Step", "Task", "materialize", "observe", "step"]
+__all__ = [
+    "Layer",
+    "Step",
+    "Task",
+    "load_spec",
+    "load_task",
+    "materialize",
+    "observe",
+    "step",
+]

@@ -33,11 +33,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SpecLike
 from sme_registry.task import memory
 from sme_registry.task.draw import Array, Layer
+from sme_registry.task.loading import load_task
 from sme_registry.task.streams import uniform
-from sme_registry.task.task import Task, materialize
+from sme_registry.task.task import Task
 
 Outcome = Literal["passed", "warning", "refused", "reported"]
 
@@ -116,11 +117,11 @@ class Certificate:
         }
 
 
-def certify(task: Task | SMESpec, *, seed: int = 0) -> Certificate:
+def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     """Measure a drawn task. The same task and seed give the same certificate.
 
     Args:
-      task: the task, or the spec to draw it from.
+      task: the task, or what `load_task` draws it from.
       seed: of the states and actions measured with, in [0, 2⁵³).
 
     Returns:
@@ -133,8 +134,8 @@ def certify(task: Task | SMESpec, *, seed: int = 0) -> Certificate:
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**53:
         raise OptionError(f"seed={seed!r}: must be an integer in [0, 2**53). Leave it out for 0.")
-    if isinstance(task, SMESpec):
-        task = materialize(task)
+    if not isinstance(task, Task):
+        task = load_task(task)
     S, A = task.spec.state_dim, task.spec.action_dim
     lanes = max(256, min(LANES, 2**24 // (S * A)))
     states = max(2_000, min(STATES, 2**26 // (S + task.spec.hidden_width)))

@@ -1,8 +1,8 @@
 """Fingerprints: a digest fixes the spec, not the numbers; probes of π* and T fix those.
 
 Random streams and LAPACK may differ between machines and versions. A file therefore publishes
-π*(s) and T(s, a) at three fixed probes, and a task whose numbers are further than 1e-6 from them
-is refused instead of being another task under the same name.
+π*(s) and T(s, a) at three fixed probes. A task whose numbers differ from them by more than 1e-6 is
+refused, so that no other task runs under the same name.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def probes(state_dim: int, action_dim: int) -> tuple[Array, Array]:
     return states, actions
 
 
-def take(task: Task) -> Fingerprint:
+def fingerprint_of(task: Task) -> Fingerprint:
     """The fingerprint of a drawn task."""
     states, actions = probes(task.spec.state_dim, task.spec.action_dim)
     return Fingerprint(
@@ -42,26 +42,30 @@ def take(task: Task) -> Fingerprint:
     )
 
 
-def check(published: Fingerprint, task: Task) -> None:
+def check_fingerprint(published: Fingerprint, task: Task) -> None:
     """Compare a task with a published fingerprint.
 
     Raises:
       FingerprintMismatchError: shapes differ, or a number differs by more than 1e-6.
     """
-    drawn = take(task)
+    drawn = fingerprint_of(task)
     for field in ("optimal_action", "next_state"):
         here, there = np.asarray(getattr(drawn, field)), _matrix(getattr(published, field))
-        same_shape = there is not None and here.shape == there.shape
-        distance = float(np.abs(here - there).max()) if there is not None and same_shape else None
-        if distance is None or not distance <= TOLERANCE:
-            off = "has another shape" if distance is None else f"differs by {distance:.3g}"
-            raise FingerprintMismatchError(
-                f"fingerprint.{field}: {off} (allowed {TOLERANCE:g}): the task drawn on this "
-                f"machine is not the published one of {task.spec.digest[:19]}…. If the file was "
-                "edited, take it again from its source. If not, this machine's NumPy or SciPy "
-                "draws other numbers: install the versions in constraints.txt."
-            )
+        if there is None or here.shape != there.shape:
+            difference = "has another shape"
+        else:
+            distance = float(np.abs(here - there).max())
+            if distance <= TOLERANCE:
+                continue
+            difference = f"differs by {distance:.3g}"
+        raise FingerprintMismatchError(
+            f"fingerprint.{field}: {difference} (allowed {TOLERANCE:g}): the task drawn on this "
+            f"machine is not the published one of {task.spec.digest[:19]}…. If the file was "
+            "edited, take it again from its source. If not, this machine's NumPy or SciPy "
+            "draws other numbers: install the versions in constraints.txt."
+        )
 
 
 def _matrix(rows: tuple[tuple[float, ...], ...]) -> Array | None:
+    """The rows as a matrix; None where they differ in length."""
     return np.asarray(rows) if len({len(row) for row in rows}) == 1 else None

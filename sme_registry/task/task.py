@@ -14,7 +14,6 @@ the unit cube. Actions are clipped to [0, 1], as the environment clips them.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import cast
@@ -24,11 +23,10 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from sme_registry.errors import ActionError, StateError
-from sme_registry.spec import SMESpec, as_spec
-from sme_registry.task import draw, fingerprint, memory
+from sme_registry.spec import SMESpec
+from sme_registry.task import draw
 from sme_registry.task.draw import Array, Layer
 
-_CACHED_BYTES = 2**24
 _LARGEST = 1e300  # beyond it W s could overflow, and π* be NaN
 
 
@@ -235,47 +233,3 @@ def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception
             f"{_LARGEST:g} in size."
         )
     return array
-
-
-def materialize(spec: SMESpec) -> Task:
-    """Draw the numbers of a spec. The same spec gives the same task, bit for bit on one machine.
-
-    Args:
-      spec: the spec; one read from a file carries that file's fingerprint.
-
-    Returns:
-      The task, its arrays read-only.
-
-    Raises:
-      SpecError: `spec` is not an SMESpec or a mapping of its fields.
-      ResourceLimitError: it would not fit in memory; the message says how much it needs.
-      FingerprintMismatchError: this machine draws other numbers than the file publishes.
-    """
-    spec = as_spec(spec)
-    memory.refuse_above_limit(
-        memory.peak_bytes(spec),
-        f"A task of state_dim={spec.state_dim}, action_dim={spec.action_dim}, "
-        f"complexity={spec.complexity}, hidden_width={spec.hidden_width}",
-        "Make one of these smaller.",
-    )
-    published = spec._fingerprint
-    if published is not None:
-        # Equal specs share one drawn task, so it must not carry what one file says of it.
-        spec = spec.model_copy()
-        spec._fingerprint = None
-    small = memory.parameter_bytes(spec) <= _CACHED_BYTES
-    task = _draw_cached(spec) if small else _draw(spec)
-    if published is not None:
-        fingerprint.check(published, task)
-    return task
-
-
-def _draw(spec: SMESpec) -> Task:
-    W, b = draw.transition_matrix(spec), draw.transition_offset(spec)
-    policies = draw.optimal_policies(spec)
-    for array in (W, b, *(part for policy in policies for layer in policy for part in layer)):
-        array.setflags(write=False)
-    return Task(spec, W, b, policies, draw.observed_channels(spec))
-
-
-_draw_cached = functools.lru_cache(maxsize=64)(_draw)

@@ -28,8 +28,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.io import write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
@@ -150,7 +149,7 @@ def train(
       ResourceLimitError: the task would not fit in memory.
       MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
     """
-    resolved = resolve(spec)
+    resolved = load_spec(spec)
     algorithm = known_algorithm(default_algorithm(resolved) if algorithm is None else algorithm)
     if num_envs is None:
         num_envs = default_num_envs(resolved, algorithm)

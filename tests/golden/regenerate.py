@@ -20,8 +20,7 @@ import numpy as np
 
 from sme_registry.io import write_atomically
 from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_task
 
 FOLDER = Path(__file__).parent
 TASKS = (
@@ -40,7 +39,7 @@ def digests() -> dict[str, dict[str, str]]:
 
 def one_step(name: str) -> list[dict[str, Any]]:
     """Steps of one task: inside the cube, at its corners, and outside; actions good and clipped."""
-    task = materialize(resolve(name))
+    task = load_task(name)
     S, A = task.spec.state_dim, task.spec.action_dim
     rng = np.random.default_rng(20261121)
     states = [rng.random(S), rng.random(S), np.zeros(S), np.ones(S), rng.uniform(-0.5, 1.5, S)]

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sme_registry.compiled import engine
-from sme_registry.spec.resolve import resolve
-from sme_registry.task import materialize
+from sme_registry.task import load_task
 from tests.compiled.stepping import Lane
 from tests.golden import regenerate
 
@@ -30,7 +29,7 @@ def test_the_golden_tasks_are_those_of_the_command():
 
 @pytest.mark.parametrize(("name", "index"), CASES)
 def test_the_definition_takes_the_golden_step(name, index):
-    case, task = STEPS[name][index], materialize(resolve(name))
+    case, task = STEPS[name][index], load_task(name)
     s, a = numbers(case["state"]), numbers(case["action"])
     np.testing.assert_array_equal(task.transition(s, a), numbers(case["next_state"]))
     np.testing.assert_allclose(task.optimal_action(s), case["optimal_action"], rtol=0, atol=1e-9)
@@ -43,7 +42,7 @@ def test_the_definition_takes_the_golden_step(name, index):
 def test_every_engine_takes_the_golden_step(name, index, backend):
     if backend == "numba":
         pytest.importorskip("numba")
-    case, task = STEPS[name][index], materialize(resolve(name))
+    case, task = STEPS[name][index], load_task(name)
     lane = Lane(task, engine(task, backend), numbers(case["state"]))
     done = lane.step(numbers(case["action"]))
     np.testing.assert_array_equal(done.state, numbers(case["next_state"]))

@@ -23,7 +23,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec.resolve import ResolvedSpec, resolve
 from sme_registry.task import materialize
 
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
@@ -147,9 +147,9 @@ def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
 
 @pytest.mark.parametrize("file", ENVS, ids=ids(ENVS))
 def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
-    spec = resolve(file.versioned_name)
-    assert spec._fingerprint == file.fingerprint
-    task = materialize(spec)  # compares with the fingerprint
+    spec, fingerprint = file.spec, file.fingerprint
+    assert resolve(file.versioned_name) == ResolvedSpec(spec, fingerprint)
+    task = materialize(spec, fingerprint)
     assert task.W.shape == (spec.action_dim, spec.state_dim)
     env = sme_registry.make_parallel(file.versioned_name)
     assert env.sme_spec == spec

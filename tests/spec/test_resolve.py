@@ -33,14 +33,16 @@ DEFAULT = catalogue.find(EnvFile, "Default-v1")
     ],
 )
 def test_every_name_of_the_default_task_leads_to_it(name):
-    assert resolve(name) == SMESpec()
+    assert resolve(name).spec == SMESpec()
 
 
 def test_specs_of_named_files_carry_their_fingerprint_and_others_none():
-    assert resolve("Default")._fingerprint == DEFAULT.fingerprint
-    assert resolve(DEFAULT.digest)._fingerprint == DEFAULT.fingerprint
-    assert resolve({})._fingerprint is None
-    assert resolve(SMESpec(k=7))._fingerprint is None
+    assert resolve("Default").fingerprint == DEFAULT.fingerprint
+    assert resolve(DEFAULT.digest).fingerprint == DEFAULT.fingerprint
+    assert resolve("Default").derive().fingerprint == DEFAULT.fingerprint
+    assert resolve("Default").derive(k=7).fingerprint is None
+    assert resolve({}).fingerprint is None
+    assert resolve(SMESpec(k=7)).fingerprint is None
 
 
 def test_instances_of_suites_are_found_by_digest():
@@ -48,14 +50,14 @@ def test_instances_of_suites_are_found_by_digest():
 
     suite = catalogue.entries(SuiteFile)[0].suite
     for spec in suite.instances[:3]:
-        assert resolve(spec.digest[:19]) == spec
+        assert resolve(spec.digest[:19]).spec == spec
 
 
 def test_a_path_needs_no_ending_where_it_cannot_be_a_name(tmp_path):
     path = tmp_path / "task"
     shutil.copy(catalogue.spec_folder() / "envs" / "Default-v1.json", path)
-    assert resolve(path) == SMESpec()
-    assert resolve(str(path)) == SMESpec()
+    assert resolve(path).spec == SMESpec()
+    assert resolve(str(path)).spec == SMESpec()
 
 
 @pytest.mark.parametrize(

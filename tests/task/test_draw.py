@@ -221,7 +221,7 @@ def test_a_single_agent_is_a_team_of_one():
 
 def test_the_same_spec_is_the_same_task_bit_for_bit():
     spec = SMESpec(complexity=3, seed="0xabc")
-    from sme_registry.task.task import _draw
+    from sme_registry.task.loading import _draw
 
     one, other = _draw(spec), _draw(spec)
     for mine, its in zip(layers_of(one), layers_of(other), strict=True):

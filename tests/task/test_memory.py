@@ -8,7 +8,7 @@ import sme_registry
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize, memory
-from sme_registry.task.task import _draw
+from sme_registry.task.loading import _draw
 
 TOO_LARGE = [
     SMESpec(state_dim=2**20, action_dim=2**20),

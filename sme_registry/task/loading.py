@@ -1,0 +1,94 @@
+"""From a name or a spec to a drawn task: `materialize`, `load_spec` and `load_task`.
+
+A digest fixes a spec but not the drawn numbers, so a file also publishes a fingerprint of them.
+It is checked where the file is named: `load_spec` and `load_task` draw the task and compare. A spec
+alone has no published numbers, so `materialize(spec)` checks only a fingerprint passed to it.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from sme_registry.spec import Fingerprint, SMESpec, SpecLike, as_spec
+from sme_registry.spec.resolve import ResolvedSpec, resolve
+from sme_registry.task import draw, memory
+from sme_registry.task.fingerprint import check_fingerprint
+from sme_registry.task.task import Task
+
+_CACHED_BYTES = 2**24  # larger tasks are drawn each time rather than kept in memory
+
+
+def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
+    """Draw the numbers of a spec. The same spec gives the same task, bit for bit on one machine.
+
+    Args:
+      spec: the spec, or its fields as a mapping.
+      fingerprint: published numbers that the task must have, such as `EnvFile.fingerprint`; None
+        compares with nothing.
+
+    Returns:
+      The task; its arrays are read-only.
+
+    Raises:
+      SpecError: `spec` is not an SMESpec or a mapping of its fields.
+      ResourceLimitError: it would not fit in memory; the message says how much it needs.
+      FingerprintMismatchError: the numbers drawn on this machine differ from the published ones.
+    """
+    spec = as_spec(spec)
+    memory.refuse_above_limit(
+        memory.peak_bytes(spec),
+        f"A task of state_dim={spec.state_dim}, action_dim={spec.action_dim}, "
+        f"complexity={spec.complexity}, hidden_width={spec.hidden_width}",
+        "Make one of these smaller.",
+    )
+    small = memory.parameter_bytes(spec) <= _CACHED_BYTES
+    task = _draw_cached(spec) if small else _draw(spec)
+    if fingerprint is not None:
+        check_fingerprint(fingerprint, task)
+    return task
+
+
+def load_task(task: SpecLike, **overrides: Any) -> Task:
+    """Draw the task of a name or spec; one of a file must have its file's fingerprint.
+
+    Args:
+      task: a spec, its fields, an id, a digest, or the path of a file.
+      **overrides: spec fields to change; the derived task has no published numbers.
+
+    Raises:
+      UnknownNameError, SpecError: no such task, or a field is out of range.
+      ResourceLimitError, FingerprintMismatchError: see `materialize`.
+    """
+    return _materialize_resolved(resolve(task).derive(**overrides))
+
+
+def load_spec(task: SpecLike) -> SMESpec:
+    """The spec of a name; one of a file is drawn to check the file's fingerprint.
+
+    Args:
+      task: a spec, its fields, an id, a digest, or the path of a file.
+
+    Raises:
+      UnknownNameError, SpecError: no such task, or a field is out of range.
+      ResourceLimitError, FingerprintMismatchError: see `materialize`.
+    """
+    resolved = resolve(task)
+    if resolved.fingerprint is not None:
+        _materialize_resolved(resolved)
+    return resolved.spec
+
+
+def _materialize_resolved(resolved: ResolvedSpec) -> Task:
+    return materialize(resolved.spec, resolved.fingerprint)
+
+
+def _draw(spec: SMESpec) -> Task:
+    W, b = draw.transition_matrix(spec), draw.transition_offset(spec)
+    policies = draw.optimal_policies(spec)
+    for array in (W, b, *(part for policy in policies for layer in policy for part in layer)):
+        array.setflags(write=False)
+    return Task(spec, W, b, policies, draw.observed_channels(spec))
+
+
+_draw_cached = functools.lru_cache(maxsize=64)(_draw)
