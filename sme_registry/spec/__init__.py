@@ -13,7 +13,7 @@ from sme_registry.spec.document import (
 )
 from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.sme_spec import AgentSpec, SMESpec, SpecLike, TeamSpec, as_spec
+from sme_registry.spec.sme_spec import AgentSpec, SMESpec, TeamSpec, as_spec
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import Suite, SuiteClass
 

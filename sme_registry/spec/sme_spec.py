@@ -6,9 +6,8 @@ C_π* `complexity` (L), T `horizon`, H `hidden_width`.
 
 from __future__ import annotations
 
-import os
 import re
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     Field,
@@ -217,10 +216,6 @@ class SMESpec(Setting):
           SpecError: an unknown field, or a value outside its range.
         """
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
-
-
-# What names a task: a spec, its fields, an id, a digest, or the path of a file.
-SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]
 
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
