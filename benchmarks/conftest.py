@@ -1,15 +1,14 @@
 """Ratios against named peers, measured in interleaved rounds of one run; `make bench` prints them.
 
-A machine's speed wanders by a fifth within a minute. So ours and the peer take turns, and a row is
-the ratio of their median times over the rounds. A bar that is missed is printed, never asserted:
-speed is no part of a test's verdict.
+A machine's speed varies by a fifth within a minute, so we and the peer run alternately, and a row is
+the ratio of the median times over all rounds. A missed target is printed, never asserted.
 """
 
 from __future__ import annotations
 
 import os
 
-# Before NumPy loads: one core for everybody.
+# Set before NumPy is imported: one core for all candidates.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
@@ -30,14 +29,14 @@ ROUNDS = 11
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison: seconds per unit of work, and how many times as fast ours must be."""
+    """One comparison: seconds per unit of work, and the targeted ratio of peer to ours."""
 
     title: str
     unit: str
     ours: float
     peer_name: str
     peer: float
-    bar: float
+    target: float
 
     @property
     def ratio(self) -> float:
@@ -54,9 +53,9 @@ def compare(benchmark: Any) -> Callable[..., None]:
     """`compare(title, unit, ours, peers, units)`: rows for one of our functions and its peers.
 
     Each function does `n` units of work when called with n; `peers` maps a name to
-    `(function, n of a round, bar)`; a bar is the least peer time divided by our time, 0 where
-    the peer only stands there to compare. `clock` is wall time, or `time.thread_time` for work so
-    long that other jobs on the machine would be measured with it.
+    `(function, n per round, target)`; the target is the smallest acceptable ratio of peer time to
+    our time, or 0 if there is none. `clock` is wall-clock time, or `time.thread_time` for long
+    work that other jobs on the machine would disturb.
     """
 
     def measure(
@@ -67,18 +66,18 @@ def compare(benchmark: Any) -> Callable[..., None]:
         peers: dict[str, tuple[Work, int, float]],
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        works = {"ours": (ours, units), **{name: peer[:2] for name, peer in peers.items()}}
-        for work, count in works.values():  # warm up: compilation, caches, lazy imports
+        candidates = {"ours": (ours, units), **{name: peer[:2] for name, peer in peers.items()}}
+        for work, count in candidates.values():  # warm up: compilation, caches, lazy imports
             work(max(1, count // 10))
-        seconds: dict[str, list[float]] = {name: [] for name in works}
+        seconds: dict[str, list[float]] = {name: [] for name in candidates}
         for _ in range(ROUNDS):
-            for name, (work, count) in works.items():
-                begun = clock()
+            for name, (work, count) in candidates.items():
+                start = clock()
                 work(count)
-                seconds[name].append((clock() - begun) / count)
+                seconds[name].append((clock() - start) / count)
         medians = {name: statistics.median(values) for name, values in seconds.items()}
-        for name, (_, _, bar) in peers.items():
-            row = Row(title, unit, medians["ours"], name, medians[name], bar)
+        for name, (_, _, target) in peers.items():
+            row = Row(title, unit, medians["ours"], name, medians[name], target)
             rows.append(row)
             benchmark.extra_info[f"ratio to {name}"] = row.ratio
         benchmark.pedantic(ours, args=(units,), rounds=3, iterations=1)
@@ -96,18 +95,18 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     from sme_registry.compiled import chosen_backend
 
     table = Table(title="Medians of interleaved rounds, one core", title_justify="left")
-    for heading in ("what", "per", "ours", "peer", "", "ratio", "bar", ""):
+    for heading in ("what", "per", "ours", "peer", "", "ratio", "target", ""):
         table.add_column(
-            heading, justify="right" if heading in ("ours", "ratio", "bar") else "left"
+            heading, justify="right" if heading in ("ours", "ratio", "target") else "left"
         )
     for row in rows:
-        met = "met" if row.ratio >= row.bar else "[bold]missed[/bold]"
-        bar = f"{row.bar:.3g} ×"
-        if not row.bar:
-            met, bar = "", "none"
+        outcome = "met" if row.ratio >= row.target else "[bold]missed[/bold]"
+        target = f"{row.target:.3g} ×"
+        if not row.target:
+            outcome, target = "", "none"
         table.add_row(
             row.title, row.unit, _time(row.ours), row.peer_name, _time(row.peer),
-            f"{row.ratio:.2f} ×", bar, met,
+            f"{row.ratio:.2f} ×", target, outcome,
         )  # fmt: skip
     terminalreporter.write_line("")
     console = Console(file=sys.stdout, width=130)

@@ -33,6 +33,6 @@ def test_six_regions_of_a_linear_policy(compare: Any) -> None:
             for first in range(0, STATES, BLOCK):
                 task.optimal_action(states[first : first + BLOCK])
 
-    # At most 1.5 times the time of the pass: the peer's time must be two thirds of ours or more.
+    # Target: at most 1.5 times the time of one pass.
     title = f"evaluate, {STATES:,} states, complexity 10"
     compare(title, "pass", ours, 1, {"NumPy oracle, one pass": (oracle, 1, 1 / 1.5)})

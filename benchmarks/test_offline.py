@@ -1,8 +1,8 @@
-"""A gradient step of BC and of IQL, sampling included, beside d3rlpy's where it is installed.
+"""A gradient step of BC and IQL, including sampling, compared with d3rlpy's where it is installed.
 
-It is not, in the environment of `make bench`: docs/results/offline_learners.md says how it was
-measured. There the peer is a step of Stable-Baselines3's TD3, of as many and as wide layers, which
-is no bar, only a measure of what such a step costs.
+`make bench` does not install d3rlpy; docs/results/offline_learners.md describes that measurement.
+Without it, the peer is a step of Stable-Baselines3's TD3 with layers of equal number and width, as a
+reference for the cost of such a step and not as a target.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def transitions() -> Transitions:
 
 
 def td3(transitions: Transitions) -> Callable[[int], None]:
-    """Steps of SB3's TD3 with layers of 256, from a full replay buffer."""
+    """Gradient steps of SB3's TD3 with layers of 256, from a full replay buffer."""
     from stable_baselines3 import TD3
 
     from sme_registry.sb3 import SMEVecEnv
@@ -56,8 +56,8 @@ def td3(transitions: Transitions) -> Callable[[int], None]:
     return lambda steps: model.train(steps, BATCH)
 
 
-def theirs(transitions: Transitions, algorithm: str) -> Callable[[int], None]:
-    """Steps of d3rlpy's, its sampling included."""
+def d3rlpy_steps(transitions: Transitions, algorithm: str) -> Callable[[int], None]:
+    """Gradient steps of d3rlpy, including its sampling."""
     import d3rlpy
 
     data = d3rlpy.dataset.MDPDataset(**to_d3rlpy(transitions))
@@ -92,5 +92,5 @@ def test_gradient_steps(compare: Any, transitions: Transitions, algorithm: str) 
     if importlib.util.find_spec("stable_baselines3") is not None:
         peers["SB3 TD3, 256 × 256"] = td3(transitions), STEPS, 0.0
     if importlib.util.find_spec("d3rlpy") is not None:
-        peers["d3rlpy"] = (theirs(transitions, algorithm), STEPS, 1.5)
+        peers["d3rlpy"] = (d3rlpy_steps(transitions, algorithm), STEPS, 1.5)
     compare(f"{algorithm.upper()}, batch {BATCH}", "gradient step", ours, STEPS, peers)

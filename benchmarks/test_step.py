@@ -1,4 +1,4 @@
-"""Steps per second, single and batched, against Gymnasium's own and against plain NumPy."""
+"""Steps per second, single and batched, compared with Gymnasium's environments and plain NumPy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ gymnasium.register("PlainNumPy-v0", entry_point=PlainEnv)
 
 
 def stepping(env: gymnasium.Env[Any, Any]) -> Callable[[int], None]:
-    """Steps with one fixed action (drawing actions would cost more than a step), and resets."""
+    """Steps with a fixed action (sampling one would cost more than a step), and resets."""
     env.reset(seed=0)
     action = np.full(env.action_space.shape, 0.4, np.float32)
 
@@ -33,7 +33,7 @@ def stepping(env: gymnasium.Env[Any, Any]) -> Callable[[int], None]:
 
 
 def reading_weights(task: Task) -> Callable[[int], None]:
-    """NumPy's own `dot` over as many numbers as the optimal policy has, and nothing else."""
+    """NumPy's `dot` over as many numbers as the optimal policy has weights."""
     weights = np.concatenate([W.ravel() for W, _ in task.policies[0]])
 
     def work(times: int) -> None:
@@ -54,13 +54,13 @@ def batch_stepping(env: Any, actions: Any) -> Callable[[int], None]:
     return work
 
 
-@pytest.mark.parametrize(("complexity", "units", "bar"), [(1, 20_000, 12), (50, 1_000, 10)])
-def test_single_step(compare: Any, complexity: int, units: int, bar: float) -> None:
+@pytest.mark.parametrize(("complexity", "units", "target"), [(1, 20_000, 12), (50, 1_000, 10)])
+def test_single_step(compare: Any, complexity: int, units: int, target: float) -> None:
     ours = gymnasium.make("SME/Default-v1", complexity=complexity)
     plain = gymnasium.make("PlainNumPy-v0", task=materialize(SMESpec(complexity=complexity)))
-    peers = {"plain NumPy": (stepping(plain), units // 10, bar)}
+    peers = {"plain NumPy": (stepping(plain), units // 10, target)}
     if complexity == 50:
-        # What no step in float64 can be faster than where the weights outgrow the cache.
+        # A lower bound for any step in float64 whose weights exceed the cache.
         peers["reading the weights once"] = (reading_weights(ours.unwrapped.task), units, 0)
     if complexity == 1:
         peers["Pendulum-v1"] = (stepping(gymnasium.make("Pendulum-v1")), units // 10, 6)

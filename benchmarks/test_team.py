@@ -1,4 +1,4 @@
-"""Teams: steps per second beside MPE2's, and a batch of teams beside that of a single agent."""
+"""Teams: steps per second compared with MPE2, and a batch of teams compared with single agents."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def team_stepping(env: Any, actions: dict[str, Any]) -> Callable[[int], None]:
 
 
 def batch_stepping(spec: SMESpec) -> Callable[[int], None]:
-    """Steps of 1,024 lanes, and new beginnings where they end."""
+    """Steps of 1,024 lanes, with resets of finished episodes."""
     batch = Batch(materialize(spec), BATCH)
     actions = np.random.default_rng(0).random((BATCH, spec.action_dim))
     batch.begin(np.arange(BATCH), batch.observe())
@@ -47,7 +47,7 @@ def batch_stepping(spec: SMESpec) -> Callable[[int], None]:
 
 def test_parallel_step(compare: Any) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # importing it warns of the old way to make environments
+        warnings.simplefilter("ignore")  # importing it gives a deprecation warning
         simple_spread = pytest.importorskip("mpe2.simple_spread_v3")
         spread = simple_spread.parallel_env(N=3)
     spread.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Training: evaluations beside SB3's `evaluate_policy`, steps beside the same agent on Pendulum."""
+"""Evaluations compared with SB3's `evaluate_policy`, training steps compared with Pendulum-v1."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ sb3 = pytest.importorskip("stable_baselines3")
 
 SPEC = SMESpec()
 EPISODES = 5
-# Steps of a round: PPO learns at the end of each of its rollouts, of 2,048.
+# Steps per round; PPO learns at the end of each rollout of 2,048 steps.
 ROUND = {"PPO": 2048, "TD3": 40, "SAC": 40}
 
 
 def learner(algorithm: str, env: Any) -> Any:
     settings = {} if algorithm == "PPO" else {"buffer_size": 20_000, "learning_starts": 10}
-    made = getattr(sb3, algorithm)("MlpPolicy", env, seed=0, device="cpu", **settings)
-    made.set_logger(sb3.common.logger.Logger(None, []))
-    return made
+    model = getattr(sb3, algorithm)("MlpPolicy", env, seed=0, device="cpu", **settings)
+    model.set_logger(sb3.common.logger.Logger(None, []))
+    return model
 
 
 @pytest.mark.parametrize("algorithm", ["TD3", "SAC", "PPO"])
@@ -41,14 +41,14 @@ def test_evaluations_of_five_episodes(compare: Any, algorithm: str) -> None:
     env.reset(seed=0)
 
     def ours(times: int) -> None:
-        for evaluation in range(times):  # the weights are copied anew each time
+        for evaluation in range(times):  # each evaluation copies the weights
             rollouts(
                 numpy_policy(model, SPEC),
                 task,
                 start_states(0, evaluation, EPISODES, SPEC.state_dim),
             )
 
-    def theirs(times: int) -> None:
+    def sb3_evaluations(times: int) -> None:
         for _ in range(times):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -57,7 +57,7 @@ def test_evaluations_of_five_episodes(compare: Any, algorithm: str) -> None:
     with one_thread():
         compare(
             f"{algorithm}, an evaluation of {EPISODES} episodes", "pass", ours, 5,
-            {"SB3's evaluate_policy": (theirs, 1, 5.0)}, clock=time.thread_time,
+            {"SB3's evaluate_policy": (sb3_evaluations, 1, 5.0)}, clock=time.thread_time,
         )  # fmt: skip
 
 
