@@ -1,8 +1,8 @@
 """The baseline: the same environments as a researcher would write them, in plain NumPy.
 
-The same numbers (states bit for bit, `tests/compiled` checks it), the same checks of actions and
-the same `info`, but one operation a line, no tuning and no compiled code. Φ is SciPy's `ndtr`:
-`scipy.stats.norm.cdf`, which many would write, costs ninety times as much on four values.
+They produce the same numbers (`tests/compiled` checks that states agree bit for bit), with the same
+action checks and `info`, but without tuning or compiled code. Φ is SciPy's `ndtr`; the common
+`scipy.stats.norm.cdf` costs ninety times as much on four values.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A gradient step of BC and IQL, including sampling, compared with d3rlpy's where it is installed.
 
 `make bench` does not install d3rlpy; docs/results/offline_learners.md describes that measurement.
-Without it, the peer is a step of Stable-Baselines3's TD3 with layers of equal number and width, as a
-reference for the cost of such a step and not as a target.
+Without it, the peer is a step of Stable-Baselines3's TD3 with equal layers, as a reference for the
+cost of such a step and not as a target.
 """
 
 from __future__ import annotations
