@@ -1,7 +1,7 @@
 """Ratios against named peers, measured in interleaved rounds of one run; `make bench` prints them.
 
-A machine's speed varies by a fifth within a minute, so we and the peer run alternately. A row is the
-ratio of the median times over all rounds. A missed target is printed, never asserted.
+A machine's speed varies by a fifth within a minute, so we and the peer run alternately. A row is
+the ratio of the median times over all rounds. A missed target is printed, never asserted.
 """
 
 from __future__ import annotations
