@@ -128,17 +128,17 @@ def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str
         "",
         f"{report.regions[0].states:,} states a region. r̃ is the similarity to the optimal "
         "action (1 is optimal); normalised regret is 0 for the optimum and 1 for the constant "
-        "action ½; decay is the share of r̃ lost since WD.",
+        "action ½; similarity decay is the share of r̃ lost since WD.",
         "",
-        "| region | ε | r̃ | normalised regret | decay | linear policy's r̃ |",
+        "| region | ε | r̃ | normalised regret | similarity decay | linear policy's r̃ |",
         "|---|---|---:|---:|---:|---:|",
     ]
     linear = report.references["linear_least_squares"]
     for region, reference in zip(report.regions, linear, strict=True):
         lines.append(
             f"| {region.name} | {region.epsilon_low:g}–{region.epsilon_high:g} "
-            f"| {region.similarity:.3f} | {region.normalised_regret:.3f} | {region.decay:.1%} "
-            f"| {reference.similarity:.3f} |"
+            f"| {region.similarity:.3f} | {region.normalised_regret:.3f} "
+            f"| {region.similarity_decay:.1%} | {reference.similarity:.3f} |"
         )
     for figure in result.figures:
         lines += ["", f"![{figure.stem.replace('_', ' ')}]({figure.name})"]

@@ -1,31 +1,36 @@
-"""`EvaluationReport`: what an evaluation found, as a document to write, share and read again.
+"""`EvaluationReport`: the results of an evaluation, as a JSON document, a table and a data frame.
 
-Of a policy's clipped actions a and the optimal ones a*, over the states of a region:
+a are the policy's actions, clipped to [0, 1], a* the optimal ones. Over the states of region m, of
+which region 0 is WD and 1 to M are the OOD shells:
 
-    r̃ = 1 − mean |a − a*|                        similarity, in [0, 1]
-    normalised regret = mean |a − a*| / mean |½ − a*|    0 for the optimum, 1 for the constant ½
-    decay at m = (r̃_WD − r̃_m) / r̃_WD             in points: 100 (r̃_WD − r̃_m)
+    r̃_m = 1 − mean |a − a*|                       similarity, in [0, 1]
+    N_m = mean |a − a*| / mean |½ − a*|           normalised regret: 0 optimal, 1 the constant ½
+    N₀, N̄ = Σ_{m≥1} N_m / M, N̄ − N₀               WD regret, OOD regret, OOD decay
+    (r̃_0 − r̃_m) / r̃_0, 100 (r̃_0 − r̃_m)           similarity decay, similarity loss in points
 """
 
 from __future__ import annotations
 
+import io
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.errors import DigestMismatchError
+from sme_registry.errors import DigestMismatchError, MissingDependencyError
 from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel
 
 if TYPE_CHECKING:
+    import pandas
     from rich.table import Table
 
 NOT_COMPARABLE = (
-    "Levels ε are not comparable between different state_dim: the more channels, the nearer a "
-    "shell's states lie to its outer face."
+    "Levels ε are not comparable between different state_dim: with more channels, the states of "
+    "a shell lie nearer to its outer face."
 )
 
 LABELS = {
@@ -42,7 +47,7 @@ class ChannelReport(StrictModel):
 
     Attributes:
       mae: mean |a − a*| of the channel, in [0, 1].
-      normalised_regret: the same over mean |½ − a*| of the channel.
+      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
     """
 
     mae: Real
@@ -56,14 +61,14 @@ class RegionReport(StrictModel):
       name: `WD`, `OOD 1`, …
       epsilon_low: ε of the inner face, which belongs to the region inside; 0 for WD.
       epsilon_high: ε of the outer face, which belongs to this region; 0 for WD.
-      states: how many states.
+      states: number of states.
       similarity: mean r̃.
       similarity_sd: standard deviation of r̃ over states (not over seeds).
       mae: mean |a − a*| = 1 − r̃.
       normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
-      decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative where the policy does better outside.
-      decay_points: 100 (r̃_WD − r̃), the loss in points of similarity.
-      clipped_share: share of action entries outside the action range before they were clipped.
+      similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
+      similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
+      clipped_share: share of action entries that were outside the action range and clipped.
       channels: each action channel, in order.
     """
 
@@ -75,8 +80,8 @@ class RegionReport(StrictModel):
     similarity_sd: Real
     mae: Real
     normalised_regret: Real
-    decay: Real
-    decay_points: Real
+    similarity_decay: Real
+    similarity_loss: Real
     clipped_share: Real
     channels: Annotated[tuple[ChannelReport, ...], Field(strict=False)]
 
@@ -99,20 +104,20 @@ class AgentReport(StrictModel):
 class EvaluationReport(StrictModel):
     """A policy in every region of a protocol, and the references on the same states.
 
-    Of a team `regions` and `references` are over all action channels, and `agents` has each agent
-    over its own. A report of a single agent has none, and its JSON no such field.
+    `print(report)` shows it as a table. For a team, `regions` and `references` are over all action
+    channels, and `agents` has the same for each agent over its own. A single agent's report has no
+    agents, and its JSON omits the field.
 
     Attributes:
       policy: the policy's name.
       action_range: of the policy's actions, "unit" or "symmetric"; "mixed" where the agents of a
         team differ.
-      spec: the task, whole.
+      spec: the task.
       spec_digest: its digest.
-      protocol: the protocol, whole.
+      protocol: the protocol.
       protocol_digest: its digest.
       regions: WD, then OOD 1, 2, …
-      references: the same regions for each reference policy; what each is, says
-        `sme_registry.evaluation.references`.
+      references: the same regions for each reference policy; `evaluation.references` defines them.
       agents: each agent of a team by its name, in the order of the channels that they own.
       versions: of Python and the packages that the numbers depend on.
     """
@@ -130,7 +135,7 @@ class EvaluationReport(StrictModel):
     versions: dict[str, str]
 
     @model_serializer(mode="wrap")
-    def _without_agents_of_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _omit_no_agents(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
         if not self.agents:
             del plain["agents"]
@@ -143,40 +148,99 @@ class EvaluationReport(StrictModel):
         Raises:
           MalformedDocumentError: not readable, or not strict JSON.
           SpecError: a field is wrong, missing or unknown.
-          DigestMismatchError: a digest is not that of the spec or protocol beside it.
+          DigestMismatchError: a digest does not match the spec or protocol in the file.
         """
         report = cls.from_dict(read_json(path), str(path))
         for what in ("spec", "protocol"):
-            found, stated = getattr(report, what).digest, getattr(report, f"{what}_digest")
-            if found != stated:
+            actual, stated = getattr(report, what).digest, getattr(report, f"{what}_digest")
+            if actual != stated:
                 raise DigestMismatchError(
-                    f"{path}: {what}_digest={stated!r:.90}: its {what} has {found!r}. One of them "
-                    "was changed after the evaluation: take the report again from its source."
+                    f"{path}: {what}_digest={stated!r:.90}: the digest of its {what} is "
+                    f"{actual!r}. One of them was edited after the evaluation: get the report "
+                    "from its source again, or repeat the evaluation."
                 )
         return report
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the report as JSON, whole or not at all.
+        """Write the report as JSON, completely or not at all.
 
         Raises:
-          OptionError: it cannot be written; what stood there is untouched.
+          OptionError: it cannot be written; an existing file is unchanged.
         """
         return write_atomically(path, to_json(self.to_dict()))
 
-    def table(self) -> Table:
-        """The report for a terminal of 80 columns: regions across, policy and references down.
+    @property
+    def wd_regret(self) -> float:
+        """N₀, normalised regret in WD: 0 for the optimal policy, 1 for the constant ½."""
+        return self.regions[0].normalised_regret
 
-        Of a team it is the whole team's, and three lines for each agent below.
+    @property
+    def ood_regret(self) -> float:
+        """N̄, the mean of normalised regret over the OOD shells; NaN if there are none."""
+        shells = [region.normalised_regret for region in self.regions[1:]]
+        return sum(shells) / len(shells) if shells else math.nan
+
+    @property
+    def ood_decay(self) -> float:
+        """N̄ − N₀, by how much normalised regret grows outside the training cube."""
+        return self.ood_regret - self.wd_regret
+
+    def to_frame(self) -> pandas.DataFrame:
+        """The numbers as a tidy pandas frame.
+
+        Returns:
+          One row for each policy and region: `policy`; `reference`, whether it is a reference
+          policy; `agent`, empty for the whole team or the single agent; `region`; then the columns
+          `epsilon_low` to `clipped_share` of `RegionReport`.
+
+        Raises:
+          MissingDependencyError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise MissingDependencyError(
+                "EvaluationReport.to_frame: pandas is not installed. "
+                "Run `pip install 'sme-registry[studies]'`."
+            ) from None
+        scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
+        return pandas.DataFrame(
+            {"policy": policy, "reference": is_reference, "agent": agent, "region": region.name}
+            | region.model_dump(exclude={"name", "channels"})
+            for agent, scope in scopes.items()
+            for is_reference, policies in (
+                (False, {self.policy: scope.regions}),
+                (True, scope.references),
+            )
+            for policy, regions in policies.items()
+            for region in regions
+        )
+
+    def __str__(self) -> str:
+        from rich.console import Console
+
+        # Wide, so that no column wraps; a table is only as wide as its content.
+        console = Console(file=io.StringIO(), width=1000, color_system=None)
+        with console.capture() as capture:
+            console.print(self.table())
+        return "\n".join(line.rstrip() for line in capture.get().splitlines())
+
+    def table(self) -> Table:
+        """The report as a table of 80 columns: a column for each region, a row for each policy.
+
+        For a team, it shows the whole team, then three rows for each agent.
         """
         from rich.markup import escape
         from rich.table import Table
 
-        spec, own_name = self.spec, escape(self.policy)
+        spec, policy = self.spec, escape(self.policy)
         team = f", {len(self.agents)} agents" if self.agents else ""
         table = Table(
-            title=f"{own_name} on {catalogue.title(spec)} (S={spec.state_dim}, "
+            title=f"{policy} on {catalogue.title(spec)} (S={spec.state_dim}, "
             f"A={spec.action_dim}, L={spec.complexity}{team})\n"
-            f"{spec.digest}\n{self.regions[0].states:,} states a region",
+            f"{spec.digest}\n{self.regions[0].states:,} states per region; "
+            f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
+            f"OOD decay {self.ood_decay:.3f}",
             caption=NOT_COMPARABLE,
             title_justify="left",
             caption_justify="left",
@@ -196,18 +260,18 @@ class EvaluationReport(StrictModel):
             ("normalised regret", "normalised_regret"),
         ):
             table.add_row(heading, style="italic")
-            for name, regions in {own_name: self.regions, **self.references}.items():
+            for name, regions in {policy: self.regions, **self.references}.items():
                 row(f"  {LABELS.get(name, name)}", regions, field, ".3f")
             table.add_section()
         row("SD of r̃ over states", self.regions, "similarity_sd", ".3f")
-        row("decay from WD", self.regions, "decay", ".1%")
-        row("points of r̃ lost", self.regions, "decay_points", ".1f")
+        row("similarity decay", self.regions, "similarity_decay", ".1%")
+        row("similarity loss, pts", self.regions, "similarity_loss", ".1f")
         row("actions clipped", self.regions, "clipped_share", ".1%")
-        for agent, found in self.agents.items():
+        for agent, report in self.agents.items():
             table.add_section()
-            row(f"{agent}  r̃", found.regions, "similarity", ".3f")
-            row("  normalised regret", found.regions, "normalised_regret", ".3f")
-            linear = found.references.get("linear_least_squares")
+            row(f"{agent}  r̃", report.regions, "similarity", ".3f")
+            row("  normalised regret", report.regions, "normalised_regret", ".3f")
+            linear = report.references.get("linear_least_squares")
             if linear is not None:
                 row(f"  of {LABELS['linear_least_squares']}", linear, "normalised_regret", ".3f")
         return table

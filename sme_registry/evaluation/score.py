@@ -74,8 +74,8 @@ class Score:
             similarity_sd=math.sqrt(self._squares / (self._states - 1)),
             mae=self._mean,
             normalised_regret=self._mean / floor.mae,
-            decay=(similarity_inside - similarity) / similarity_inside,
-            decay_points=100.0 * (similarity_inside - similarity),
+            similarity_decay=(similarity_inside - similarity) / similarity_inside,
+            similarity_loss=100.0 * (similarity_inside - similarity),
             clipped_share=self._clipped / (self._states * len(self._missed)),
             channels=tuple(
                 ChannelReport(

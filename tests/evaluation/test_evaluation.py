@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import sys
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
+    MissingDependencyError,
     SpecError,
     UnknownNameError,
 )
 from sme_registry.evaluation import references, regions
+from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
 
 SPEC = SMESpec(state_dim=4, action_dim=3, complexity=3)
@@ -53,7 +56,7 @@ def test_optimal_policy_has_similarity_1_and_regret_0(monkeypatch, backend, comp
         assert region.similarity == pytest.approx(1.0, abs=1e-9)
         assert region.normalised_regret == pytest.approx(0.0, abs=1e-9)
         assert region.similarity_sd < 1e-9
-        assert region.decay == pytest.approx(0.0, abs=1e-9)
+        assert region.similarity_decay == pytest.approx(0.0, abs=1e-9)
 
 
 def test_constant_half_has_normalised_regret_of_exactly_1():
@@ -79,8 +82,9 @@ def test_numbers_are_those_of_the_definition(report):
         assert region.similarity_sd == pytest.approx(similarity.std(ddof=1), abs=1e-12)
         assert region.mae == pytest.approx(missed.mean(), abs=1e-12)
         assert region.normalised_regret == pytest.approx(missed.mean() / floor.mean(), abs=1e-12)
-        assert region.decay == pytest.approx((inside - similarity.mean()) / inside, abs=1e-12)
-        assert region.decay_points == pytest.approx(100 * (inside - similarity.mean()), abs=1e-9)
+        lost = inside - similarity.mean()
+        assert region.similarity_decay == pytest.approx(lost / inside, abs=1e-12)
+        assert region.similarity_loss == pytest.approx(100 * lost, abs=1e-9)
         assert region.clipped_share == np.mean((linear(o) < 0) | (linear(o) > 1))
         for channel, mae, half_mae in zip(
             region.channels, missed.mean(axis=0), floor.mean(axis=0), strict=True
@@ -224,6 +228,55 @@ def test_a_report_with_an_unknown_or_missing_field_is_refused(report):
     del plain["regions"][0]["mae"]
     with pytest.raises(SpecError, match="mae: missing"):
         EvaluationReport.from_dict(plain)
+
+
+def test_regret_and_decay_over_regions_are_those_of_the_definition(report):
+    inside, *shells = (region.normalised_regret for region in report.regions)
+    assert report.wd_regret == inside
+    assert report.ood_regret == pytest.approx(np.mean(shells), abs=1e-15)
+    assert report.ood_decay == report.ood_regret - inside
+    alone = report.model_copy(update={"regions": report.regions[:1]})
+    assert np.isnan(alone.ood_regret)
+    assert np.isnan(alone.ood_decay)
+
+
+def test_the_frame_has_one_row_for_each_policy_and_region(report):
+    pytest.importorskip("pandas")
+    frame = report.to_frame()
+    assert list(frame.columns) == [
+        "policy", "reference", "agent", "region", "epsilon_low", "epsilon_high", "states",
+        "similarity", "similarity_sd", "mae", "normalised_regret", "similarity_decay",
+        "similarity_loss", "clipped_share",
+    ]  # fmt: skip
+    assert len(frame) == 6 * 6
+    mine = frame[~frame["reference"]]
+    assert list(mine["region"]) == [region.name for region in report.regions]
+    assert list(mine["mae"]) == [region.mae for region in report.regions]
+    half = frame[frame["policy"] == "constant_half"]
+    assert list(half["normalised_regret"]) == [1.0] * 6
+
+
+def test_a_teams_frame_has_rows_for_each_agent():
+    pytest.importorskip("pandas")
+    spec = sme_registry.load("Team2")
+    report = evaluate(reference_policy("linear", spec), spec, PROTOCOL)
+    frame = report.to_frame()
+    assert len(frame) == 6 * 6 * 3
+    own = frame[(frame["agent"] == "agent_1") & (frame["policy"] == "best_constant")]
+    expected = report.agents["agent_1"].references["best_constant"]
+    assert list(own["normalised_regret"]) == [region.normalised_regret for region in expected]
+
+
+def test_a_frame_without_pandas_names_the_extra(report, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[studies\]'"):
+        report.to_frame()
+
+
+def test_printing_a_report_shows_its_table(report):
+    text = str(report)
+    assert text == "\n".join(line.rstrip() for line in rendered(report).splitlines())
+    assert "\x1b" not in text
 
 
 def rendered(report):

@@ -285,8 +285,8 @@ class _Study:
                     run.result.cell.spec.state_dim,
                     outside.epsilon_high,
                     inside.similarity,
-                    outside.decay,
-                    outside.decay_points,
+                    outside.similarity_decay,
+                    outside.similarity_loss,
                 )
 
     def levels(self) -> Iterator[Level]:
