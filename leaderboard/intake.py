@@ -109,9 +109,9 @@ def admit(
     _check_artefacts(store, submission, artefact)
     if artefact is not None:
         for digest in _artefacts(submission):
-            if not store.has_object(digest):
+            if not store.objects.has(digest):
                 store.put_object(digest, [artefact(digest)], by=submission.submitter.key)
-    with store.turn():  # nobody else fills the quota between its check and the row
+    with store.transaction():  # nobody else fills the quota between its check and the row
         _check_quota(store, submission.submitter.key, moment)
         return store.receive(signed)
 
@@ -282,14 +282,14 @@ def check_upload(
             "Export a smaller network.",
         )
     moment = at or datetime.datetime.now(datetime.UTC)
-    used = store.uploads(key, utc(moment - _DAY)) + pending_of_key
+    used = store.usage.uploaded_bytes(key, utc(moment - _DAY)) + pending_of_key
     if used + size > limits.upload_bytes_per_day:
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
             "within 24 hours. Upload the rest when the first of them are a day old.",
         )
-    if store.total_bytes() + pending + size > limits.total_bytes:
+    if store.usage.total_bytes() + pending + size > limits.total_bytes:
         raise Rejection(
             "quota",
             f"objects: the board has no room left of its {limits.total_bytes:,} bytes. "
@@ -305,7 +305,7 @@ def _check_quota(store: Store, key: str, moment: datetime.datetime) -> None:
     limits = store.document.limits
     if key == store.document.key:
         return  # the reference rows, without which nothing is shown
-    times = store.submissions_of(key, utc(moment - _DAY))
+    times = store.usage.submission_times(key, utc(moment - _DAY))
     if len(times) >= limits.submissions_per_day:
         free = _moment(times[-limits.submissions_per_day]) + _DAY
         raise Rejection(
@@ -313,7 +313,7 @@ def _check_quota(store: Store, key: str, moment: datetime.datetime) -> None:
             f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
             f"within 24 hours. Send the next one after {utc(free)}.",
         )
-    waiting = store.waiting()
+    waiting = store.queue.waiting()
     if waiting >= limits.waiting_submissions:
         raise Rejection(
             "quota",
@@ -333,7 +333,7 @@ def _check_artefacts(
     """All there and as large as they say; then each through the gate, one in memory at a time."""
     if artefact is None:
         for digest, wanted in _artefacts(submission).items():
-            if not store.has_object(digest):
+            if not store.objects.has(digest):
                 raise Rejection(
                     "artefact_missing",
                     f"artefact={digest}: is not on the board. Upload it before the submission.",
@@ -352,7 +352,7 @@ def _check_artefacts(
             spec = instances[run.spec][1]
             widths.setdefault(run.artefact.sha256, set()).add((spec.state_dim + 2, spec.action_dim))
     for digest, dimensions in widths.items():
-        data = artefact(digest) if artefact else store.object_bytes(digest)
+        data = artefact(digest) if artefact else store.objects.read(digest)
         for observation_dim, action_dim in sorted(dimensions):
             inspect(data, observation_dim, action_dim)
 

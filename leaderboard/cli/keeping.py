@@ -168,12 +168,14 @@ def gc(
 
       sme-leaderboard gc board --dry-run
     """
-    from leaderboard.store import Store
+    from leaderboard.store import Store, collect_garbage
 
     if older_than_hours != older_than_hours:
         raise BoardError("older_than_hours=nan: must be a number of hours, at least 0.")
     with Store.open(board) as store:
-        report = store.gc(objects_older_than=older_than_hours * 3600.0, dry_run=dry_run)
+        report = collect_garbage(
+            store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run
+        )
     if json:
         print_json({"files": report.files, "bytes": report.bytes, "dry_run": dry_run})
         return

@@ -118,7 +118,7 @@ def verify(
         _verify_opening(folder, document, log)
         found = _follow(log, fresh, count, kept)
         with Store.open(path, read_only=True) as store:
-            with store.still():
+            with store.locked():
                 found |= _follow(log, fresh, count, kept)  # what came meanwhile
                 _verify_numbering(folder, fresh)
                 if kept is not None and not found:
@@ -394,7 +394,7 @@ def _rescore(store: Store, id: str) -> None:
     """The policies once more, through gate, sandbox and evaluation."""
     where = f"results/{hex_of(id)}.json"
     stored = store.result(id)
-    anew = score_submission(store.document, store.submission(id).submission, store.object_bytes)
+    anew = score_submission(store.document, store.submission(id).submission, store.objects.read)
     assert stored is not None
     if anew.status != stored.status:
         raise TamperedError(where, f"scored anew it is rejected: {anew.code}: {anew.message}")

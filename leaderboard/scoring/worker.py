@@ -25,8 +25,7 @@ from types import FrameType
 
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.score import score_submission
-from leaderboard.store import Claim, Store
-from leaderboard.store.store import LEASE_SECONDS
+from leaderboard.store import LEASE_SECONDS, Claim, Store
 from sme_registry.errors import MissingDependencyError, OptionError, SMEError
 from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts, unblock_interrupts
 
@@ -74,7 +73,7 @@ def run_scorer(
     written = 0
     with Store.open(path) as store:
         while not (stop and stop()):
-            claim = store.claim(worker, seconds=lease_seconds)
+            claim = store.queue.claim(worker, seconds=lease_seconds)
             if claim is not None:
                 written += _score(store, claim, progress)
             elif until_empty:
@@ -89,17 +88,17 @@ def _score(store: Store, claim: Claim, progress: Progress | None) -> bool:
     try:
         with _heartbeats(store, claim):
             submission = store.submission(claim.id).submission
-            result = score_submission(store.document, submission, store.object_bytes, progress)
+            result = score_submission(store.document, submission, store.objects.read, progress)
     except (TamperedError, MissingDependencyError, KeyboardInterrupt):
-        store.release(claim)  # nothing that the submission did
+        store.queue.release(claim)  # nothing that the submission did
         raise
     except BoardError:
         # Perhaps the machine is at fault, perhaps what the policy did to it: it counts as lost.
-        store.abandon(claim.worker)
+        store.queue.abandon(claim.worker)
         raise
     except Exception as error:
         _log.exception("%s: attempt %d was lost", claim.id, claim.attempt)
-        store.abandon(claim.worker)
+        store.queue.abandon(claim.worker)
         entry = store.entry(claim.id)
         if entry is not None and entry.reference:  # which is never given up
             raise BoardError(
@@ -107,7 +106,7 @@ def _score(store: Store, claim: Claim, progress: Progress | None) -> bool:
                 f"{type(error).__name__}: {error}. It waits: mend what fails, and score again."
             ) from error
         return False
-    return store.finish(claim, result)
+    return store.queue.finish(claim, result)
 
 
 @contextlib.contextmanager
@@ -118,7 +117,7 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
     def beat() -> None:
         while not over.wait(claim.seconds / 4):
             with contextlib.suppress(BoardError):  # a full disk now may have room the next time
-                if not store.heartbeat(claim):
+                if not store.queue.heartbeat(claim):
                     return
 
     thread = threading.Thread(target=beat, name=f"heartbeat of {claim.worker}", daemon=True)
@@ -174,14 +173,14 @@ def run_scorers(
         raise OptionError(f"workers={workers}: must be at least 1. Leave it out for one.")
     alive: dict[str, _Scorer] = {}
     with Store.open(path) as store:
-        before, done = store.done(), 0
+        before, done = store.queue.done(), 0
         barren, judged = 0, _judged(store)
         try:
-            while (left := store.waiting()) or not until_empty:
+            while (left := store.queue.waiting()) or not until_empty:
                 if stop and stop():
                     break
                 while len(alive) < workers and (
-                    not until_empty or (len(alive) < left and store.claimable())
+                    not until_empty or (len(alive) < left and store.queue.claimable())
                 ):
                     name = worker_name()
                     with defer_interrupts(), block_interrupts():  # or it would be nobody's
@@ -199,9 +198,9 @@ def run_scorers(
                         f"{path}: {barren} scorers died and finished nothing. "
                         "See the system's log for what killed them, such as a lack of memory."
                     )
-                done = store.done() - before
+                done = store.queue.done() - before
                 if progress is not None:
-                    progress(done, done + store.waiting())
+                    progress(done, done + store.queue.waiting())
         finally:
             _interrupt([scorer.process for scorer in alive.values()])
             _bury(store, alive)
@@ -210,7 +209,7 @@ def run_scorers(
 
 def _judged(store: Store) -> int:
     """How many are done, those left out that scorers were lost over."""
-    return store.done() - store.given_up()
+    return store.queue.done() - store.queue.failed()
 
 
 def _start(path: str | Path, name: str, until_empty: bool, lease_seconds: float) -> _Scorer:
@@ -272,7 +271,7 @@ def _bury(store: Store, alive: dict[str, _Scorer]) -> tuple[int, SMEError | None
             died += 1
             complaint = said or complaint
         # Also of one that ended well: Ctrl-C may have come between its claim and its knowing so.
-        store.abandon(name)
+        store.queue.abandon(name)
         scorer.process.close()
         del alive[name]
     return died, complaint

@@ -1,18 +1,23 @@
-"""A board's folder: what was submitted and found, in files that are whole or absent.
+"""A board's folder: submissions, results and artefacts in files that are complete or absent.
 
-The signed log is the truth, the other files hold what it names, and `index.sqlite` is an index
-of both that can be made anew at any time. Any process may die at any point: what it leaves is a
-state from which the next one goes on.
+The signed log is authoritative, the other files hold the documents that it names, and
+`index.sqlite` indexes both and can be rebuilt at any time. Any process may die at any point; the
+next one continues from the state it leaves.
 """
 
-from leaderboard.store.documents import digest_of, read_document
+from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.index import EntryRow, Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
-from leaderboard.store.store import Claim, Garbage, Store
+from leaderboard.store.queue import ATTEMPTS, LEASE_SECONDS, Claim, Queue
+from leaderboard.store.store import Store
+from leaderboard.store.upkeep import Garbage, collect_garbage
+from leaderboard.store.usage import Usage
 
 __all__ = [
+    "ATTEMPTS",
     "EMPTY",
+    "LEASE_SECONDS",
     "Claim",
     "EntryRow",
     "Garbage",
@@ -22,7 +27,10 @@ __all__ = [
     "Log",
     "LogEntry",
     "Objects",
+    "Queue",
     "Store",
+    "Usage",
+    "collect_garbage",
     "digest_of",
     "read_document",
 ]

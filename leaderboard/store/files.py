@@ -1,30 +1,37 @@
-"""Files that are whole or absent, and durable: the folder that names them is synced, too.
+"""Files of a board: complete or absent, durable, and read back only if they match the log.
 
-A process that is killed leaves at most a temporary file, `.name.xxxxxxxx.tmp`, which `gc` removes.
+The writing itself is `sme_registry.io.atomic_file`. A board also syncs the folder that names a
+file, so that a logged entry survives a loss of power, and makes files readable to everyone.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
-from leaderboard.errors import BoardError
+from leaderboard.documents.board import Folder, hex_of
+from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
+from sme_registry.errors import SMEError
+from sme_registry.spec import StrictModel
+
+_Model = TypeVar("_Model", bound=StrictModel)
 
 
 @contextlib.contextmanager
-def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """`sme_registry.io.atomic_file`, such that the file is still there after a loss of power.
+def durable_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
+    """`sme_registry.io.atomic_file` whose result survives a loss of power.
 
     Args:
-      path: the target; its folder is made where it is missing.
+      path: the target; its folder is created if it does not exist.
       new: never replace an existing file.
 
     Raises:
-      BoardError: the disk is full, the folder cannot be written to, or (`new`) the name is taken.
+      BoardError: the disk is full, the folder is not writable, or (`new`) the file exists.
     """
     try:
         make_folder(path.parent)
@@ -36,14 +43,14 @@ def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
         raise unwritable(path, error) from error
 
 
-def write(path: Path, data: bytes, *, new: bool = False) -> None:
-    """Write a file whole or not at all; arguments and errors as for `whole`."""
-    with atomic_file(path, new=new) as stream:
+def write_file(path: Path, data: bytes, *, new: bool = False) -> None:
+    """Write a whole file; arguments and errors as for `durable_file`."""
+    with durable_file(path, new=new) as stream:
         stream.write(data)
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, if need be, such that it is still there after a loss of power."""
+    """Create a folder, if it does not exist, so that it survives a loss of power."""
     if not path.is_dir():
         path.mkdir(parents=True, exist_ok=True)
         sync_folder(path.parent)
@@ -59,8 +66,54 @@ def sync_folder(path: Path) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> BoardError:
-    """What to raise where a write failed."""
+    """The error to raise where a write failed."""
     return BoardError(
         f"{path}: cannot be written: {error.strerror or error}. "
-        "Nothing was changed. Make room or give the right to write, and try again."
+        "Nothing was changed. Free disk space or get write permission, then try again."
     )
+
+
+def to_bytes(document: StrictModel) -> bytes:
+    """The contents of a document's file."""
+    return io.to_json(document.to_dict()).encode()
+
+
+def digest_of(document: StrictModel) -> str:
+    """`sha256:` and 64 hex digits of the document's file, as `sha256sum` prints them."""
+    return "sha256:" + hashlib.sha256(to_bytes(document)).hexdigest()
+
+
+def write_document(path: Path, document: StrictModel, *, new: bool = False) -> None:
+    """Write a document's file; arguments and errors as for `durable_file`."""
+    write_file(path, to_bytes(document), new=new)
+
+
+def read_document(
+    folder: Folder, path: Path, kind: type[_Model], digest: str | None = None
+) -> _Model:
+    """Read a document of a board.
+
+    Args:
+      folder: the board's folder, for error messages.
+      path: the file.
+      kind: the document's type.
+      digest: of the file, as logged; None if the log does not name the file.
+
+    Raises:
+      TamperedError: the file is missing, is not a document of this type, differs from the logged
+        one, or is not in the form in which the board writes it.
+    """
+    where = path.relative_to(folder.path).as_posix()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise TamperedError(where, f"cannot be read: {error.strerror}") from None
+    if digest is not None and hashlib.sha256(data).hexdigest() != hex_of(digest):
+        raise TamperedError(where, f"differs from the document in the log, {digest[:19]}…")
+    try:
+        document = kind.from_dict(io.parse_json(data, where), where)
+    except SMEError as error:
+        raise TamperedError(where, f"is not a document that the board wrote: {error}") from None
+    if digest is None and to_bytes(document) != data:
+        raise TamperedError(where, "is not in the form in which the board writes it")
+    return document

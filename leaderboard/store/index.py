@@ -1,8 +1,8 @@
-"""`index.sqlite`: what pages, ranking and queue ask for, derived from the log and the documents.
+"""`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
-The tables `head`, `entry` and `object` are a function of the log alone, so that an index made
-anew equals the one that grew. `lease` and `upload` hold what passes: who scores what, and the
-artefacts that no submission names yet.
+The tables `head`, `entry` and `object` are a function of the log alone, so a rebuilt index equals
+one that grew. `lease` and `upload` are temporary state: the claims of scorers, and the artefacts
+that no submission names yet.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import METRICS, Estimate, Result, Scores
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.store.documents import digest_of, read_document
+from leaderboard.store.files import digest_of, read_document
+from leaderboard.store.lock import BUSY_SECONDS
 from leaderboard.store.log import EMPTY, Head, LogEntry
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]
 
-BUSY_SECONDS = 60.0
 DERIVED = {"head": "zero", "entry": "id", "object": "digest"}  # tables and their keys
 
 SCHEMA = """
@@ -60,27 +60,27 @@ CREATE TABLE upload (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
 """
-VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # another text is another schema
+VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
 
 
 class IndexUnusable(Exception):
-    """The index is missing, broken, of another schema or of another log: make it anew."""
+    """The index is missing, broken, or of another schema or log: rebuild it."""
 
 
 @dataclass(frozen=True)
 class EntryRow:
-    """One submission, as board and ranking need it.
+    """One submission, as pages and ranking need it.
 
     Attributes:
       id: the submission's digest.
-      sequence: of the log entry by which it was received: the order of submission.
-      received: when.
-      status: "withdrawn" may have scores.
-      code: why it was rejected; empty where it was not.
-      runs: listed in the submission, failed ones included.
+      sequence: number of the log entry that received it, and so the order of submission.
+      received: time of that entry.
+      status: a "withdrawn" one may have scores.
+      code: of its rejection; empty if it was not rejected.
+      runs: number of runs listed in the submission, failed ones included.
       steps: environment steps of all runs.
-      reference: one of the board's own rows, "optimal" and "constant".
-      scores: null where nothing was scored.
+      reference: whether it is one of the board's own rows, "optimal" and "constant".
+      scores: None if it was not scored.
     """
 
     id: str
@@ -111,7 +111,7 @@ class Index:
     """A connection to an index.
 
     Args:
-      connection: to a database that has the tables.
+      connection: to a database with the schema's tables.
       folder, document: the board's.
     """
 
@@ -124,55 +124,39 @@ class Index:
 
     @classmethod
     def open(cls, path: Path, folder: Folder, document: BoardDocument) -> Index:
-        """An existing index for writing.
+        """Open an existing index for writing.
 
         Raises:
-          IndexUnusable: it has to be made anew.
+          IndexUnusable: it must be rebuilt.
         """
         if not path.is_file():
-            raise IndexUnusable("missing")
-        connection = None
-        try:
+            raise IndexUnusable("is missing")
+        with _unusable_if_broken():
             connection = _connect(f"{path.absolute().as_uri()}?mode=rw")
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")
-            _refuse_unusable(connection, document)
-        except sqlite3.DatabaseError as error:
-            if connection is not None:
-                connection.close()
-            raise IndexUnusable(str(error)) from None
+        try:
+            with _unusable_if_broken():
+                connection.execute("PRAGMA journal_mode = WAL")
+                connection.execute("PRAGMA synchronous = FULL")
+                _refuse_unusable(connection, document)
         except IndexUnusable:
-            if connection is not None:
-                connection.close()
+            connection.close()
             raise
         return cls(connection, folder, document)
 
     @classmethod
     def snapshot(cls, path: Path, folder: Folder, document: BoardDocument) -> Index:
-        """A copy in memory of an existing index; writes nothing into a folder that is read-only.
+        """Copy an existing index into memory; writes nothing into a read-only folder.
 
         Raises:
-          IndexUnusable: it has to be made anew.
+          IndexUnusable: it must be rebuilt.
         """
         if not path.is_file():
-            raise IndexUnusable("missing")
+            raise IndexUnusable("is missing")
         memory = _connect(":memory:")
         try:
-            try:
-                _copy(path, memory)
-            except sqlite3.OperationalError:
-                # SQLite reads a log of writes (WAL) only where it may write beside it.
-                with tempfile.TemporaryDirectory() as elsewhere:
-                    copy = Path(elsewhere) / path.name
-                    for suffix in ("", "-wal"):
-                        part = path.with_name(path.name + suffix)
-                        if part.exists():
-                            shutil.copyfile(part, copy.with_name(part.name))
-                    _copy(copy, memory)
-            _refuse_unusable(memory, document)
-        except (sqlite3.DatabaseError, OSError) as error:
-            memory.close()
-            raise IndexUnusable(str(error)) from None
+            with _unusable_if_broken():
+                _copy_index(path, memory)
+                _refuse_unusable(memory, document)
         except IndexUnusable:
             memory.close()
             raise
@@ -180,18 +164,18 @@ class Index:
 
     @classmethod
     def empty(cls, path: Path | None, folder: Folder, document: BoardDocument) -> Index:
-        """An index of nothing, in a new file or in memory; filled by `apply`."""
+        """Create an empty index in a new file or in memory; `apply` fills it."""
         connection = _connect(":memory:" if path is None else str(path))
         connection.executescript(f"PRAGMA user_version = {VERSION}; BEGIN; {SCHEMA} COMMIT;")
         return cls(connection, folder, document)
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self.connection.close()
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
-        """All or nothing; no other connection writes meanwhile."""
+        """Commit all writes of the block or none; other connections wait."""
         self.connection.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -202,22 +186,22 @@ class Index:
 
     @property
     def head(self) -> Head:
-        """The last log entry that the index holds."""
+        """The last log entry in the index."""
         row = self.connection.execute("SELECT sequence, digest, time FROM head").fetchone()
         return EMPTY if row is None else Head(*row)
 
     def apply(self, entry: LogEntry) -> None:
-        """Take in the log entry after `head`.
+        """Apply the log entry after `head`.
 
         Raises:
-          TamperedError: the document that it names is missing or altered, or the entry makes no
-            sense after those before it.
+          TamperedError: the document that it names is missing or altered, or the entry contradicts
+            those before it.
         """
         match entry.event:
             case "opened":
                 document = self.document
                 if (entry.subject, entry.document) != (document.digest, digest_of(document)):
-                    raise TamperedError("board.json", "is not the board that the log opened")
+                    raise TamperedError("board.json", "differs from the board that the log opened")
             case "received":
                 self._received(entry)
             case "result":
@@ -231,11 +215,11 @@ class Index:
 
     def _received(self, entry: LogEntry) -> None:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
-            raise _senseless(entry, "receives a submission again")
+            raise _contradiction(entry, "receives a submission twice")
         path = self.folder.submission(entry.subject)
         submission = read_document(self.folder, path, SignedSubmission, entry.document).submission
         if submission.digest != entry.subject:
-            raise _senseless(entry, "names a document that is of another submission")
+            raise _contradiction(entry, "names a document of another submission")
         method, submitter = submission.method, submission.submitter
         self.connection.execute(
             f"INSERT INTO entry VALUES ({', '.join('?' * 21)})",
@@ -262,11 +246,11 @@ class Index:
 
     def _result(self, entry: LogEntry) -> None:
         if self.status(entry.subject) != "waiting":
-            raise _senseless(entry, "is of a submission that does not wait for a result")
+            raise _contradiction(entry, "the submission was not waiting for a result")
         path = self.folder.result(entry.subject)
         result = read_document(self.folder, path, Result, entry.document)
         if result.submission != entry.subject:
-            raise _senseless(entry, "names a document that is of another submission")
+            raise _contradiction(entry, "names a document of another submission")
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
             "scores = ? WHERE id = ?",
@@ -281,11 +265,11 @@ class Index:
 
     def _withdrawn(self, entry: LogEntry) -> None:
         if self.status(entry.subject) in (None, "withdrawn"):
-            raise _senseless(entry, "withdraws what is not there")
+            raise _contradiction(entry, "the submission is unknown or already withdrawn")
         path = self.folder.withdrawal(entry.subject)
         signed = read_document(self.folder, path, SignedWithdrawal, entry.document)
         if signed.withdrawal.submission != entry.subject:
-            raise _senseless(entry, "names a document that is of another submission")
+            raise _contradiction(entry, "names a document of another submission")
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",
             (entry.document, entry.subject),
@@ -293,36 +277,40 @@ class Index:
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 
     def one(self, statement: str, *values: Any) -> tuple[Any, ...] | None:
-        """The first row of an answer; None where there is none."""
+        """The first row of a query; None if there is none."""
         row: tuple[Any, ...] | None = self.connection.execute(statement, values).fetchone()
         return row
 
+    def number(self, statement: str, *values: Any) -> int:
+        """The number that a query for an aggregate returns."""
+        return int(self.connection.execute(statement, values).fetchone()[0])
+
     def status(self, id: str) -> Status | None:
-        """A submission's status; None where there is no such submission."""
+        """A submission's status; None if there is no such submission."""
         row = self.one("SELECT status FROM entry WHERE id = ?", id)
         return None if row is None else row[0]
 
     def entries(self) -> list[EntryRow]:
-        """Every submission, in the order in which they came."""
+        """All submissions, in the order in which they were received."""
         return [
             _entry_row(row)
             for row in self.connection.execute(f"SELECT {_ROW} FROM entry ORDER BY sequence")
         ]
 
     def entry(self, id: str) -> EntryRow | None:
-        """One submission; None where there is no such submission."""
+        """One submission; None if there is no such submission."""
         row = self.one(f"SELECT {_ROW} FROM entry WHERE id = ?", id)
         return None if row is None else _entry_row(row)
 
     def derived_rows(self) -> Iterator[tuple[str, str, tuple[Any, ...]]]:
-        """Table, key and values of each row that is a function of the log, in a fixed order."""
+        """Table, key and values of each row that the log determines, in a fixed order."""
         for table, key in DERIVED.items():
             for row in self.connection.execute(f"SELECT {key}, * FROM {table} ORDER BY {key}"):
                 yield table, str(row[0]), row[1:]
 
 
 def _connect(target: str) -> sqlite3.Connection:
-    # Transactions are begun by hand; the store's own lock lets one thread in at a time.
+    # Transactions begin explicitly; the store's lock admits one thread at a time.
     return sqlite3.connect(
         target,
         timeout=BUSY_SECONDS,
@@ -332,36 +320,58 @@ def _connect(target: str) -> sqlite3.Connection:
     )
 
 
-def _copy(path: Path, memory: sqlite3.Connection) -> None:
+def _copy_index(path: Path, memory: sqlite3.Connection) -> None:
+    try:
+        _backup(path, memory)
+    except sqlite3.OperationalError:
+        # SQLite reads a write-ahead log only in a folder that is writable.
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / path.name
+            for suffix in ("", "-wal"):
+                part = path.with_name(path.name + suffix)
+                if part.exists():
+                    shutil.copyfile(part, copy.with_name(part.name))
+            _backup(copy, memory)
+
+
+def _backup(path: Path, memory: sqlite3.Connection) -> None:
     with contextlib.closing(_connect(f"{path.absolute().as_uri()}?mode=ro")) as source:
         source.backup(memory)
+
+
+@contextlib.contextmanager
+def _unusable_if_broken() -> Iterator[None]:
+    try:
+        yield
+    except (sqlite3.DatabaseError, OSError) as error:
+        raise IndexUnusable(str(error)) from None
 
 
 def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) -> None:
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     if version != VERSION:
-        raise IndexUnusable("of another schema")
+        raise IndexUnusable("has another schema")
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
-        raise IndexUnusable(f"broken: {verdict}")
+        raise IndexUnusable(f"is broken: {verdict}")
     head = connection.execute("SELECT board FROM head").fetchone()
     if head is None or head[0] != document.digest:
-        raise IndexUnusable("of another board")
+        raise IndexUnusable("belongs to another board")
 
 
-def _senseless(entry: LogEntry, what: str) -> TamperedError:
-    return TamperedError(f"log/{entry.sequence:08d}.json", f"event={entry.event}: {what}")
+def _contradiction(entry: LogEntry, message: str) -> TamperedError:
+    return TamperedError(f"log/{entry.sequence:08d}.json", f"event={entry.event}: {message}")
 
 
 def _scores_text(scores: Scores) -> str:
-    """Scores as lists of numbers: read back 1,000 at a time, so without names."""
+    """Scores as lists of numbers without names, because rankings read thousands of them."""
     estimates = [getattr(scores, metric) for metric in METRICS] + list(scores.normalised_regret)
     return json.dumps([[each.value, each.low, each.high] for each in estimates])
 
 
-@functools.lru_cache(maxsize=4096)  # frozen, and asked for again each time that the log grows
+@functools.lru_cache(maxsize=4096)  # frozen, and read again whenever the log grows
 def _scores(text: str) -> Scores:
-    """`_scores_text` undone, not validated again: what was written came out of a `Result`."""
+    """The inverse of `_scores_text`; not validated, because a valid `Result` was written."""
     estimates = [
         Estimate.model_construct(value=value, low=low, high=high)
         for value, low, high in json.loads(text)

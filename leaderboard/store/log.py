@@ -1,7 +1,7 @@
-"""The log: one signed file per event, each holding the digest of the one before. It is the truth.
+"""The log: one signed file per event, each with the digest of the one before. It is authoritative.
 
 entry_n.previous  = digest(entry_{n−1})          64 zeros for the first
-entry_n.signature = by the board's key, of the entry without it
+entry_n.signature = by the board's key, over the entry without it
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import Signature, SigningKey, verifies
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import TamperedError
-from leaderboard.store.documents import read_document, write_document
+from leaderboard.store.files import read_document, write_document
 from sme_registry.spec import Digest, Document, Integer, SchemaVersion
 
 Event = Literal["opened", "received", "result", "withdrawn"]
@@ -24,10 +24,10 @@ NOTHING = "sha256:" + "0" * 64
 
 
 class Head(NamedTuple):
-    """The last entry of a log, or of an index: what the next one must follow.
+    """The last entry of a log or an index, which the next entry must follow.
 
     Attributes:
-      sequence: its number; −1 where there is none.
+      sequence: its number; −1 if there is none.
     """
 
     sequence: int
@@ -43,12 +43,12 @@ class LogEntry(Document):
 
     Attributes:
       sequence: its number, 0 for the first.
-      previous: digest of the entry before; 64 zeros where there is none.
-      time: when, by the board's clock, but never before the entry before.
+      previous: digest of the entry before; 64 zeros for the first.
+      time: of the event by the board's clock, never earlier than the entry before.
       event: "opened" (once, the first), "received", "result" or "withdrawn".
-      subject: the submission's id; of "opened" the board document's digest.
-      document: SHA-256 of the file that was written: the signed submission, the result, the
-        signed withdrawal, or board.json.
+      subject: the submission's id; for "opened" the board document's digest.
+      document: SHA-256 of the file written: the signed submission, the result, the signed
+        withdrawal, or board.json.
       signature: by the board's key.
     """
 
@@ -63,12 +63,12 @@ class LogEntry(Document):
 
     @property
     def signed_digest(self) -> str:
-        """Digest of everything but the signature."""
+        """Digest of the entry without its signature."""
         return _digest_without_signature(self)
 
     @property
     def head(self) -> Head:
-        """This entry as the one that the next must follow."""
+        """This entry as the one that the next entry must follow."""
         return Head(self.sequence, self.digest, self.time)
 
 
@@ -76,7 +76,7 @@ class Log:
     """The log of one board.
 
     Args:
-      folder: the board's.
+      folder: the board's folder.
       key: the board's public key.
     """
 
@@ -85,11 +85,11 @@ class Log:
         self.key = key
 
     def has(self, sequence: int) -> bool:
-        """Whether there is an entry of this number."""
+        """Whether the entry of this number exists."""
         return self.folder.log_entry(sequence).exists()
 
     def read(self, sequence: int) -> LogEntry:
-        """An entry, its signature verified, but not what comes before it.
+        """Read an entry and verify its signature, but not the entries before it.
 
         Raises:
           TamperedError: it is missing, altered, or not signed by the board.
@@ -98,25 +98,25 @@ class Log:
         entry = read_document(self.folder, path, LogEntry)
         where = path.relative_to(self.folder.path).as_posix()
         if entry.sequence != sequence:
-            raise TamperedError(where, f"holds the entry of number {entry.sequence}")
+            raise TamperedError(where, f"holds entry {entry.sequence}")
         if not verifies(self.key, entry.signature, "log", entry.signed_digest):
-            raise TamperedError(where, "its signature is not by this board's key")
+            raise TamperedError(where, "its signature does not match the board's key")
         return entry
 
     def read_after(self, head: Head) -> LogEntry:
-        """The entry after `head`, verified to follow it.
+        """Read the entry after `head` and verify that it follows it.
 
         Raises:
-          TamperedError: it is missing, altered, not signed by the board, or follows another.
+          TamperedError: it is missing, altered, not signed by the board, or does not follow `head`.
         """
         entry = self.read(head.sequence + 1)
         where = f"log/{entry.sequence:08d}.json"
         if entry.previous != head.digest:
-            raise TamperedError(where, "does not follow the entry before it: one was exchanged")
+            raise TamperedError(where, "does not follow the entry before it: one was replaced")
         if entry.time < head.time:
-            raise TamperedError(where, f"time={entry.time}: is before the entry before it")
+            raise TamperedError(where, f"time={entry.time}: is earlier than the entry before it")
         if (entry.event == "opened") != (entry.sequence == 0):
-            raise TamperedError(where, "a board is opened once, by the first entry")
+            raise TamperedError(where, "only the first entry may open a board")
         return entry
 
     def append(
@@ -124,10 +124,10 @@ class Log:
     ) -> LogEntry:
         """Write the entry after `head`.
 
-        A clock that was set back stands still here until it has caught up.
+        If the clock was set back, entries repeat the last time until the clock has caught up.
 
         Raises:
-          BoardError: it cannot be written, or another process has taken its number.
+          BoardError: it cannot be written, or another process has used its number.
         """
         unsigned = LogEntry.model_construct(
             schema_version=1,

@@ -1,4 +1,4 @@
-"""Artefacts by content: `objects/ab/cdef…`, named by the SHA-256 of their bytes."""
+"""`Objects`: artefacts as `objects/ab/cdef…`, named by the SHA-256 of their bytes."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from pathlib import Path
 
 from leaderboard.documents.board import Folder
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.store.files import atomic_file, unwritable
+from leaderboard.store.files import durable_file, unwritable
 
 
 class Objects:
     """The artefacts of one board.
 
     Args:
-      folder: the board's.
+      folder: the board's folder.
     """
 
     def __init__(self, folder: Folder) -> None:
         self.folder = folder
 
     def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> bool:
-        """Write an artefact as its bytes come; nothing of it is there before all of it is right.
+        """Write an artefact while its bytes arrive; it exists only once all of it is verified.
 
         Args:
-          digest: what its bytes must have.
-          chunks: the bytes; not read where the artefact is there already.
-          limit: most bytes.
+          digest: the expected digest of its bytes.
+          chunks: the bytes; not read if the artefact exists.
+          limit: the largest size allowed, in bytes.
 
         Returns:
           True if it is new.
@@ -39,42 +39,42 @@ class Objects:
         """
         path = self.folder.object(digest)
         try:
-            os.utime(path)  # young again, so that `gc` leaves it to the submission that is coming
+            os.utime(path)  # so that `gc` keeps it for the submission that follows
             return False
         except FileNotFoundError:
             pass
         except OSError as error:
             raise unwritable(path, error) from error
         sha256, size = hashlib.sha256(), 0
-        with atomic_file(path) as stream:
+        with durable_file(path) as stream:
             for chunk in chunks:
                 size += len(chunk)
                 if size > limit:
                     raise Rejection(
                         "too_large",
-                        f"artefact={digest[:19]}…: more than {limit:,} bytes. "
+                        f"artefact={digest[:19]}…: has more than {limit:,} bytes. "
                         "Submit a smaller policy.",
                     )
                 sha256.update(chunk)
                 stream.write(chunk)
-            found = "sha256:" + sha256.hexdigest()
-            if found != digest:
+            actual = "sha256:" + sha256.hexdigest()
+            if actual != digest:
                 raise Rejection(
                     "artefact_digest",
-                    f"artefact={digest[:19]}…: its bytes have the digest {found[:19]}…. "
-                    "Send the file that was hashed.",
+                    f"artefact={digest[:19]}…: the bytes have the digest {actual[:19]}…. "
+                    "Upload the file that was hashed.",
                 )
         return True
 
     def has(self, digest: str) -> bool:
-        """Whether the artefact is there."""
+        """Whether the artefact exists."""
         return self.folder.object(digest).is_file()
 
     def read(self, digest: str) -> bytes:
-        """An artefact's bytes, hashed anew.
+        """Read an artefact and verify its digest.
 
         Raises:
-          BoardError: it is not there.
+          BoardError: it does not exist.
           TamperedError: its bytes have another digest.
         """
         path = self.folder.object(digest)
@@ -86,7 +86,7 @@ class Objects:
             ) from None
         if hashlib.sha256(data).hexdigest() != path.parent.name + path.name:
             where = path.relative_to(self.folder.path).as_posix()
-            raise TamperedError(where, "its bytes have another digest than its name says")
+            raise TamperedError(where, "its bytes do not match the digest in its name")
         return data
 
     def paths(self) -> Iterator[tuple[str, Path]]:

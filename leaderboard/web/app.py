@@ -240,7 +240,7 @@ class _Served:
 
     async def get_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
-        if not await _in_thread(self._store.has_object, digest):
+        if not await _in_thread(self._store.objects.has, digest):
             raise Refusal("not_found", f"object={digest}: is not on this board.")
         headers = {
             "Cache-Control": "public, max-age=31536000, immutable",
@@ -248,7 +248,7 @@ class _Served:
         }
         if request.method == "HEAD":
             return Response(headers=headers, media_type="application/octet-stream")
-        data = await _in_thread(self._store.object_bytes, digest)
+        data = await _in_thread(self._store.objects.read, digest)
         return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def post_submission(self, request: Request) -> Response:

@@ -16,7 +16,7 @@ import numpy as np
 from leaderboard.artefact.sandbox import Sandbox
 from leaderboard.documents.submission import Submission
 from leaderboard.scoring.metrics import run_metrics
-from leaderboard.store.store import Store
+from leaderboard.store import Store
 from sme_registry import evaluate
 
 BOARD = Path(__file__).resolve().parents[2] / "examples" / "board"
@@ -38,7 +38,7 @@ def gains(store: Store, submission: Submission, draws: int) -> dict[str, tuple[f
         name, spec = board.instances[run.spec]
         if name in found or run.artefact is None:
             continue
-        data = store.object_bytes(run.artefact.sha256)
+        data = store.objects.read(run.artefact.sha256)
         metrics = []
         with Sandbox(data, spec.state_dim + 2, spec.action_dim) as policy:
             for seed in range(draws):

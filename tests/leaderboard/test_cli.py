@@ -184,15 +184,15 @@ def test_show_withholds_scores_until_the_references_are_right_and_says_why() -> 
     id = make_bundle()
     good("submit", "bundle", "board")
     with Store.open("board") as store:
-        claims = [store.claim(f"worker {number}") for number in range(3)]
+        claims = [store.queue.claim(f"worker {number}") for number in range(3)]
         assert claims[2] is not None
         assert claims[2].id == id
         submission = store.submission(id).submission
-        result = score_submission(store.document, submission, store.object_bytes)
-        assert store.finish(claims[2], result)
+        result = score_submission(store.document, submission, store.objects.read)
+        assert store.queue.finish(claims[2], result)
         for claim in claims[:2]:
             assert claim is not None
-            store.release(claim)
+            store.queue.release(claim)
     shown = good("show", "board", id)
     assert "scored" in shown
     assert "reference row 'optimal': waiting" in shown
@@ -288,10 +288,10 @@ def test_gc_removes_what_no_submission_names_and_only_says_so_before() -> None:
         store.put_object(digest, [data], by=key.public)
     assert "1 files" in good("gc", "board", "--older-than-hours", "0", "--dry-run")
     with Store.open("board") as store:
-        assert store.has_object(digest)
+        assert store.objects.has(digest)
     good("gc", "board", "--older-than-hours", "0")
     with Store.open("board") as store:
-        assert not store.has_object(digest)
+        assert not store.objects.has(digest)
     good("score", "board")
     assert "Whole" in good("verify", "board")
 

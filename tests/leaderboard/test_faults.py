@@ -15,7 +15,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import METRICS, Estimate, Result
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
-from leaderboard.store import Store
+from leaderboard.store import Store, collect_garbage
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.store.made_up import made_up_result
 
@@ -38,7 +38,7 @@ class Killer(threading.Thread):
         last = SUBMISSIONS - 2 * SCORERS
         moments = sorted(self._random.sample(range(last), KILLS))
         for moment in moments:
-            while self._store.done() < moment and not self.over.is_set():
+            while self._store.queue.done() < moment and not self.over.is_set():
                 time.sleep(0.01)
             time.sleep(self._random.uniform(0.0, 0.2))
             while not self.over.is_set() and not self._kill_one():
@@ -87,13 +87,13 @@ def test_killed_scorers_lose_nothing_and_score_nothing_twice(tmp_path, key, caps
         subjects = [entry.subject for entry in store.log(0, 10**6) if entry.event == "result"]
         assert len(set(subjects)) == SUBMISSIONS
         assert {row.status for row in store.entries()} == {"scored"}
-        with store.turn() as index:
+        with store.transaction() as index:
             lived_through = list(index.derived_rows())
         store.reindex()
-        with store.turn() as index:
+        with store.transaction() as index:
             assert list(index.derived_rows()) == lived_through
             assert index.one("SELECT count(*) FROM lease") == (0,)
-        leftovers = store.gc(temporary_older_than=0).temporary
+        leftovers = collect_garbage(store, temporary_older_than=0).temporary
         assert leftovers <= KILLS
         report = verify(board)
         assert (report.results, report.unlogged) == (SUBMISSIONS, 0)
@@ -129,7 +129,7 @@ def test_a_board_of_a_thousand_entries_of_thirty_runs_is_read_fast(tmp_path, key
         timed("entry(id)", 99, lambda: store.entry(rows[500].id))
         timed("result(id)", 9, lambda: store.result(rows[500].id))
         timed("log(1900)", 3, lambda: store.log(1900, 100))
-        timed("quotas", 99, lambda: store.uploads(key.public, "2020-01-01T00:00:00Z"))
+        timed("quotas", 99, lambda: store.usage.uploaded_bytes(key.public, "2020-01-01T00:00:00Z"))
         timed("reindex", 1, store.reindex)
         assert store.entries() == rows
     with capsys.disabled():
@@ -143,7 +143,7 @@ def fill(board: Path, key: SigningKey, *, entries: int, instances: int) -> None:
     with (
         pytest.MonkeyPatch.context() as patch,
         tiny_board(board, instances=instances) as store,
-        store.turn(),
+        store.transaction(),
     ):
         patch.setattr(os, "fsync", lambda handle: None)
         first = put_submission(store, key).submission
@@ -152,9 +152,9 @@ def fill(board: Path, key: SigningKey, *, entries: int, instances: int) -> None:
             method = first.method.model_copy(update={"name": f"Method {number}"})
             if number > 0:
                 store.receive(first.model_copy(update={"method": method}).signed(key))
-            claim = store.claim("filler")
+            claim = store.queue.claim("filler")
             assert claim is not None
-            assert store.finish(claim, _shifted(result, claim.id, 0.0005 * number))
+            assert store.queue.finish(claim, _shifted(result, claim.id, 0.0005 * number))
 
 
 def _shifted(result: Result, id: str, by: float) -> Result:

@@ -131,7 +131,7 @@ def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKe
         put_submission(store, key, 2)
         signed, artefacts = tiny_submission(store, key, 3)
         put(store, key, artefacts)
-        first = store.submissions_of(key.public, ANY_TIME)[0]
+        first = store.usage.submission_times(key.public, ANY_TIME)[0]
         free = datetime.datetime.fromisoformat(first) + datetime.timedelta(days=1)
         with pytest.raises(Rejection, match=f"quota: .* after {utc(free)}") as caught:
             intake.receive(store, signed.to_bytes())
@@ -168,7 +168,7 @@ def test_a_bundle_brings_its_artefacts(tmp_path: Path, store: Store, key: Signin
         assert intake.submit_bundle(store, folder) == signed.id
     assert len(store.entries()) == 1
     for digest, data in artefacts.items():
-        assert store.object_bytes(digest) == data
+        assert store.objects.read(digest) == data
 
 
 def test_a_bundle_that_is_refused_leaves_nothing(

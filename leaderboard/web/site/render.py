@@ -31,7 +31,7 @@ from leaderboard.documents.submission import Run, SignedSubmission, Submission
 from leaderboard.errors import CODES
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
-from leaderboard.store.files import write as write_whole
+from leaderboard.store.files import write_file
 from leaderboard.web.site import charts
 from sme_registry.errors import MissingDependencyError, OptionError
 
@@ -530,7 +530,7 @@ def write_site(
     def write(path: str, content: bytes) -> None:
         target = out / path
         if not (target.is_file() and target.read_bytes() == content):
-            write_whole(target, content)
+            write_file(target, content)
 
     # Pages are made by this thread, which holds the store; the others wait for the disk.
     with ThreadPoolExecutor(_WRITERS) as pool:

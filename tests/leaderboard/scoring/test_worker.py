@@ -19,8 +19,7 @@ from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.score import score_submission
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer, run_scorers
-from leaderboard.store import Store
-from leaderboard.store.store import ATTEMPTS
+from leaderboard.store import ATTEMPTS, Store
 from sme_registry.errors import OptionError
 from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board
 
@@ -44,7 +43,7 @@ def test_a_scorer_scores_what_waits_and_returns(store, board):
     assert seen[-1] == (states, states)
     first = store.entries()[0]
     submission = store.submission(first.id).submission
-    anew = score_submission(store.document, submission, store.object_bytes)
+    anew = score_submission(store.document, submission, store.objects.read)
     assert store.result(first.id) == anew
 
 
@@ -109,7 +108,7 @@ def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monk
     def slow(*arguments):
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
-            held.append(store.claim("thief"))
+            held.append(store.queue.claim("thief"))
             threading.Event().wait(0.05)
         return real(*arguments)
 
@@ -124,7 +123,7 @@ def test_a_scorer_stops_when_it_is_told_to(store, submit):
     submit(2)
     answers = iter([False, True])
     assert run_scorer(store.folder.path, until_empty=False, stop=lambda: next(answers)) == 1
-    assert store.waiting() == 1
+    assert store.queue.waiting() == 1
 
 
 def test_several_processes_score_everything_once(store, board):
@@ -158,23 +157,23 @@ def test_processes_that_only_die_are_given_up(store, board, monkeypatch):
     monkeypatch.setattr(scorer, "_BARREN_DEATHS", 2)
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
-    assert store.waiting() == 3
+    assert store.queue.waiting() == 3
 
 
 def test_scorers_killed_over_a_reference_row_leave_it_to_be_scored(store, monkeypatch):
     references = intake.submit_references(store)
     for attempt in range(ATTEMPTS):
-        store.abandon(store.claim(f"killed {attempt}").worker)
+        store.queue.abandon(store.queue.claim(f"killed {attempt}").worker)
     monkeypatch.setattr(scorer, "_BARREN_DEATHS", 2)
 
     def kill_once_it_claims(pid):
-        while store.claimable() == store.waiting():
+        while store.queue.claimable() == store.queue.waiting():
             threading.Event().wait(0.01)
         os.kill(pid, signal.SIGKILL)
 
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(store.folder.path, 1, started=kill_once_it_claims)
-    assert store.waiting() == len(references)
+    assert store.queue.waiting() == len(references)
     assert run_scorers(store.folder.path, 1) == len(references)
     refuse_unpublishable(store.entries())
 
@@ -220,12 +219,12 @@ def test_ctrl_c_stops_all_processes_and_gives_their_claims_back(tmp_path, key, t
     pids = [int(process.stdout.readline()) for _ in range(2)]
     with Store.open(tmp_path / "board") as store:
         for number in range(4 if at_once else 400):
-            if store.done() > 0:
+            if store.queue.done() > 0:
                 break
-            if store.waiting() < 5:
+            if store.queue.waiting() < 5:
                 put_submission(store, key, number)
             threading.Event().wait(0.1)
-        assert at_once or store.done() > 0
+        assert at_once or store.queue.done() > 0
         if to_all:
             os.killpg(process.pid, signal.SIGINT)
         else:
@@ -236,7 +235,7 @@ def test_ctrl_c_stops_all_processes_and_gives_their_claims_back(tmp_path, key, t
         for pid in pids:
             with pytest.raises(ProcessLookupError):
                 os.kill(pid, 0)
-        assert store.claimable() == store.waiting()
+        assert store.queue.claimable() == store.queue.waiting()
 
 
 def test_scorers_end_when_who_started_them_is_killed(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.scoring.verify import verify
-from leaderboard.store import Store
+from leaderboard.store import Store, collect_garbage
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_submission,
@@ -43,8 +43,8 @@ def receive(board: Path, key: SigningKey) -> object:
 
 def finish(board: Path, key: SigningKey) -> object:
     with Store.open(board) as store:
-        while (claim := store.claim("worker", seconds=0)) is not None:
-            store.finish(claim, made_up_result(store, claim.id))
+        while (claim := store.queue.claim("worker", seconds=0)) is not None:
+            store.queue.finish(claim, made_up_result(store, claim.id))
         return True
 
 
@@ -96,7 +96,7 @@ def test_a_write_is_whole_or_absent_and_can_be_done_again(tmp_path, key, work: W
         assert state(board) == after, call
         verify(board)
         with Store.open(board) as store:
-            store.gc(temporary_older_than=0, objects_older_than=1e9)
+            collect_garbage(store, temporary_older_than=0, objects_older_than=1e9)
         assert [path.name for path in board.rglob(".*")] == []
         shutil.rmtree(board)
         if not crashed:

@@ -6,6 +6,8 @@ import time
 
 import pytest
 
+from leaderboard.store import collect_garbage
+
 HOUR, DAY = 3600.0, 86400.0
 
 
@@ -36,35 +38,35 @@ def litter(store, key, submit):
 
 def test_gc_removes_what_dead_processes_left_and_what_nobody_names(store, litter):
     old, young, named = litter
-    before = store.total_bytes()
-    garbage = store.gc()
+    before = store.usage.total_bytes()
+    garbage = collect_garbage(store)
     assert (garbage.temporary, garbage.objects) == (3, 1)
     assert garbage.files == 4
     assert garbage.bytes == 3 * len(b"half") + len(b"old, and of nobody")
-    assert not store.has_object(old)
-    assert store.has_object(young)
-    assert store.has_object(named)
+    assert not store.objects.has(old)
+    assert store.objects.has(young)
+    assert store.objects.has(named)
     assert [path.name for path in store.folder.path.rglob(".*.tmp")] == [".alive.12345678.tmp"]
-    assert store.total_bytes() == before - len(b"old, and of nobody")
-    assert store.gc().files == 0
+    assert store.usage.total_bytes() == before - len(b"old, and of nobody")
+    assert collect_garbage(store).files == 0
 
 
 def test_a_dry_run_counts_the_same_and_removes_nothing(store, litter):
     before = sorted(path for path in store.folder.path.rglob("*"))
-    counted = store.gc(dry_run=True)
+    counted = collect_garbage(store, dry_run=True)
     assert sorted(path for path in store.folder.path.rglob("*")) == before
-    assert counted == store.gc()
+    assert counted == collect_garbage(store)
 
 
 def test_an_object_that_is_brought_again_is_young_again(store, key, litter):
     old, _, _ = litter
     assert put(store, key, b"old, and of nobody") == old
-    assert store.gc().objects == 0
-    assert store.has_object(old)
+    assert collect_garbage(store).objects == 0
+    assert store.objects.has(old)
 
 
 def test_ages_are_arguments(store, litter):
-    garbage = store.gc(temporary_older_than=0, objects_older_than=0)
+    garbage = collect_garbage(store, temporary_older_than=0, objects_older_than=0)
     assert (garbage.temporary, garbage.objects) == (4, 2)
 
 
@@ -74,8 +76,8 @@ def test_gc_leaves_an_upload_in_flight_alone(store, key):
 
     def slow():
         yield data[:10]
-        assert store.gc(objects_older_than=0).files == 0
+        assert collect_garbage(store, objects_older_than=0).files == 0
         yield data[10:]
 
     assert store.put_object(digest, slow(), by=key.public)
-    assert store.object_bytes(digest) == data
+    assert store.objects.read(digest) == data

@@ -16,7 +16,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.score import result_of
-from leaderboard.store import Index, Store
+from leaderboard.store import Index, Store, collect_garbage
 from sme_registry.errors import UnknownNameError
 from tests.leaderboard.conftest import (
     put_submission,
@@ -32,11 +32,11 @@ def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
     """Submissions of every status; a waiting one only where asked for."""
     signed = [put_submission(store, key, number) for number in range(4)]
     for number in range(3):
-        claim = store.claim("worker")
+        claim = store.queue.claim("worker")
         assert claim is not None
         assert claim.id == signed[number].id
         code = "onnx_op" if number == 1 else ""
-        assert store.finish(claim, made_up_result(store, claim.id, code=code))
+        assert store.queue.finish(claim, made_up_result(store, claim.id, code=code))
     store.withdraw(signed_withdrawal(signed[2].id, key))
     if not waiting:
         store.withdraw(signed_withdrawal(signed[3].id, key))
@@ -66,7 +66,7 @@ def dump(path: Path) -> list[str]:
 
 
 def derived(store: Store) -> list[object]:
-    with store.turn() as index:
+    with store.transaction() as index:
         return list(index.derived_rows())
 
 
@@ -111,8 +111,8 @@ def test_an_entry_row_says_what_board_and_ranking_need(store, key):
         if row.scores is not None:
             assert row.scores == result.scores
         assert (store.withdrawal(row.id) is not None) == (row.status == "withdrawn")
-    assert store.waiting() == 1
-    assert store.done() == 3
+    assert store.queue.waiting() == 1
+    assert store.queue.done() == 3
 
 
 def test_rows_of_the_boards_own_key_are_reference_rows(store, key):
@@ -139,7 +139,7 @@ def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, sub
     assert store.withdraw(signed_withdrawal(signed.id, key))
     assert not store.withdraw(signed_withdrawal(signed.id, key))
     assert store.entry(signed.id).status == "withdrawn"
-    assert store.waiting() == 0
+    assert store.queue.waiting() == 0
 
 
 def test_what_is_unknown_is_said_to_be_unknown(store, key):
@@ -158,8 +158,8 @@ def test_submissions_are_counted_by_key_and_time(store, key, submit):
     put_submission(store, SigningKey.generate(), 3)
     now = datetime.datetime.now(datetime.UTC)
     day = datetime.timedelta(days=1)
-    assert len(store.submissions_of(key.public, utc(now - day))) == 2
-    assert store.submissions_of(key.public, utc(now + day)) == []
+    assert len(store.usage.submission_times(key.public, utc(now - day))) == 2
+    assert store.usage.submission_times(key.public, utc(now + day)) == []
 
 
 @pytest.mark.parametrize("harm", ["missing", "empty", "noise", "torn", "schema", "another board"])
@@ -211,7 +211,7 @@ def test_an_index_that_lies_about_its_place_is_made_anew(tmp_path, key):
         for number in range(3):
             put_submission(store, key, number)
         expected, second = derived(store), store.log(2, 1)[0]
-        with store.turn() as index:
+        with store.transaction() as index:
             index.connection.execute("UPDATE head SET sequence = ?, digest = ?", (2, second.digest))
     for read_only in (True, False):
         with Store.open(tmp_path / "board", read_only=read_only) as store:
@@ -250,9 +250,9 @@ def test_read_only_opening_writes_nothing(tmp_path, key):
         for refused in (
             lambda: store.put_object("sha256:" + "0" * 64, [b""], by=key.public),
             lambda: put_submission(store, key, 9),
-            lambda: store.claim("worker"),
+            lambda: store.queue.claim("worker"),
             store.reindex,
-            store.gc,
+            lambda: collect_garbage(store),
         ):
             with pytest.raises(BoardError, match="read-only"):
                 refused()
@@ -291,7 +291,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
         with Store.open(board, read_only=True) as read:
             assert len(read.entries()) == (5 if killed else 4)
             assert read.result(read.entries()[0].id) is not None
-            with read._reading() as index:
+            with read._database.reading() as index:
                 assert list(index.derived_rows()) == expected
         with pytest.raises(BoardError):
             Store.open(board)
@@ -336,7 +336,7 @@ def test_processes_take_turns(tmp_path, key, deleted):
 
 
 def test_a_turn_nests(store, key):
-    with store.turn() as outer, store.turn() as inner:
+    with store.transaction() as outer, store.transaction() as inner:
         assert isinstance(inner, Index)
         assert inner is outer
         put_submission(store, key)
@@ -346,7 +346,7 @@ def test_a_turn_nests(store, key):
 
 def test_a_turn_that_fails_after_the_log_entry_loses_nothing(store, key):
     def fails() -> None:
-        with store.turn():
+        with store.transaction():
             put_submission(store, key)
             raise ZeroDivisionError
 
@@ -360,12 +360,12 @@ def test_a_turn_that_fails_after_the_log_entry_loses_nothing(store, key):
 def test_a_new_board_goes_only_into_a_new_folder(tmp_path):
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").write_text("mine")
-    with pytest.raises(BoardError, match="no board can be made here"):
+    with pytest.raises(BoardError, match="cannot create a board here"):
         tiny_board(tmp_path / "taken")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
     tiny_board(tmp_path / "board").close()
     before = (tmp_path / "board" / "board.json").read_bytes()
-    with pytest.raises(BoardError, match="no board can be made here"):
+    with pytest.raises(BoardError, match="cannot create a board here"):
         tiny_board(tmp_path / "board")
     assert (tmp_path / "board" / "board.json").read_bytes() == before
 
@@ -377,7 +377,7 @@ def test_a_suite_with_teams_makes_no_board(tmp_path):
     team = sme_registry.load("SME/Team2-v1").to_dict()
     del team["seed"]
     suite = Suite.from_dict({"classes": [{"name": "Team", "setting": team, "seeds": [0]}]})
-    with pytest.raises(BoardError, match="single agents"):
+    with pytest.raises(BoardError, match="single-agent"):
         Store.create(
             tmp_path / "board",
             title="Teams",

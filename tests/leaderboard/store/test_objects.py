@@ -28,8 +28,8 @@ def test_an_object_is_new_once_and_comes_back_as_it_was(store):
     pieces = [data[start : start + 4096] for start in range(0, len(data), 4096)]
     assert store.put_object(digest(data), pieces, by=KEY)
     assert not store.put_object(digest(data), pieces, by=KEY)
-    assert store.has_object(digest(data))
-    assert store.object_bytes(digest(data)) == data
+    assert store.objects.has(digest(data))
+    assert store.objects.read(digest(data)) == data
     assert stat.S_IMODE(store.folder.object(digest(data)).stat().st_mode) == 0o644
 
 
@@ -71,31 +71,31 @@ def test_altered_bytes_are_not_handed_out(store):
     store.put_object(digest(b"policy"), [b"policy"], by=KEY)
     store.folder.object(digest(b"policy")).write_bytes(b"Policy")
     with pytest.raises(TamperedError, match="objects/"):
-        store.object_bytes(digest(b"policy"))
+        store.objects.read(digest(b"policy"))
 
 
 def test_a_missing_object_is_said_to_be_missing(store):
     with pytest.raises(BoardError, match="cannot be read"):
-        store.object_bytes(digest(b"never seen"))
+        store.objects.read(digest(b"never seen"))
 
 
 def test_a_path_is_no_digest(store):
     for name in ("../../board.key", "sha256:../board.key", "sha256:" + "A" * 64):
         with pytest.raises(ValueError, match="not a digest"):
-            store.has_object(name)
+            store.objects.has(name)
 
 
 def test_bytes_count_for_who_brought_them_until_and_after_they_are_submitted(store, key, submit):
     since = "2000-01-01T00:00:00Z"
     store.put_object(digest(b"12345"), [b"12345"], by=key.public)
-    assert store.uploads(key.public, since) == store.total_bytes() == 5
+    assert store.usage.uploaded_bytes(key.public, since) == store.usage.total_bytes() == 5
     signed = submit()
     size = 5 + signed.submission.runs[0].artefact.size
-    assert store.uploads(key.public, since) == store.total_bytes() == size
-    assert store.uploads(key.public, "2999-01-01T00:00:00Z") == 0
-    assert store.uploads(KEY, since) == 0
+    assert store.usage.uploaded_bytes(key.public, since) == store.usage.total_bytes() == size
+    assert store.usage.uploaded_bytes(key.public, "2999-01-01T00:00:00Z") == 0
+    assert store.usage.uploaded_bytes(KEY, since) == 0
     store.reindex()  # who brought what nobody submitted is forgotten, but not its size
-    assert store.total_bytes() == size
+    assert store.usage.total_bytes() == size
 
 
 def test_many_threads_bring_the_same_object_once(store):
@@ -113,4 +113,4 @@ def test_many_threads_bring_the_same_object_once(store):
     assert len(new) == 8
     assert any(new)
     assert files(store) == [store.folder.object(digest(data)).name]
-    assert store.total_bytes() == len(data)
+    assert store.usage.total_bytes() == len(data)

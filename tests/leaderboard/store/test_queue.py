@@ -5,169 +5,168 @@ import time
 import pytest
 
 from leaderboard import intake
-from leaderboard.store import Store
-from leaderboard.store.store import ATTEMPTS
+from leaderboard.store import ATTEMPTS, Store
 from tests.leaderboard.conftest import signed_withdrawal
 from tests.leaderboard.store.made_up import made_up_result
 
 
 def test_the_oldest_is_claimed_first_and_by_one_worker_only(store, submit):
     ids = [submit(number).id for number in range(3)]
-    assert store.claimable() == 3
-    claims = [store.claim(worker) for worker in ("a", "b", "c", "d")]
+    assert store.queue.claimable() == 3
+    claims = [store.queue.claim(worker) for worker in ("a", "b", "c", "d")]
     assert [claim and claim.id for claim in claims] == [*ids, None]
-    assert store.claimable() == 0
-    assert store.waiting() == 3
+    assert store.queue.claimable() == 0
+    assert store.queue.waiting() == 3
 
 
 def test_a_claim_that_ran_out_is_claimed_again_and_the_late_result_refused(store, submit):
     submit()
-    late = store.claim("late", seconds=0)
-    second = store.claim("second")
+    late = store.queue.claim("late", seconds=0)
+    second = store.queue.claim("second")
     assert (late.attempt, second.attempt) == (1, 2)
-    assert not store.heartbeat(late)
-    assert not store.finish(late, made_up_result(store, late.id, level=0.1))
+    assert not store.queue.heartbeat(late)
+    assert not store.queue.finish(late, made_up_result(store, late.id, level=0.1))
     assert store.result(late.id) is None
-    assert store.finish(second, made_up_result(store, second.id, level=0.2))
+    assert store.queue.finish(second, made_up_result(store, second.id, level=0.2))
     assert store.entry(second.id).scores.wd_regret.value == pytest.approx(0.2)
-    assert not store.finish(second, made_up_result(store, second.id, level=0.3))
-    assert not store.finish(late, made_up_result(store, late.id, level=0.3))
+    assert not store.queue.finish(second, made_up_result(store, second.id, level=0.3))
+    assert not store.queue.finish(late, made_up_result(store, late.id, level=0.3))
     assert [entry.event for entry in store.log()] == ["opened", "received", "result"]
 
 
 def test_a_worker_whose_claim_ran_out_may_still_finish_where_nobody_else_came(store, submit):
     submit()
-    claim = store.claim("slow", seconds=0)
-    assert store.finish(claim, made_up_result(store, claim.id))
+    claim = store.queue.claim("slow", seconds=0)
+    assert store.queue.finish(claim, made_up_result(store, claim.id))
 
 
 def test_the_same_worker_claiming_again_is_another_attempt(store, submit):
     submit()
-    first = store.claim("worker", seconds=0)
-    second = store.claim("worker")
+    first = store.queue.claim("worker", seconds=0)
+    second = store.queue.claim("worker")
     assert first.worker == second.worker
-    assert not store.finish(first, made_up_result(store, first.id))
-    assert store.finish(second, made_up_result(store, second.id))
+    assert not store.queue.finish(first, made_up_result(store, first.id))
+    assert store.queue.finish(second, made_up_result(store, second.id))
 
 
 def test_a_heartbeat_renews_a_claim(store, submit, monkeypatch):
     at = 1000.0
-    monkeypatch.setattr("leaderboard.store.store._running_time", lambda: ("boot", at))
+    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", at))
     submit()
-    claim = store.claim("worker", seconds=10)
+    claim = store.queue.claim("worker", seconds=10)
     at = 1009.0
-    assert store.claim("other") is None
-    assert store.heartbeat(claim)
+    assert store.queue.claim("other") is None
+    assert store.queue.heartbeat(claim)
     at = 1018.0
-    assert store.claim("other") is None
+    assert store.queue.claim("other") is None
     at = 1019.0
-    assert store.claim("other").attempt == 2
-    assert not store.heartbeat(claim)
+    assert store.queue.claim("other").attempt == 2
+    assert not store.queue.heartbeat(claim)
 
 
 def test_a_claim_does_not_survive_the_machine(store, submit, monkeypatch):
     submit()
-    monkeypatch.setattr("leaderboard.store.store._running_time", lambda: ("boot one", 1e6))
-    store.claim("worker", seconds=1e6)
-    monkeypatch.setattr("leaderboard.store.store._running_time", lambda: ("boot two", 5.0))
-    assert store.claim("other").attempt == 2
+    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot one", 1e6))
+    store.queue.claim("worker", seconds=1e6)
+    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot two", 5.0))
+    assert store.queue.claim("other").attempt == 2
 
 
 @pytest.mark.parametrize("days", [-400, 400])
 def test_setting_the_clock_moves_no_claim(store, submit, monkeypatch, days):
     submit(0)
     submit(1)
-    held = store.claim("worker", seconds=60)
+    held = store.queue.claim("worker", seconds=60)
     shifted = time.time() + days * 86400
     monkeypatch.setattr(time, "time", lambda: shifted)
     monkeypatch.setattr("leaderboard.store.log.now", lambda: "2020-01-01T00:00:00Z")
-    assert store.claim("other").id != held.id
-    assert store.claim("third") is None
-    assert store.heartbeat(held)
-    assert store.finish(held, made_up_result(store, held.id))
+    assert store.queue.claim("other").id != held.id
+    assert store.queue.claim("third") is None
+    assert store.queue.heartbeat(held)
+    assert store.queue.finish(held, made_up_result(store, held.id))
 
 
 def test_what_is_given_back_does_not_count_as_lost(store, submit):
     submit()
     for _ in range(ATTEMPTS + 2):
-        store.release(store.claim("worker"))
-    assert store.claim("worker").attempt == ATTEMPTS + 3
+        store.queue.release(store.queue.claim("worker"))
+    assert store.queue.claim("worker").attempt == ATTEMPTS + 3
 
 
 def test_a_submission_that_lost_every_attempt_is_rejected(store, submit):
     lost, next_one = submit(0), submit(1)
     for attempt in range(1, ATTEMPTS + 1):
-        claim = store.claim(f"worker {attempt}")
+        claim = store.queue.claim(f"worker {attempt}")
         assert (claim.id, claim.attempt) == (lost.id, attempt)
-        store.abandon(claim.worker)
-    assert store.claim("worker").id == next_one.id
+        store.queue.abandon(claim.worker)
+    assert store.queue.claim("worker").id == next_one.id
     assert store.entry(lost.id).status == "rejected"
     assert store.entry(lost.id).code == "scoring_failed"
     assert store.result(lost.id).code == "scoring_failed"
-    assert store.given_up() == 1
+    assert store.queue.failed() == 1
 
 
 def test_a_reference_row_is_never_given_up(store, submit):
     references = intake.submit_references(store)
     other = submit()
     for attempt in range(1, ATTEMPTS + 3):
-        claim = store.claim(f"worker {attempt}")
+        claim = store.queue.claim(f"worker {attempt}")
         assert (claim.id, claim.attempt) == (references[0], attempt)
-        store.abandon(claim.worker)
-    assert store.given_up() == 0
+        store.queue.abandon(claim.worker)
+    assert store.queue.failed() == 0
     for id in (*references, other.id):
-        claim = store.claim("whole")
+        claim = store.queue.claim("whole")
         assert claim.id == id
-        assert store.finish(claim, made_up_result(store, id))
+        assert store.queue.finish(claim, made_up_result(store, id))
 
 
 def test_a_reference_row_that_was_given_up_once_stays_so_in_the_log(store):
     """As scorers did before: such a board is still read, and its log followed."""
     first, second = intake.submit_references(store)
-    claim = store.claim("worker")
-    assert store.finish(claim, store._given_up(first))
+    claim = store.queue.claim("worker")
+    assert store.queue.finish(claim, store.queue._scoring_failed(first))
     store.reindex()
     assert store.entry(first).code == "scoring_failed"
-    assert store.claim("worker").id == second
+    assert store.queue.claim("worker").id == second
 
 
 def test_what_is_withdrawn_while_it_is_scored_gets_no_result(store, key, submit):
     signed = submit()
-    claim = store.claim("worker")
+    claim = store.queue.claim("worker")
     store.withdraw(signed_withdrawal(signed.id, key))
-    assert not store.heartbeat(claim)
-    assert not store.finish(claim, made_up_result(store, claim.id))
+    assert not store.queue.heartbeat(claim)
+    assert not store.queue.finish(claim, made_up_result(store, claim.id))
     assert store.result(signed.id) is None
-    assert store.claim("worker") is None
+    assert store.queue.claim("worker") is None
 
 
 def test_a_claim_made_before_reindexing_is_no_longer_current(store, submit):
     submit()
-    claim = store.claim("worker")
+    claim = store.queue.claim("worker")
     store.reindex()
-    assert not store.finish(claim, made_up_result(store, claim.id))
-    again = store.claim("another")
-    assert not store.finish(claim, made_up_result(store, claim.id))
-    assert store.finish(again, made_up_result(store, again.id))
+    assert not store.queue.finish(claim, made_up_result(store, claim.id))
+    again = store.queue.claim("another")
+    assert not store.queue.finish(claim, made_up_result(store, claim.id))
+    assert store.queue.finish(again, made_up_result(store, again.id))
 
 
 def test_a_result_of_another_submission_or_protocol_is_refused(store, submit):
     one, other = submit(0), submit(1)
-    claim = store.claim("worker")
+    claim = store.queue.claim("worker")
     assert claim.id == one.id
     with pytest.raises(ValueError, match="a result of"):
-        store.finish(claim, made_up_result(store, other.id))
+        store.queue.finish(claim, made_up_result(store, other.id))
     foreign = made_up_result(store, one.id, code="onnx_op").model_copy(
         update={"protocol": "sha256:" + "0" * 64}
     )
     with pytest.raises(ValueError, match="a result of"):
-        store.finish(claim, foreign)
+        store.queue.finish(claim, foreign)
 
 
 def test_claims_are_seen_by_every_store_of_the_board(store, submit):
     submit()
     with Store.open(store.folder.path) as other:
-        claim = store.claim("worker")
-        assert other.claim("other") is None
-        assert other.finish(claim, made_up_result(other, claim.id))
+        claim = store.queue.claim("worker")
+        assert other.queue.claim("other") is None
+        assert other.queue.finish(claim, made_up_result(other, claim.id))
         assert store.entries()[0].status == "scored"

@@ -345,8 +345,8 @@ def test_an_artefact_goes_in_once_and_comes_out_as_it_was(
     assert put(url, key, data).status_code == 200
     assert HTTP.head(path).status_code == 200
     assert HTTP.get(path).content == data
-    assert store.object_bytes(sha256(data)) == data
-    assert store.uploads(key.public, "2000-01-01T00:00:00Z") == len(data)
+    assert store.objects.read(sha256(data)) == data
+    assert store.usage.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
 
 
 def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
@@ -442,7 +442,7 @@ def test_a_length_that_lies_leaves_nothing_behind(url: str, store: Store, key: S
             connection.shutdown(socket.SHUT_WR)
             answer = connection.recv(2**16)
         assert answer.startswith(b"HTTP/1.1 4") or answer == b""
-    assert not store.has_object(sha256(data))
+    assert not store.objects.has(sha256(data))
     assert files_of(store) == before
 
 
@@ -674,7 +674,7 @@ def test_submissions_of_a_key_have_a_quota_that_says_when(tmp_path: Path, key: S
         with serving(store.folder.path) as url:
             answer = post(url, uploaded(url, store, key, 3).to_bytes())
             assert refusal(answer) == (429, "quota")
-            received = store.submissions_of(key.public, "2000-01-01T00:00:00Z")[0]
+            received = store.usage.submission_times(key.public, "2000-01-01T00:00:00Z")[0]
             tomorrow = datetime.datetime.fromisoformat(received) + datetime.timedelta(days=1)
             assert f"after {utc(tomorrow)}" in answer.json()["message"]
             other = SigningKey.generate()
@@ -758,7 +758,7 @@ def test_serve_scores_beside_and_stops_cleanly(
         intake.submit_references(store)
         with serving_process(store.folder.path, workers=1) as (url, process):
             deadline = time.monotonic() + 60
-            while store.waiting() and time.monotonic() < deadline:
+            while store.queue.waiting() and time.monotonic() < deadline:
                 assert process.poll() is None
                 time.sleep(0.05)
             assert HTTP.get(url).status_code == 200

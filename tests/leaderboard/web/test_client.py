@@ -92,7 +92,7 @@ def test_a_bundle_arrives_whole_and_once(
     assert [entry.id for entry in store.entries()] == [signed.id]
     for run in signed.submission.runs:
         assert run.artefact is not None
-        assert store.has_object(run.artefact.sha256)
+        assert store.objects.has(run.artefact.sha256)
 
 
 def test_the_status_is_that_of_the_board(

@@ -119,7 +119,7 @@ def submit(
     store.receive(signed)
     if profile is None and rejected is None:
         return signed.id
-    claim = store.claim("synthetic")
+    claim = store.queue.claim("synthetic")
     assert claim is not None
     assert claim.id == signed.id
     common = {
@@ -132,7 +132,7 @@ def submit(
     else:
         assert profile is not None
         result = _result(document, submission, profile, spread, missing, common, oracle_like)
-    assert store.finish(claim, result)
+    assert store.queue.finish(claim, result)
     return signed.id
 
 

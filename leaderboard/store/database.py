@@ -1,0 +1,303 @@
+"""`Database`: a board's signed log and its SQLite index in step, for many processes and threads.
+
+A write holds the board's lock and writes the document's file, then the log entry, then the index's
+rows. A process that dies before the log entry has changed nothing. If it dies after it, the next
+process adds the entry to the index.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from leaderboard.documents.board import BoardDocument, Folder
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import utc
+from leaderboard.errors import BoardError, TamperedError
+from leaderboard.store.files import digest_of, sync_folder, unwritable, write_document
+from leaderboard.store.index import Index, IndexUnusable
+from leaderboard.store.lock import FolderLock
+from leaderboard.store.log import EMPTY, Event, Head, Log
+from leaderboard.store.objects import Objects
+from sme_registry.io import temporary_beside
+from sme_registry.spec import StrictModel
+
+
+class Database:
+    """The log and its index.
+
+    Args:
+      folder, document: the board's.
+      objects: the board's artefacts; a rebuilt index counts those that no submission names.
+      read_only: write nothing, not even the index, which is then held in memory.
+    """
+
+    def __init__(
+        self, folder: Folder, document: BoardDocument, objects: Objects, *, read_only: bool
+    ) -> None:
+        self.folder = folder
+        self.document = document
+        self.read_only = read_only
+        self.log = Log(folder, document.key)
+        self._objects = objects
+        self._thread_lock = threading.RLock()
+        self._in_transaction = False
+        self._key: SigningKey | None = None
+        self._index: Index | None = None
+        self._inode = (0, 0)
+        if not self.log.has(0):
+            raise TamperedError("log/00000000.json", "is missing; every log starts with it")
+        self._lock = FolderLock(folder.log)
+
+    def open(self, *, reindex: bool) -> None:
+        """Connect to the index and bring it up to date; rebuild it if it is unusable.
+
+        Args:
+          reindex: rebuild the index and ignore what the old one recorded of the log.
+
+        Raises:
+          BoardError: the index cannot be written.
+          TamperedError: log, documents and index disagree; names the first altered row.
+        """
+        if not self.read_only and not os.access(self.folder.path, os.W_OK):
+            raise BoardError(
+                f"{self.folder.path}: is not writable. Get write permission, or open the board "
+                "read-only."
+            )
+        with self.locked():
+            self._connect(rebuild=reindex)
+        try:
+            self._refresh()
+        except TamperedError:  # passes with a rebuilt index if only the index was altered
+            with self.locked():
+                self._connect(rebuild=True)
+            self._refresh()
+
+    def close(self) -> None:
+        """Close the index and the lock; closing twice does nothing."""
+        with self._thread_lock:
+            if self._index is not None:
+                # Closing the last connection moves SQLite's write-ahead log into the database.
+                with self.locked():
+                    self._index.close()
+                self._index = None
+            self._lock.close()
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Block all writers for a short while; a writable store also blocks all readers."""
+        with self._thread_lock, self._lock.hold(exclusive=not self.read_only):
+            yield
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[Index]:
+        """Write to the board while every other process and thread waits. Nests.
+
+        Yields:
+          The index, up to date.
+
+        Raises:
+          BoardError: the board is read-only, locked for a minute by another process, or SQLite
+            fails.
+        """
+        self.refuse_read_only()
+        with self._thread_lock:
+            if self._in_transaction:
+                yield self._connected
+                return
+            with self._lock.hold(exclusive=True), self._explained():
+                if self._replaced():
+                    self._connect()
+                index = self._connected
+                with index.transaction():
+                    self._catch_up(index)
+                    self._in_transaction = True
+                    try:
+                        yield index
+                    finally:
+                        self._in_transaction = False
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[Index]:
+        """Read the index, brought up to date with what other processes have written."""
+        with self._thread_lock, self._explained():
+            if not self._in_transaction:
+                self._refresh()
+            yield self._connected
+
+    def record(self, event: Event, subject: str, path: Path, document: StrictModel) -> None:
+        """Write a document's file, its log entry and its rows; call it in a transaction."""
+        key = self.signing_key()
+        index = self._connected
+        write_document(path, document)
+        index.apply(self.log.append(key, index.head, event, subject, digest_of(document)))
+
+    def signing_key(self) -> SigningKey:
+        """The board's key.
+
+        Raises:
+          BoardError: the key's file is missing or holds another board's key.
+        """
+        if self._key is None:
+            if not self.folder.key.exists():
+                raise BoardError(
+                    f"{self.folder.path}: cannot accept anything without the board's key, "
+                    f"{self.folder.key.name}. Copy it from the original board, or create your own "
+                    "board with `sme-leaderboard init`."
+                )
+            key = self.folder.signing_key()
+            if key.public != self.document.key:
+                raise BoardError(
+                    f"{self.folder.key}: is not the key in board.json, "
+                    f"{self.document.key[:16]}…. Restore that key."
+                )
+            self._key = key
+        return self._key
+
+    def refuse_read_only(self) -> None:
+        """Raise `BoardError` if the board was opened read-only."""
+        if self.read_only:
+            raise BoardError(f"{self.folder.path}: opened read-only. Open it for writing.")
+
+    def rebuild(self) -> None:
+        """Rebuild the index from the log and the documents, whatever its state.
+
+        Raises:
+          TamperedError: log and documents disagree.
+          BoardError: the index cannot be written.
+        """
+        self.refuse_read_only()
+        with self.locked():
+            self._rebuild()
+
+    @property
+    def _connected(self) -> Index:
+        if self._index is None:
+            raise BoardError(f"{self.folder.path}: the store is closed. Open it again.")
+        return self._index
+
+    def _refresh(self) -> None:
+        """Apply what other processes have logged; two file-system calls show whether they have."""
+        index = self._connected
+        if self.read_only:
+            self._catch_up(index)
+        elif self._replaced() or self.log.has(index.head.sequence + 1):
+            with self.transaction():
+                pass
+
+    def _catch_up(self, index: Index) -> None:
+        head = index.head
+        while self.log.has(head.sequence + 1):
+            entry = self.log.read_after(head)
+            index.apply(entry)
+            head = entry.head
+
+    def _connect(self, *, rebuild: bool = False) -> None:
+        """Connect to the index, rebuilt if necessary, while the board is locked.
+
+        Locked, because a connection to a database that is being replaced could read the other
+        database's write-ahead log.
+        """
+        previous, self._index = self._index, None
+        if previous is not None:
+            previous.close()
+        connect = Index.snapshot if self.read_only else Index.open
+        if not rebuild:
+            with contextlib.suppress(IndexUnusable):
+                self._index = connect(self.folder.index, self.folder, self.document)
+        if self._index is not None:
+            self._inode = _inode(self.folder.index)
+            self._refuse_lost_log(self._index.head)
+        elif self.read_only:
+            self._index = Index.empty(None, self.folder, self.document)
+        else:
+            self._rebuild()
+
+    def _refuse_lost_log(self, head: Head) -> None:
+        """Check that the log still has the index's last entry; an index is never ahead of it."""
+        if head == EMPTY:
+            return
+        where = f"log/{head.sequence:08d}.json"
+        remedy = "Restore the log, or accept the present one with `sme-leaderboard reindex`"
+        if not self.log.has(head.sequence):
+            raise TamperedError(where, f"is missing, but the index recorded it. {remedy}")
+        if self.log.read(head.sequence).digest != head.digest:
+            raise TamperedError(where, f"differs from the entry that the index recorded. {remedy}")
+
+    def _rebuild(self) -> None:
+        """Build a new index and put it in the old one's place, while the board is locked."""
+        path = self.folder.index
+        with self._explained():
+            self._build(path)
+        try:
+            self._index = Index.open(path, self.folder, self.document)
+        except IndexUnusable as error:
+            raise BoardError(
+                f"{path}: {error}, although it was just built. Find the process that removes it, "
+                "then try again."
+            ) from None
+        self._inode = _inode(path)
+
+    def _build(self, path: Path) -> None:
+        temporary = temporary_beside(path)
+        try:
+            index = Index.empty(temporary, self.folder, self.document)
+            try:
+                with index.transaction():
+                    self._catch_up(index)
+                    self._add_uploads(index)
+                index.connection.execute("PRAGMA journal_mode = WAL")
+            finally:
+                index.close()
+            os.chmod(temporary, 0o644)
+            if self._index is not None:
+                self._index.close()
+                self._index = None
+            # In this order: no database may ever lie next to another one's write-ahead log.
+            for suffix in ("", "-wal", "-shm"):
+                path.with_name(path.name + suffix).unlink(missing_ok=True)
+            os.replace(temporary, path)
+            sync_folder(path.parent)
+        except OSError as error:
+            raise unwritable(path, error) from error
+        finally:
+            for suffix in ("", "-journal", "-wal", "-shm"):
+                with contextlib.suppress(OSError):  # does not exist, or the disk is read-only
+                    temporary.with_name(temporary.name + suffix).unlink()
+
+    def _add_uploads(self, index: Index) -> None:
+        """Count the artefacts that no submission names; who uploaded them is no longer known."""
+        for digest, path in self._objects.paths():
+            if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
+                stat = path.stat()
+                uploaded = utc(datetime.datetime.fromtimestamp(stat.st_mtime, datetime.UTC))
+                index.connection.execute(
+                    "INSERT INTO upload VALUES (?, ?, '', ?)", (digest, stat.st_size, uploaded)
+                )
+
+    def _replaced(self) -> bool:
+        """Whether the index's file was deleted, or replaced by another process."""
+        return _inode(self.folder.index) != self._inode
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise BoardError(
+                f"{self.folder.index}: {error}. Free disk space or get write permission; "
+                "otherwise delete this file, which is then rebuilt from the log."
+            ) from error
+
+
+def _inode(path: Path) -> tuple[int, int]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return (0, 0)
+    return stat.st_dev, stat.st_ino

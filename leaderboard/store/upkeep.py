@@ -1,0 +1,95 @@
+"""Removal of files that dead processes and missing submissions leave behind."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from leaderboard.store.files import unwritable
+from sme_registry.io import TEMPORARY
+
+if TYPE_CHECKING:
+    from leaderboard.store.store import Store
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """What `collect_garbage` removed, or would remove.
+
+    Attributes:
+      temporary: number of half-written files of dead processes.
+      objects: number of artefacts that no submission names.
+      bytes: of all of them.
+    """
+
+    temporary: int
+    objects: int
+    bytes: int
+
+    @property
+    def files(self) -> int:
+        """Number of files of both kinds."""
+        return self.temporary + self.objects
+
+
+def collect_garbage(
+    store: Store,
+    *,
+    temporary_older_than: float = 3600.0,
+    objects_older_than: float = 86400.0,
+    dry_run: bool = False,
+) -> Garbage:
+    """Remove half-written files of dead processes and artefacts that no submission names.
+
+    Args:
+      store: the board's.
+      temporary_older_than: seconds since a temporary file was last written to; a younger one may
+        belong to an upload in progress.
+      objects_older_than: seconds since an artefact was uploaded; the submission of a younger one
+        may follow.
+      dry_run: only count.
+
+    Raises:
+      BoardError: a file cannot be removed.
+    """
+    now = time.time()
+
+    def is_older(path: Path, seconds: float) -> bool:
+        return path.stat().st_mtime <= now - seconds
+
+    with store.transaction() as index:
+        temporary = [
+            path
+            for path in store.folder.path.rglob(TEMPORARY)
+            if path.is_file() and is_older(path, temporary_older_than)
+        ]
+        objects = {
+            digest: path
+            for digest, path in store.objects.paths()
+            if is_older(path, objects_older_than)
+            and index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None
+        }
+        paths = [*temporary, *objects.values()]
+        size = sum(path.stat().st_size for path in paths)
+        if not dry_run:
+            for path in paths:
+                try:
+                    path.unlink()
+                except OSError as error:
+                    raise unwritable(path, error) from error
+            for digest in objects:
+                index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
+    return Garbage(len(temporary), len(objects), size)
+
+
+def remove_unlogged_results(store: Store) -> None:
+    """Remove results of scorers that died before they logged them."""
+    if not store.folder.results.is_dir():
+        return
+    with store.transaction() as index:
+        for path in store.folder.results.glob("[!.]*.json"):
+            id = f"sha256:{path.stem}"
+            if not index.one("SELECT 1 FROM entry WHERE id = ? AND result IS NOT NULL", id):
+                path.unlink()
