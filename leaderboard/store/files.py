@@ -38,7 +38,7 @@ def durable_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
         with io.atomic_file(path, new=new) as stream:
             os.fchmod(stream.fileno(), 0o644)
             yield stream
-        sync_folder(path.parent)
+        io.sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
 
@@ -53,16 +53,7 @@ def make_folder(path: Path) -> None:
     """Create a folder, if it does not exist, so that it survives a loss of power."""
     if not path.is_dir():
         path.mkdir(parents=True, exist_ok=True)
-        sync_folder(path.parent)
-
-
-def sync_folder(path: Path) -> None:
-    """Make the names in a folder durable."""
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        io.sync_folder(path.parent)
 
 
 def unwritable(path: Path, error: OSError) -> BoardError:

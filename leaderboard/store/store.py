@@ -21,7 +21,6 @@ from leaderboard.store.files import (
     digest_of,
     make_folder,
     read_document,
-    sync_folder,
     write_document,
 )
 from leaderboard.store.index import EntryRow, Index
@@ -30,7 +29,7 @@ from leaderboard.store.objects import Objects
 from leaderboard.store.queue import Queue
 from leaderboard.store.usage import Usage
 from sme_registry.errors import UnknownNameError
-from sme_registry.io import temporary_beside
+from sme_registry.io import sync_folder, temporary_beside
 from sme_registry.spec import EvaluationProtocol, Suite
 
 

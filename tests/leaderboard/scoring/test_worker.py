@@ -214,7 +214,7 @@ def test_ctrl_c_stops_all_processes_and_gives_their_claims_back(tmp_path, key, t
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )
     pids = [int(process.stdout.readline()) for _ in range(2)]
     with Store.open(tmp_path / "board") as store:
@@ -246,7 +246,7 @@ def test_scorers_end_when_who_started_them_is_killed(tmp_path):
         [sys.executable, script, tmp_path / "board"],
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )
     pids = [int(process.stdout.readline()) for _ in range(2)]
     process.kill()
