@@ -2,8 +2,8 @@
 
 θ of a metric and its 95 % interval are `sme_registry.statistics`' `aggregate` and
 `stratified_bootstrap`: the mean over classes of the interquartile mean within a class. It is not
-the pooled interquartile mean, which hardly moves when a method gives up a class.
-`python -m tests.leaderboard.coverage` measures how often such intervals hold what they should.
+the pooled interquartile mean, which hardly changes when a method fails on one whole class.
+`python -m benchmarks.interval_coverage` measures the coverage of these intervals.
 
 Axis letters: `n` runs of a class, `K` metrics, `N` entries of a board.
 """

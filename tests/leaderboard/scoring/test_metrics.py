@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean
 
+from benchmarks.interval_coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
 from leaderboard.scoring.metrics import Array, rank_ranges, run_metrics
 from sme_registry import statistics
 from sme_registry.statistics import aggregate as theta
 from sme_registry.statistics import iqm
 from sme_registry.statistics import stratified_bootstrap as bootstrap
-from tests.leaderboard.coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
@@ -187,7 +187,7 @@ def test_intervals_hold_the_truth_and_do_not_part_equal_methods(
     # Three standard errors of what 400 methods, or 200 pairs of them, can show.
     slack = 3 * math.sqrt(0.93 * 0.07 / 400)
     assert min(found.coverage, found.coverage_of_mean) >= 0.93 - slack
-    assert found.parted <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
+    assert found.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
 
 
 def test_the_bootstrap_of_a_board_takes_well_under_a_second(
