@@ -29,7 +29,7 @@ from sme_registry.terminal import duration_range, err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.estimate import Span
-    from sme_registry.studies.engine.runner import StudyStatus
+    from sme_registry.studies.engine.status import StudyStatus
 
 _LINES_OF_FAILURES = 20
 _BESIDE_FROM = ("path", "name", "description", "source", "force")
@@ -192,7 +192,7 @@ def _tell_of_algorithms(uses: Iterable[str], told: type[SMEError]) -> None:
       uses: of a plan's algorithms.
       told: the kind of error that is a line on standard error; others are raised.
     """
-    from sme_registry.studies.engine.runner import refuse_unknown_algorithm
+    from sme_registry.studies.engine.cell import refuse_unknown_algorithm
 
     lines: dict[str, None] = {}
     for one in dict.fromkeys(uses):
@@ -527,7 +527,7 @@ def status(
 
       sme study status runs/all --only "class=k-*" --json
     """
-    from sme_registry.studies.engine.runner import study_status
+    from sme_registry.studies.engine.status import study_status
 
     found = study_status(folder, only or (), lambda file: _scaled(file, steps, seeds, evaluations))
     if json:
@@ -541,7 +541,7 @@ app.command("report")(study_report.report)
 
 def _print_status(status: StudyStatus) -> None:
     from sme_registry.studies.engine.executors import available_cores
-    from sme_registry.studies.engine.runner import STATES
+    from sme_registry.studies.engine.status import STATES
 
     file = status.file
     table = Table(
@@ -560,13 +560,15 @@ def _print_status(status: StudyStatus) -> None:
     out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ of all[/]")
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
-    if status.left.high > 0:
+    if status.seconds_left.high > 0:
         here = available_cores()
-        shared = type(status.left)(status.left.low / here, status.left.high / here)
-        one, all_here = duration_range(*status.left), duration_range(*shared)
-        out().print(f"left: {one} of one core, {all_here} of the {here} here")
-    if status.others:
-        out().print(f"[dim]{status.others:,} results in the folder are of no cell of this plan[/]")
+        one = duration_range(*status.seconds_left)
+        all_here = duration_range(*(bound / here for bound in status.seconds_left))
+        out().print(f"Time left: {one} on one core, {all_here} on the {here} cores here")
+    if status.other_results:
+        out().print(
+            f"[dim]{status.other_results:,} results in the folder are of no cell of this plan[/]"
+        )
     for cell in status.failed[:_LINES_OF_FAILURES]:
         failure, planned = cell.failure, cell.planned
         if failure is None:

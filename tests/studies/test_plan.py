@@ -254,7 +254,7 @@ class TestCommands:
         for words in ("2 !1 / 3", "3 cells: 2 done, 1 failed", "ValueError: this one is broken"):
             assert words in text
         text = good("status", "s", "--seeds", "5")
-        assert "of one core" in text
+        assert "on one core" in text
 
     def test_a_new_plan_has_what_was_asked_for(self) -> None:
         options = ("--action-range", "unit", "--action-range", "symmetric", "--seeds", "4")
@@ -292,7 +292,7 @@ class TestCommands:
             ),
             (("run", "smoke", "-f", "s", "--jobs", "0"), "--jobs"),
             (("run", "smoke"), "--folder"),
-            (("status", "nowhere"), "holds no study"),
+            (("status", "nowhere"), "contains no study"),
             (("new", "x", "-t", "Default", "-a", "PPO"), "must end in .json"),
             (("new", "x.json", "-a", "PPO"), "--suite"),
             (("new", "x.json", "-t", "Default"), "--algorithm"),

@@ -1,17 +1,17 @@
-"""`uses`: what is trained in a study's cell, found by name.
+"""`uses`: the name of what a study's cell trains.
 
-    PPO, TD3, …             of Stable-Baselines3, in any case
-    an entry point          of the group `sme_registry.algorithms`, of an installed package
-    module:function         imported; the module is looked for in this folder, too
+    PPO, TD3, …             an algorithm of Stable-Baselines3, in any case
+    an entry point          of the group `sme_registry.algorithms`, in an installed package
+    module:function         imported, from this folder or installed
     reference:constant, …   a policy that learns nothing
 
-What an entry point or `module:function` names is either a class of Stable-Baselines3's kind, as it
-is (`sb3_contrib:TQC`), or a function that makes a learner:
+An entry point or `module:function` names either a class like those of Stable-Baselines3
+(`sb3_contrib:TQC`), or a function that returns a learner:
 
     def make(env: VecEnv, *, seed: int, **hyperparameters) -> Learner
 
-`env` is a `VecEnv` of one environment, whose every step counts: the cell evaluates the learner
-after as many of them as are due, by its `predict`. So a learner has nothing to call back.
+`env` is a `VecEnv` of one environment. The cell counts its steps and evaluates the learner through
+`predict` whenever an evaluation is due, so a learner needs no callbacks.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from sme_registry.training.algorithms import (
 
 ENTRY_POINTS = "sme_registry.algorithms"
 REFERENCE = "reference:"
-# The cell's own business, and no hyperparameters.
+# Set by the cell; not hyperparameters.
 _RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
 
 
 class Learner(Protocol):
-    """What a cell trains; a model of Stable-Baselines3 is one."""
+    """What a cell trains, such as a model of Stable-Baselines3."""
 
     def learn(self, total_timesteps: int) -> Any:
-        """Step the environment at least this often, and learn from it."""
+        """Learn from at least this many steps of the environment."""
 
     def predict(self, observation: Any, *, deterministic: bool) -> Any:
         """Actions `[B, A]` in the range of `env.action_space`, or a tuple that begins with them.
@@ -55,7 +55,7 @@ class Learner(Protocol):
 
 
 def reference_name(uses: str) -> str | None:
-    """Which policy a `reference:…` names; None for what learns.
+    """The policy that `reference:…` names; None for a learner.
 
     Raises:
       UnknownNameError: no such reference.
@@ -64,10 +64,10 @@ def reference_name(uses: str) -> str | None:
 
 
 def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
-    """The name that follows a prefix; None where `uses` does not begin with it.
+    """The name after a prefix; None if `uses` does not begin with it.
 
     Raises:
-      UnknownNameError: the name is not known; says which are, and what is near.
+      UnknownNameError: the name is unknown; the message lists the known ones.
     """
     if not uses.startswith(prefix):
         return None
@@ -81,79 +81,79 @@ def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
 
 
 def find_algorithm(uses: str) -> Any:
-    """The class or function that makes a learner.
+    """The class or function that creates a learner.
 
     Args:
-      uses: a name of one of the kinds above, other than a reference.
+      uses: a name of one of these kinds, except a reference.
 
     Raises:
-      UnknownNameError: nothing has this name; says what is near.
-      OptionError: a module or entry point cannot be imported, or is nothing that makes a learner.
+      UnknownNameError: nothing has this name; the message suggests similar ones.
+      OptionError: a module or entry point cannot be imported or called.
       MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
     """
-    refuse_without_dependencies()  # whose `VecEnv` every learner is given
+    refuse_without_dependencies()  # every learner gets their `VecEnv`
     if ":" in uses:
-        found = import_object(uses, "uses", OptionError)
+        algorithm = import_object(uses, "uses", OptionError)
     elif uses.casefold() in (known.casefold() for known in ALGORITHMS):
         return load_algorithm(uses)
     else:
-        found = _entry_point(uses)
-    if not callable(found):
+        algorithm = _entry_point(uses)
+    if not callable(algorithm):
         raise OptionError(
-            f"uses={uses!r}: is a {type(found).__name__}: must be a class of Stable-Baselines3's "
-            "kind, or a function from an environment to a learner."
+            f"uses={uses!r}: is of type {type(algorithm).__name__}: must be a class like those of "
+            "Stable-Baselines3, or a function from an environment to a learner."
         )
-    return found
+    return algorithm
 
 
 def new_learner(
     uses: str, env: Any, *, seed: int, steps: int, hyperparameters: Mapping[str, Any]
 ) -> Learner:
-    """A learner, ready to be trained.
+    """Create a learner.
 
     Args:
       uses: its name.
-      env: the SB3 `VecEnv`, of one environment, that it is to learn in.
-      seed: of all that it draws.
-      steps: of training that it will be given.
-      hyperparameters: where they differ from its defaults. Lists become tuples, which JSON has not
+      env: the SB3 `VecEnv` of one environment in which it learns.
+      seed: of its random numbers.
+      steps: of training.
+      hyperparameters: those that differ from its defaults. Lists become tuples, which JSON lacks
         (`"train_freq": [1, "episode"]`).
 
     Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`; or it takes
-        other hyperparameters, or makes something that is no learner.
+      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`; or it does
+        not accept the hyperparameters, or returns something that is not a learner.
     """
-    found = find_algorithm(uses)
+    algorithm = find_algorithm(uses)
     settings = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
-    if isinstance(found, type) and is_sb3(found):
-        _refuse_unknown(uses, found, settings)
-        settings = {**replay_settings(found, steps + env.num_envs), **settings}
+    if isinstance(algorithm, type) and is_sb3(algorithm):
+        _refuse_unknown(uses, algorithm, settings)
+        settings = {**replay_settings(algorithm, steps + env.num_envs), **settings}
         try:
-            learner = found("MlpPolicy", env, seed=seed, device="cpu", **settings)
+            learner = algorithm("MlpPolicy", env, seed=seed, device="cpu", **settings)
         except (AssertionError, TypeError, ValueError) as error:
             raise OptionError(
-                f"uses={uses!r}: refuses the task or its hyperparameters {sorted(hyperparameters)}:"
-                f" {error}. Change them; or make the learner in a function, as module:function."
+                f"uses={uses!r}: rejects the task or the hyperparameters "
+                f"{sorted(hyperparameters)}: {error}. Change them, or create the learner in a "
+                "function and give module:function."
             ) from error
     else:
         try:
-            inspect.signature(found).bind(env, seed=seed, **settings)
+            inspect.signature(algorithm).bind(env, seed=seed, **settings)
         except TypeError as error:
             raise OptionError(
                 f"uses={uses!r}: cannot be called with an environment, seed= and the "
-                f"hyperparameters {sorted(settings)}: {error}. Give those that it takes."
+                f"hyperparameters {sorted(settings)}: {error}. Give only those that it accepts."
             ) from None
-        learner = found(env, seed=seed, **settings)
+        learner = algorithm(env, seed=seed, **settings)
     missing = [name for name in ("learn", "predict") if not hasattr(learner, name)]
     if missing:
         raise OptionError(
-            f"uses={uses!r}: made a {type(learner).__name__}, which has no "
-            f"{' and no '.join(missing)}. Have it return a learner, as Stable-Baselines3's are."
+            f"uses={uses!r}: returned a {type(learner).__name__}, which has no "
+            f"{' and no '.join(missing)}. Return a learner like those of Stable-Baselines3."
         )
     if is_sb3(learner):
         silence(learner)
-    made: Learner = learner
-    return made
+    return learner  # type: ignore[no-any-return]
 
 
 def _entry_point(name: str) -> Any:
@@ -170,7 +170,7 @@ def _entry_point(name: str) -> Any:
     except Exception as error:
         raise OptionError(
             f"uses={name!r}: the entry point {point.value!r} cannot be imported: "
-            f"{type(error).__name__}: {error}. Repair or remove the package that brings it."
+            f"{type(error).__name__}: {error}. Repair or remove the package that provides it."
         ) from error
 
 
@@ -182,6 +182,6 @@ def _refuse_unknown(uses: str, algorithm: type, settings: Mapping[str, Any]) -> 
     for name in settings:
         if name not in known:
             raise OptionError(
-                f"hyperparameters={name!r}: {uses} has none of this name."
+                f"hyperparameters={name!r}: {uses} has no such hyperparameter."
                 f"{did_you_mean(name, known)} Known: {', '.join(known)}."
             )

@@ -1,12 +1,13 @@
-"""How long a study will take: from a table of costs, and from what has finished as soon as it has.
+"""How long a study will take: from a table of costs, and from finished cells once there are some.
 
-Of a cell, in seconds of one core, with P its steps, E its evaluations, T the horizon, N the states
-of its evaluation within and out of distribution, L the layers of the optimal policy:
+A cell takes, in seconds of one core, with P its steps, E its evaluations, T the horizon, N the
+states of its evaluation in and out of distribution, L the layers of the optimal policy:
 
     start + P · step + E · T · batch step + N · (state + layer · (L − 1))
 
-Where cells have finished, the sum after `start` is multiplied by the median of what they took over
-what it says of them: of those of the same algorithm and setting, else of the same algorithm.
+Once cells have finished, the sum after `start` is multiplied by the median ratio of their measured
+to their estimated seconds, over cells of the same algorithm and setting, or else of the same
+algorithm.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from sme_registry.spec import Cell, SMESpec
 from sme_registry.studies.engine.algorithms import REFERENCE
 from sme_registry.studies.engine.result import CellResult
 
-# Seconds of one training step with the defaults: measured on a quick core, and the
-# slowest seen. What is not here may be as quick as PPO or as slow as SAC.
+# Seconds of one training step with default hyperparameters: on a fast core, and the slowest
+# measured. Other algorithms may be as fast as PPO or as slow as SAC.
 SECONDS_PER_STEP = {
     "PPO": (0.0006, 0.0013),
     "A2C": (0.0006, 0.0013),
@@ -35,19 +36,19 @@ SECONDS_PER_STEP = {
 _UNKNOWN = (SECONDS_PER_STEP["PPO"][0], SECONDS_PER_STEP["SAC"][1])
 _BATCH_STEP = (0.00006, 0.0005)  # one step of all episodes of an evaluation, which run as a batch
 _STATE = (1.5e-6, 3e-6)
-_LAYER = (1e-6, 3e-6)  # of π*, which every state is judged by
+_LAYER = (1e-6, 3e-6)  # of π*, which is evaluated in every state
 _START = (1.5, 4.0)  # a process and its imports
 
 
 class Span(NamedTuple):
-    """Seconds, between two bounds; equal where they come from what has finished."""
+    """Bounds in seconds; equal if they come from finished cells."""
 
     low: float
     high: float
 
 
 class Estimator:
-    """Seconds of cells, the better the more have finished.
+    """Estimates the seconds of cells; improves as cells finish.
 
     Args:
       finished: results to learn from.
@@ -62,9 +63,8 @@ class Estimator:
         """Learn from a finished cell.
 
         Args:
-          result: what it left.
-          seconds: that it took by the clock, where that was seen: more than its own time where
-            other jobs share the cores.
+          result: of the cell.
+          seconds: of wall time, if measured; more than CPU time if other jobs share the cores.
         """
         expected = _work(result.cell).low
         if expected > 0 and result.timing.total > 0:
@@ -78,7 +78,7 @@ class Estimator:
         return bool(self._ratios.get(cell.uses))
 
     def seconds(self, cell: Cell) -> Span:
-        """What the cell will take on one core."""
+        """Estimate the cell on one core."""
         work = _work(cell)
         ratios = self._ratios.get((cell.uses, _setting(cell))) or self._ratios.get(cell.uses)
         if ratios:
@@ -88,7 +88,7 @@ class Estimator:
 
 
 def makespan(seconds: Sequence[float], workers: int) -> float:
-    """When the last of these jobs ends, begun in this order, each by the first who is free.
+    """When the last of these jobs ends, started in order, each by the first free worker.
 
     Args:
       seconds: of each job.

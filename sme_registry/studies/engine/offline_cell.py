@@ -4,9 +4,9 @@
     offline:bc          nu, transitions of the data set; the rest is the learner's
     offline:iql         likewise
 
-The data set is made in the cell, of the behaviour policy of METHOD, section 4, with the cell's
-seed, and is not kept: the same recipe gives the same bits. `steps` are gradient steps. The
-environment is met in the evaluations alone.
+The cell collects the data set with the behaviour policy of METHOD, section 4, and the cell's seed,
+and does not keep it: the same recipe gives the same bits. `steps` are gradient steps. The
+environment is used only for evaluations.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BATCH_SIZE = 256
 
 
 def offline_name(uses: str) -> str | None:
-    """The learner that `offline:…` names; None for what is none.
+    """The learner that `offline:…` names; None for other kinds of names.
 
     Raises:
       UnknownNameError: no such learner.
@@ -39,23 +39,23 @@ def offline_name(uses: str) -> str | None:
 
 
 def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> CellResult:
-    """Make the data, learn from it, and judge as every cell is judged.
+    """Collect the data, learn from it, and evaluate the policy as in every cell.
 
     Args:
-      cell: what to run; its k-th evaluation falls after round(steps · k / evaluations) steps.
+      cell: the cell to run; its k-th evaluation follows round(steps · k / evaluations) steps.
       name: the learner.
-      progress: told the gradient steps done and those in all.
+      progress: called with the gradient steps done and those in all.
 
     Raises:
       OptionError: ν is missing, or a number is out of range.
-      SpecError: the recipe or a hyperparameter is; or D > 0, where episodes have no common length.
+      SpecError: so is the recipe or a hyperparameter; or D > 0, where episodes differ in length.
     """
     begun = time.thread_time()
     if cell.spec.D > 0:
         raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
     settings: dict[str, Any] = dict(cell.hyperparameters)
     if "nu" not in settings:
-        raise OptionError("hyperparameters.nu: missing: must be in [0, 1], as in nu=0.5. Add it.")
+        raise OptionError("hyperparameters.nu: is required. Give a number in [0, 1], such as 0.5.")
     nu, transitions = settings.pop("nu"), settings.pop("transitions", TRANSITIONS)
     batch_size = settings.pop("batch_size", BATCH_SIZE)
     recipe = DatasetRecipe.from_dict(

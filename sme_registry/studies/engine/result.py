@@ -1,8 +1,8 @@
 """`CellResult`: the result of one finished run of a study, one file each.
 
 STUDY/plan.json               the plan, as a `StudyFile`
-STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place when whole
-STUDY/failed/<64 hex>.json    cells that raised, with the error; a retry removes it
+STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place when complete
+STUDY/failed/<64 hex>.json    cells that failed, with the error; a successful retry removes it
 STUDY/locks/<64 hex>          locked by the operating system while a cell runs
 STUDY/models/<64 hex>.zip     trained models, if they are kept
 STUDY/report/                 what `sme study report` writes
@@ -79,7 +79,7 @@ class CellResult(StrictModel):
       key: the cell's digest.
       cell: the complete cell.
       curve: its learning curve.
-      report: its evaluation within and out of distribution, with the references.
+      report: its evaluation in and out of distribution, with the references.
       online_regret: mean regret over all training steps, in [0, 1]; null for references and
         offline learners.
       offline: similarities of an offline cell; null for all others.

@@ -1,7 +1,7 @@
-"""A plan cut to the time that there is: other budgets, fewer seeds, a part of its cells.
+"""Fit a plan to the time available: other budgets, fewer seeds, some of its cells.
 
-Budgets are part of a cell's content, so a plan with another budget is another plan, with its own
-digest and name. Which of a plan's cells are run now is not: `selected` chooses from any plan.
+Budgets are part of a cell's content, so a plan with another budget is another plan with its own
+digest and name. The selection of the cells to run now is not: `selected` works on any plan.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ def scaled(
     seeds: int | None = None,
     evaluations: int | None = None,
 ) -> StudyFile:
-    """The plan with other budgets; None leaves the plan's own.
+    """The plan with other budgets; None keeps the plan's.
 
     Args:
       file: the plan.
-      steps: of every algorithm that trains, also of those with a budget of their own.
-      steps_of: of single algorithms, by name; stronger than `steps`.
+      steps: of every algorithm that trains, including those with a budget of their own.
+      steps_of: of single algorithms, by name; overrides `steps`.
       seeds: runs of each algorithm on each class.
-      evaluations: while training.
+      evaluations: during training.
 
     Returns:
-      The same file where nothing changes, else one of the name `<name>-scaled`.
+      The same file if nothing changes, otherwise one named `<name>-scaled`.
 
     Raises:
       UnknownNameError: the plan has no algorithm of a name in `steps_of`.
@@ -51,16 +51,16 @@ def scaled(
     if steps is not None:
         plain["steps"] = steps
     for algorithm in plain["algorithms"]:
-        own, name = algorithm["steps"], algorithm["name"]
+        budget, name = algorithm["steps"], algorithm["name"]
         if name in steps_of:
             algorithm["steps"] = steps_of[name]
-        elif steps is not None and own != 0:  # 0: a reference, which does not train
+        elif steps is not None and budget != 0:  # 0: a reference, which does not train
             algorithm["steps"] = None
     if seeds is not None:
         plain["seeds"] = seeds
     if evaluations is not None:
         plain["evaluations"] = evaluations
-    plan = StudyPlan.from_dict(plain, "the plan as scaled")
+    plan = StudyPlan.from_dict(plain, "the scaled plan")
     if plan == file.plan:
         return file
     name = file.name.removesuffix(_SUFFIX)[: _LONGEST_NAME - len(_SUFFIX)] + _SUFFIX
@@ -72,11 +72,11 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
 
     Args:
       cells: of a plan.
-      only: patterns `class=GLOB` and `algorithm=GLOB`. Of several of one kind any may match; of
-        both kinds both must. None selects every cell.
+      only: patterns `class=GLOB` and `algorithm=GLOB`. A cell must match any of the patterns of
+        each kind that is given. No pattern selects every cell.
 
     Raises:
-      OptionError: a pattern is of another form.
+      OptionError: a pattern has another form.
       UnknownNameError: a pattern matches nothing.
     """
     cells = tuple(cells)
@@ -89,13 +89,13 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
         kind, equals, glob = text.partition("=")
         if not equals or kind not in patterns:
             raise OptionError(
-                f"only={text!r}: must be class=GLOB or algorithm=GLOB, as in class='k-*'."
+                f"only={text!r}: must be class=GLOB or algorithm=GLOB, such as class='k-*'."
             )
         if not any(fnmatchcase(name, glob) for name in names[kind]):
-            shown = ", ".join(names[kind][:12]) + (", …" if len(names[kind]) > 12 else "")
+            listed = ", ".join(names[kind][:12]) + (", …" if len(names[kind]) > 12 else "")
             raise UnknownNameError(
-                f"only={text!r}: no {kind} of the plan matches.{did_you_mean(glob, names[kind])} "
-                f"There are: {shown}."
+                f"only={text!r}: matches no {kind} of the plan.{did_you_mean(glob, names[kind])} "
+                f"Available: {listed}."
             )
         patterns[kind].append(glob)
 

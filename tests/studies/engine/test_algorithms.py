@@ -97,7 +97,7 @@ def test_an_installed_entry_point_is_found_by_its_name(
         ("reference:linear", OptionError, "cannot be imported"),
         ("no_such_module:make", OptionError, "cannot be imported: ModuleNotFoundError"),
         ("own_learners:smal", OptionError, "AttributeError.*Did you mean 'small'"),
-        ("own_learners:number", OptionError, "is a int: must be a class"),
+        ("own_learners:number", OptionError, "is of type int: must be a class"),
     ],
 )
 def test_a_name_that_leads_nowhere_is_explained(
@@ -118,10 +118,10 @@ def test_a_reference_is_told_from_what_learns() -> None:
     ("uses", "settings", "said"),
     [
         ("TD3", {"learning_rat": 0.1}, "Did you mean 'learning_rate'"),
-        ("PPO", {"seed": 3}, "PPO has none of this name"),
-        ("SAC", {"policy_kwargs": {"depth": 3}}, "refuses the task or its hyperparameters"),
+        ("PPO", {"seed": 3}, "PPO has no such hyperparameter"),
+        ("SAC", {"policy_kwargs": {"depth": 3}}, "rejects the task or the hyperparameters"),
         ("own_learners:small", {"depth": 3}, "unexpected keyword argument 'depth'"),
-        ("own_learners:nothing", {}, "made a NoneType, which has no learn and no predict"),
+        ("own_learners:nothing", {}, "returned a NoneType, which has no learn and no predict"),
     ],
 )
 def test_what_an_algorithm_does_not_take_or_make_is_refused(

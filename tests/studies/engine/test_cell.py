@@ -195,7 +195,7 @@ def test_the_unit_action_range_is_trained_in_and_recorded() -> None:
 
 
 def test_a_learner_of_another_make_is_evaluated_when_it_is_due() -> None:
-    uses = "tests.studies.test_cell:search"
+    uses = "tests.studies.engine.test_cell:search"
     result = run_cell(cell(uses, hyperparameters={"spread": 0.5}))
     assert result.curve.steps == (32, 65, 98, 130)
     assert 0.0 < (result.online_regret or 0.0) < 1.0
@@ -205,7 +205,7 @@ def test_a_learner_of_another_make_is_evaluated_when_it_is_due() -> None:
 
 def test_a_learner_that_stops_early_is_refused() -> None:
     with pytest.raises(PolicyError, match="returned after 65 steps"):
-        run_cell(cell("tests.studies.test_cell:idle"))
+        run_cell(cell("tests.studies.engine.test_cell:idle"))
 
 
 def test_a_reference_is_judged_as_often_as_a_learner_would_be() -> None:
@@ -229,7 +229,7 @@ def test_what_cannot_be_run_is_refused() -> None:
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
     with pytest.raises(SpecError, match=r"spec\.team: must be null: .* this one is for 2"):
         Cell.from_dict({**cell().to_dict(), "spec": team.to_dict()})
-    with pytest.raises(OptionError, match="has none"):
+    with pytest.raises(OptionError, match="has no hyperparameters"):
         run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
     with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):
         run_cell(cell("reference:liner"))

@@ -17,7 +17,7 @@ from tests.studies.cells import small_file
 
 pytest.importorskip("ray")
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 # In a process of its own: Ray leaves handles to the garbage collector, and threads to whoever is

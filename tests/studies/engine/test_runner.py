@@ -22,11 +22,12 @@ from rich.console import Console
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellFailure
-from sme_registry.studies.engine.runner import run_study, study_status
+from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.engine.status import study_status
 from tests.studies import cells
 from tests.studies.cells import small_file
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 DRIVER = """
 import sys
@@ -92,7 +93,7 @@ def test_every_cell_is_run_once_and_running_again_runs_nothing(study: Path, note
     assert "3 cells · 3 to run · 1 at once" in said
     again, said = quick(file, study, run=work)
     assert again == status
-    assert "3 finished before, which are reused · 0 to run" in said
+    assert "3 finished before and reused · 0 to run" in said
     assert set(cells.starts(notes).values()) == {1}
 
 
@@ -229,8 +230,8 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(study: Path, tmp_path: P
         said = process.stderr.read()
     assert process.returncode == 130
     assert said.splitlines()[-1] == (
-        f"error: interrupted: 0 of 2 cells are finished and kept in {study}. The same command "
-        "goes on from there."
+        f"error: interrupted: 0 of 2 cells have finished and are in {study}. Run the same command "
+        "to continue."
     )
     assert "Traceback" not in said
     assert study_status(study).count("waiting") == 2
@@ -244,7 +245,7 @@ def test_a_corrupt_result_is_set_aside_and_its_cell_run_again(study: Path, notes
     assert study_status(study).count("waiting") == 1
     status, said = quick(file, study, run=work)
     assert status.count("done") == 2
-    assert "Set aside as" in said
+    assert "Renamed to" in said
     assert sorted(cells.starts(notes).values()) == [1, 2]
     assert path.with_name(f"{path.name}.corrupt").exists()
 
@@ -256,11 +257,11 @@ def test_of_an_edited_plan_only_the_new_cells_are_run(study: Path, notes: Path) 
     status, said = quick(edited, study, run=work)
     assert status.count("done") == 6
     assert "The folder's plan was small-v1" in said
-    assert "2 finished before, which are reused · 4 to run" in said
+    assert "2 finished before and reused · 4 to run" in said
     assert set(cells.starts(notes).values()) == {1}
     assert Ledger(study).plan_file() == edited
     status, _ = quick(small_file(seeds=1), study, run=work)
-    assert (len(status.cells), status.others) == (1, 5)
+    assert (len(status.cells), status.other_results) == (1, 5)
     assert len(cells.starts(notes)) == 6
 
 
@@ -317,7 +318,7 @@ def test_what_cannot_be_written_now_is_kept_until_there_is_room(study: Path, not
         (notes / cells.GATE).touch()
 
     # Run 0 ends and cannot be written; run 1 runs until there is room again.
-    console = Console(file=_Heard("No cell is begun until there is room", make_room), width=400)
+    console = Console(file=_Heard("No new cell starts until there is space", make_room), width=400)
     work = partial(cells.gated, notes, open_for=1)
     status, _ = quick(file, study, executor="processes", jobs=2, run=work, console=console)
     assert status.count("done") == 4
@@ -391,9 +392,9 @@ def test_results_of_other_versions_are_reused_and_said_to_be(study: Path) -> Non
         ledger.write(result.model_copy(update={"versions": versions}))
     status, said = quick(file, study)
     assert status.count("done") == 3
-    here = f"(here {np.__version__})"
+    here = f"(installed: {np.__version__})"
     assert (
-        "2 of the reused results were made with other versions than are installed: "
+        "2 of the reused results come from other package versions: "
         f"numpy 1.0.0 {here}, numpy 1.0.1 {here}."
     ) in " ".join(said.split())
     fresh = study.with_name("fresh")
@@ -408,7 +409,7 @@ def test_a_result_of_another_cell_is_a_failure(study: Path) -> None:
         return cells.run_cell(other)
 
     status, _ = quick(small_file(seeds=1), study, run=mistaken)
-    assert "the result is of the cell sha256:" in status.failed[0].failure.error
+    assert "the result belongs to another cell, sha256:" in status.failed[0].failure.error
 
 
 @pytest.mark.parametrize(

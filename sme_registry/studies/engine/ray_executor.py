@@ -1,0 +1,206 @@
+"""`OnRay`: a task of a Ray cluster for each cell."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import socket
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.spec import Cell
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.executors import (
+    POLL_SECONDS,
+    ConcurrentExecutor,
+    Message,
+    ReportProgress,
+    RunCell,
+    available_cores,
+    failure_message,
+    run_one,
+)
+
+_RETRIES = 3  # of a cell whose worker or node is lost
+_SECONDS_TO_ANSWER = 10.0
+_SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_task_oom_retries": str(_RETRIES),  # without it a cell too large is retried for ever
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # its notices of a lost node, dozens of lines each
+}
+_ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray version."
+
+
+class OnRay(ConcurrentExecutor):
+    """A task on one core of a Ray cluster for each cell; a cell whose node is lost runs again.
+
+    This process keeps the locks and writes the files, so the nodes need no shared file system,
+    only Ray and this package in the same versions.
+
+    Args:
+      address: of a running cluster, or "local" to start one here until `map` ends.
+      jobs: cells at once; None for the cluster's cores, as many as it has at the time.
+      run: runs a cell.
+      keep_models: whether outcomes carry the trained model.
+
+    Raises:
+      OptionError: the cluster cannot be reached.
+      MissingDependencyError: Ray is not installed.
+    """
+
+    def __init__(
+        self,
+        address: str = "local",
+        jobs: int | None = None,
+        run: RunCell = run_cell,
+        keep_models: bool = False,
+    ) -> None:
+        super().__init__(jobs, run, keep_models)
+        self._address, self._ray = address, _import_ray()
+        self._connected_here = False  # then `map` disconnects
+        if address != "local":  # now, so that a wrong one is refused before anything is written
+            self._connect()
+
+    @property
+    def workers(self) -> int:
+        """Cells that can run at once: `jobs`, else the cluster's cores as of now."""
+        if self._jobs is not None:
+            return self._jobs
+        if not self._ray.is_initialized():
+            return available_cores()
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    @contextlib.contextmanager
+    def _session(self) -> Iterator[_RaySession]:
+        self._connect()
+        try:
+            session = _RaySession(self._ray, self._run, self._keep_models)
+            try:
+                yield session
+            finally:
+                session.cancel()
+        finally:
+            if self._connected_here:
+                self._ray.shutdown()
+                self._connected_here = False
+
+    def _connect(self) -> None:
+        """Connect, unless this process is connected already.
+
+        Raises:
+          OptionError: the cluster cannot be reached.
+        """
+        if self._ray.is_initialized():
+            return
+        options: dict[str, Any] = {"address": self._address}
+        if self._address == "local":
+            options |= {"num_cpus": self.workers, "include_dashboard": False}
+        else:
+            _refuse_unreachable(self._address)
+        try:
+            self._ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
+        except Exception as error:  # of many kinds, by what is wrong with the address
+            raise OptionError(
+                f"ray={self._address!r}: cannot be used: {str(error).splitlines()[0]} {_ADDRESSES}"
+            ) from None
+        self._connected_here = True
+
+
+class _RaySession:
+    """The tasks that run now, by their Ray reference."""
+
+    def __init__(self, ray: Any, run: RunCell, keep_models: bool) -> None:
+        self._ray, self._run, self._keep_models = ray, run, keep_models
+        self._steps = _start_step_counts(ray)
+        self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_task)
+        self.running: dict[Any, Cell] = {}
+
+    def start(self, cell: Cell) -> None:
+        self.running[self._task.remote(self._steps, self._run, cell, self._keep_models)] = cell
+
+    def ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+        ready, _ = self._ray.wait(list(self.running), timeout=POLL_SECONDS)
+        for reference in ready:
+            cell = self.running.pop(reference)
+            yield cell, self._message(reference, cell)
+        by_key = {cell.digest: cell for cell in self.running.values()}
+        for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
+            if key in by_key:
+                progress(by_key[key], done, total)
+
+    def cancel(self) -> None:
+        for reference in self.running:
+            self._ray.cancel(reference, force=True)
+
+    def _message(self, reference: Any, cell: Cell) -> Message:
+        try:
+            return Message(*self._ray.get(reference))
+        except self._ray.exceptions.RayError as error:
+            text = str(error).strip()
+            return failure_message(
+                cell,
+                f"{type(error).__name__}: lost {_RETRIES + 1} times: {text.splitlines()[0]} "
+                "Run it again with --retry.",
+                text,
+            )
+
+
+def _task(steps: Any, run: RunCell, cell: Cell, keep_model: bool) -> tuple[Any, ...]:
+    """Run one cell on a Ray worker."""
+    report = functools.partial(steps.put.remote, cell.digest)
+    return tuple(run_one(run, cell, keep_model, report))
+
+
+class _StepCounts:
+    """A Ray actor to which workers report the steps they have done."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, tuple[int, int]] = {}
+
+    def put(self, key: str, done: int, total: int) -> None:
+        self._steps[key] = (done, total)
+
+    def take(self) -> dict[str, tuple[int, int]]:
+        steps, self._steps = self._steps, {}
+        return steps
+
+
+def _start_step_counts(ray: Any) -> Any:
+    """The actor, on the driver's own node: if that is lost, so is the driver."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    here = ray.get_runtime_context().get_node_id()
+    strategy = NodeAffinitySchedulingStrategy(node_id=here, soft=False)
+    return ray.remote(num_cpus=0, scheduling_strategy=strategy)(_StepCounts).remote()
+
+
+def _refuse_unreachable(address: str) -> None:
+    """Raise if nothing answers at an address: Ray itself would try for many minutes.
+
+    Raises:
+      OptionError: not host:port, or nothing answers there.
+    """
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), _SECONDS_TO_ANSWER).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise OptionError(f"ray={address!r}: cannot be reached: {error}. {_ADDRESSES}") from None
+
+
+def _import_ray() -> Any:
+    for name, value in _SETTINGS.items():
+        os.environ.setdefault(name, value)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import ray
+    except ImportError:
+        raise MissingDependencyError(
+            "ray: is not installed. Run `pip install 'sme-registry[ray]'`, or leave out --ray to "
+            "use processes on this machine."
+        ) from None
+    return ray

@@ -1,0 +1,154 @@
+"""`study_status`: which cells of a study are done, running, failed or waiting."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from sme_registry.errors import OptionError
+from sme_registry.spec import PlannedCell, StudyFile
+from sme_registry.studies.engine.estimate import Estimator, Span
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellFailure
+from sme_registry.studies.engine.scaling import selected
+
+State = Literal["done", "running", "failed", "waiting"]
+STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
+
+
+def label(planned: PlannedCell) -> str:
+    """A cell's name for people: `PPO on k-25, run 3`."""
+    return f"{planned.algorithm} on {planned.class_name}, run {planned.run}"
+
+
+@dataclass(frozen=True)
+class CellStatus:
+    """The state of a cell.
+
+    Attributes:
+      planned: the cell, and its place in the plan.
+      state: "running" if any process runs it; "failed" if it failed and no process runs it again.
+      failure: its error, if it failed.
+    """
+
+    planned: PlannedCell
+    state: State
+    failure: CellFailure | None = None
+
+
+@dataclass(frozen=True)
+class StudyStatus:
+    """The state of a study.
+
+    Attributes:
+      folder: of the study.
+      file: its plan.
+      cells: the selected cells of the plan, in its order.
+      seconds_left: of one core, for the unfinished cells; running ones count in full.
+      other_results: results in the folder that belong to no cell of the plan.
+    """
+
+    folder: Path
+    file: StudyFile
+    cells: tuple[CellStatus, ...]
+    seconds_left: Span
+    other_results: int
+
+    def count(self, state: State) -> int:
+        """How many cells are in this state."""
+        return sum(cell.state == state for cell in self.cells)
+
+    @property
+    def failed(self) -> tuple[CellStatus, ...]:
+        """The cells that failed."""
+        return tuple(cell for cell in self.cells if cell.state == "failed")
+
+    @property
+    def counts(self) -> dict[tuple[str, str], Counter[State]]:
+        """(class, algorithm) → number of cells in each state, in the plan's order."""
+        counts: dict[tuple[str, str], Counter[State]] = {}
+        for cell in self.cells:
+            group = cell.planned.class_name, cell.planned.algorithm
+            counts.setdefault(group, Counter())[cell.state] += 1
+        return counts
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain JSON data."""
+        return {
+            "folder": str(self.folder),
+            "study": self.file.versioned_name,
+            "digest": self.file.digest,
+            "cells": len(self.cells),
+            **{state: self.count(state) for state in STATES},
+            "core_seconds_left": self.seconds_left._asdict(),
+            "other_results": self.other_results,
+            "groups": [
+                {"class": name, "algorithm": algorithm, **{s: counts[s] for s in STATES}}
+                for (name, algorithm), counts in self.counts.items()
+            ],
+            "failures": [
+                {
+                    "class": cell.planned.class_name,
+                    "algorithm": cell.planned.algorithm,
+                    "run": cell.planned.run,
+                    "key": cell.failure.key,
+                    "error": cell.failure.error,
+                    "attempts": cell.failure.attempts,
+                }
+                for cell in self.failed
+                if cell.failure is not None
+            ],
+        }
+
+
+def study_status(
+    folder: str | os.PathLike[str],
+    only: Sequence[str] = (),
+    scale: Callable[[StudyFile], StudyFile] = lambda file: file,
+) -> StudyStatus:
+    """The state of the study in a folder. Changes nothing, and may be called while it runs.
+
+    Args:
+      folder: of the study.
+      only: `class=GLOB`, `algorithm=GLOB`; see `scaling.selected`.
+      scale: applied to the folder's plan first, such as a `scaling.scaled` with other budgets.
+
+    Raises:
+      OptionError: the folder contains no study.
+      UnknownNameError: a pattern matches nothing.
+      SpecError: plan.json is not a valid plan.
+    """
+    ledger = Ledger(folder)
+    file = ledger.plan_file()
+    if file is None:
+        raise OptionError(
+            f"folder={str(folder)!r}: contains no study. `sme study run` with --folder starts one."
+        )
+    return plan_status(ledger, scale(file), only)
+
+
+def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudyStatus:
+    """The state of a plan's selected cells in a folder."""
+    every = file.plan.cells
+    keys = {id(planned): planned.cell.digest for planned in every}
+    results, failures = ledger.results(), ledger.failures()
+    estimator = Estimator(results.values())
+    cells = []
+    for planned in selected(every, only):
+        key = keys[id(planned)]
+        state: State = "done" if key in results else "failed" if key in failures else "waiting"
+        if state != "done" and ledger.is_running(key):
+            state = "running"
+        cells.append(CellStatus(planned, state, failures.get(key) if state == "failed" else None))
+    spans = [estimator.seconds(c.planned.cell) for c in cells if c.state in ("running", "waiting")]
+    return StudyStatus(
+        folder=ledger.folder,
+        file=file,
+        cells=tuple(cells),
+        seconds_left=Span(sum(span.low for span in spans), sum(span.high for span in spans)),
+        other_results=len(results.keys() - set(keys.values())),
+    )
