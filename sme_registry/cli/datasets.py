@@ -148,8 +148,7 @@ def list_(out_folder: Folder = None, json: Json = False) -> None:
 
       sme dataset list --out data --json
     """
-    from sme_registry.datasets import list_datasets
-    from sme_registry.datasets.minari_file import datasets_folder
+    from sme_registry.datasets import datasets_folder, list_datasets
 
     found, broken = list_datasets(out_folder)
     if json:
@@ -219,8 +218,7 @@ def validate(
 
       sme dataset validate data/sme/*
     """
-    from sme_registry.datasets import open_dataset, replay
-    from sme_registry.datasets.minari_file import refuse_misplaced
+    from sme_registry.datasets import check_location, open_dataset, replay
     from sme_registry.task import materialize
 
     results: list[dict[str, Any]] = []
@@ -228,7 +226,7 @@ def validate(
         result: dict[str, Any] = {"set": name, "valid": True, "error": None}
         try:
             dataset = open_dataset(name, out_folder)
-            refuse_misplaced(dataset, out_folder)
+            check_location(dataset, out_folder)
             replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
             result["arrays_digest"] = dataset.record.arrays_digest
         except SMEError as error:

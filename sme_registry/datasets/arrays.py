@@ -1,12 +1,11 @@
 """`Transitions`: a data set as aligned NumPy arrays, one row for each transition.
 
-Row i is (s, a, R, s'): what was observed, what was done, what was paid, and what was observed next,
-beside what only an SME knows of it: π*(s), r̃, r and the regret 1 − r. `N` transitions, `S`
-state_dim, `A` action_dim, `n` agents of a team (1 where there is none), `O` = S + 1 + n entries of
-an observation.
+Row i is (s, a, R, s'): observation, action, reward and next observation, with the exact values that
+only an SME provides: π*(s), r̃, r and the regret 1 − r. `N` transitions, `S` state_dim, `A`
+action_dim, `n` agents (1 without a team), `O` = S + 1 + n entries of an observation.
 
-Rows of one trajectory stand together, in order. An off-by-one between observations and actions
-cannot be made with these: no array here has a row more than another.
+Rows of one trajectory are contiguous and in order. All arrays have the same number of rows, so
+observations and actions cannot be misaligned.
 """
 
 from __future__ import annotations
@@ -30,26 +29,26 @@ Indices = npt.NDArray[np.int64]
 class Transitions:
     """Aligned arrays of a data set; every first axis is N.
 
-    A trajectory is an episode, or a part of one: a set that is kept to a sub-cube of the states, or
-    cut to its length, holds parts. `terminations | timeouts` marks the last row of each.
+    A trajectory is an episode or a part of one: a data set restricted to a sub-cube of the states,
+    or cut at N rows, has parts. `terminations | timeouts` marks the last row of each trajectory.
 
     Attributes:
-      observations: `[N, O]` float32 in [0, 1]: s, t/T, and each agent's r_cum/k, acted in.
-      actions: `[N, A]` float32 in [0, 1], as the environment took them.
+      observations: `[N, O]` float32 in [0, 1]: s, t/T, and each agent's r_cum/k, before the step.
+      actions: `[N, A]` float32 in [0, 1], as the environment executed them.
       rewards: `[N]` float64 in [0, k], R; of a team the mean over its agents.
       next_observations: `[N, O]` float32, after the step; also at the end of a trajectory.
-      terminations: `[N]` bool: the episode ended by D. Nothing follows: do not bootstrap.
-      timeouts: `[N]` bool: the trajectory stops here and the task does not. Bootstrap from
-        `next_observations`. Never together with a termination.
-      optimal_actions: `[N, A]` float64 in [0, 1], π* of the states acted in.
-      regrets: `[N]` float64 in [0, 1], 1 − r; of a team `[N, n]`, each agent's own.
+      terminations: `[N]` bool: the episode ended by D. Do not bootstrap.
+      timeouts: `[N]` bool: the trajectory ends here but the task continues. Bootstrap from
+        `next_observations`. Never true together with a termination.
+      optimal_actions: `[N, A]` float64 in [0, 1], π*(s).
+      regrets: `[N]` float64 in [0, 1], 1 − r; of a team `[N, n]`, one column for each agent.
       similarities: `[N]` float64 in [0, 1], r̃; of a team `[N, n]`.
       step_rewards: `[N]` float64 in [0, 1], r; of a team `[N, n]`.
-      states: `[N, S]` float64 in [0, 1], acted in, to the bit.
+      states: `[N, S]` float64 in [0, 1], before the step, to the bit.
       next_states: `[N, S]` float64, to the bit.
-      episodes: `[N]` int64 from 0, which trajectory of the set a row is of; increasing.
-      components: `[N]` int64, which behaviour policy of the recipe acted.
-      agent_rewards: `[N, n]` float64, R of each agent of a team; None where there is no team.
+      episodes: `[N]` int64, index of the row's trajectory, from 0; non-decreasing.
+      components: `[N]` int64, index of the recipe's behaviour policy that acted.
+      agent_rewards: `[N, n]` float64, R of each agent of a team; None for a single agent.
     """
 
     observations: Observations
@@ -69,17 +68,17 @@ class Transitions:
     agent_rewards: Array | None = None
 
     def __len__(self) -> int:
-        """N, the transitions."""
+        """N, the number of transitions."""
         return len(self.rewards)
 
     def columns(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays by name, in the order of this class; without `agent_rewards` where None."""
+        """The arrays by name, in the order of this class; without `agent_rewards` if it is None."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: array for name, array in named.items() if array is not None}
 
     @property
     def ends(self) -> Indices:
-        """`[E]` the row after the last of each trajectory; `E` trajectories."""
+        """`[E]` the index after the last row of each of the `E` trajectories."""
         return np.flatnonzero(self.terminations | self.timeouts) + 1
 
     @property
@@ -98,12 +97,12 @@ def to_d3rlpy(
 ) -> dict[str, npt.NDArray[Any]]:
     """The arguments of d3rlpy's `MDPDataset`: `MDPDataset(**to_d3rlpy(transitions))`.
 
-    d3rlpy takes the observation after row i to be row i + 1. So the last row of a trajectory that
-    stopped without a termination has no successor, and d3rlpy leaves it out: one in T, and every
-    trajectory of a single step. With `final_observations` each of those gets a row more, its final
+    d3rlpy uses row i + 1 as the observation after row i. The last row of a trajectory that ended
+    without a termination has no successor, so d3rlpy drops it: one row in T, and every trajectory
+    of a single step. With `final_observations` each such trajectory gets one more row, its final
     observation with an action and a reward of 0, which d3rlpy uses as a successor and not as a
-    transition: nothing is lost. Leave them out for what reads rows and not transitions, such as
-    return-conditioned sequence models.
+    transition, so no row is lost. Do not use it for algorithms that read rows instead of
+    transitions, such as return-conditioned sequence models.
 
     Args:
       transitions: of N rows.
@@ -111,8 +110,8 @@ def to_d3rlpy(
 
     Returns:
       `observations` `[N, O]` float32, `actions` `[N, A]` float32, `rewards` `[N]` float32,
-      `terminals` `[N]` and `timeouts` `[N]` float32 of 0 and 1; with `final_observations` as many
-      rows more as there are timeouts. Fresh arrays.
+      `terminals` `[N]` and `timeouts` `[N]` float32 of 0 and 1; with `final_observations` one more
+      row for each timeout. All arrays are copies.
     """
     arrays: dict[str, npt.NDArray[Any]] = {
         "observations": transitions.observations,
@@ -135,6 +134,6 @@ def to_d3rlpy(
     }
 
 
-def agents_of(spec: SMESpec) -> int:
-    """n, the agents of a task; 1 where there is no team."""
+def num_agents(spec: SMESpec) -> int:
+    """n, the number of agents of a task; 1 without a team."""
     return 1 if spec.team is None else len(spec.team.agents)

@@ -1,16 +1,16 @@
-"""Behaviour policies: who acts while data is collected, of a quality that is dialled.
+"""Behaviour policies: the policies that collect a data set, of a chosen quality.
 
-    mixture of ν:  a = (1 − α) π*(s) + α ã(s),   α ~ U(0, ν), one for each step
+    mixture of ν:  a = (1 − α) π*(s) + α ã(s),   α ~ U(0, ν), one draw for each step
     random:        a ~ U([0, 1]^A)
-    policy:        the user's own, deterministic
+    policy:        the user's, deterministic
 
-Source: METHOD, section 4. ã is a second Deep Uniform Network of the shapes of π* (of a team one for
-each agent, of what it observes), drawn from the data's own seed; one α mixes all action channels.
-`B` lanes, `S` state_dim, `A` action_dim, `n` agents.
+Source: METHOD, section 4. ã is a second Deep Uniform Network of the same shape as π* (for a team
+one for each agent, on what it observes), drawn from the data's seed; one α mixes all channels. `B`
+lanes, `S` state_dim, `A` action_dim, `n` agents.
 
-Every number is of its episode and step alone: each episode reads its own part of a named stream,
-and π* and ã are asked by the lane-wise compiled step, whose bits do not depend on B. A user's
-policy is asked in blocks of one size, so that its network multiplies matrices of one shape.
+All numbers depend on episode and step only: each episode reads its own part of a named stream, and
+π* and ã are evaluated by the compiled step, whose bits do not depend on B. A user's policy is
+called in blocks of one size, so that its network always multiplies matrices of the same shape.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from sme_registry.task.draw import Array
 from sme_registry.task.streams import bit_generator, to_uniform
 
 NOISE_STREAM = "dataset/noise"
-_AHEAD = 64  # steps whose words an episode reads at once
-_BLOCK = 64  # observations that a user's policy is asked for at once
+_AHEAD = 64  # steps whose random numbers an episode reads at once
+_BLOCK = 64  # observations in one call of a user's policy
 
 
 def noise_task(task: Task, seed: int) -> Task:
-    """The task whose optimal policy is ã: same shapes, drawn from the data's own seed."""
+    """The task whose optimal policy is ã: of the same shape, drawn from the data's seed."""
     policies = draw.optimal_policies(task.spec.derive(seed=seed), NOISE_STREAM)
     return dataclasses.replace(task, policies=policies)
 
 
-class Oracle:
-    """π* of states, `[B, S]` to `[B, A]`; a state's answer has the same bits in any batch."""
+class OptimalPolicy:
+    """π* as a function from states `[B, S]` to `[B, A]`, with the same bits in any batch."""
 
     def __init__(self, task: Task, lanes: int) -> None:
         self._batch = Batch(task, lanes, reuse=True)
@@ -50,22 +50,22 @@ class Oracle:
         self._no_action = np.zeros((lanes, task.spec.action_dim))
 
     def __call__(self, s: Array) -> Array:
-        """π*(s); written over by the call after the next."""
+        """π*(s); the next call but one overwrites it."""
         self._batch.begin(self._lanes, self._observation, s)
         return self._batch.advance(self._no_action).optimal
 
 
 class EpisodeStream:
-    """Uniform numbers of a named stream, of which each episode reads a part of its own.
+    """Uniform numbers of a named stream, a separate part of it for each episode.
 
-    Episode e reads from the word 4 · 2¹²⁸ e on, so its numbers depend on neither the lane that it
-    runs in nor the episodes beside it.
+    Episode e reads from word 4 · 2¹²⁸ e onwards, so its numbers do not depend on its lane or on the
+    other episodes.
 
     Args:
       seed: of the data.
       name: of the stream.
       lanes: B.
-      width: numbers a step.
+      width: numbers for each step.
       ahead: steps whose numbers are read at once.
     """
 
@@ -77,19 +77,19 @@ class EpisodeStream:
         self._lanes = np.arange(lanes)
 
     def begin(self, lane: int, episode: int) -> None:
-        """Put a lane at the beginning of an episode's numbers."""
+        """Start a lane at the first number of an episode."""
         generator = bit_generator(self._seed, self._name)
         generator.advance(episode << 128)
         self._generators[lane] = generator
         self._used[lane] = self._drawn.shape[1]
 
     def next(self, lanes: npt.NDArray[np.int64] | None = None) -> Array:
-        """The next numbers of these lanes, of all where None, `[len(lanes), width]` in (0, 1)."""
+        """The next numbers of these lanes (None: all), `[len(lanes), width]` in (0, 1)."""
         lanes = self._lanes if lanes is None else lanes
         _, ahead, width = self._drawn.shape
         for lane in lanes[self._used[lanes] == ahead].tolist():
             generator = self._generators[lane]
-            assert generator is not None  # a lane begins before it is asked
+            assert generator is not None  # `begin` comes first
             self._drawn[lane] = to_uniform(generator.random_raw(ahead * width)).reshape(ahead, -1)
             self._used[lane] = 0
         numbers: Array = self._drawn[lanes, self._used[lanes]]
@@ -97,21 +97,21 @@ class EpisodeStream:
         return numbers
 
 
-class Actor(Protocol):
-    """Who acts in every lane."""
+class BehaviourPolicy(Protocol):
+    """A policy that acts in all lanes."""
 
     def begin(self, lane: int, episode: int) -> None:
-        """An episode begins in a lane."""
+        """Begin an episode in a lane."""
 
     def act(self, s: Array, observation: Observation) -> Array:
-        """Actions `[B, A]`, of states `[B, S]` and joint observations `[B, S + 1 + n]`."""
+        """Actions `[B, A]` for states `[B, S]` and joint observations `[B, S + 1 + n]`."""
 
 
 class _Mixture:
     def __init__(self, task: Task, seed: int, nu: float, stream: str, lanes: int) -> None:
         self._nu = nu
-        self._optimal = Oracle(task, lanes)
-        self._noise = Oracle(noise_task(task, seed), lanes) if nu > 0.0 else None
+        self._optimal = OptimalPolicy(task, lanes)
+        self._noise = OptimalPolicy(noise_task(task, seed), lanes) if nu > 0.0 else None
         self._alpha = EpisodeStream(seed, f"{stream}/alpha", lanes, 1)
 
     def begin(self, lane: int, episode: int) -> None:
@@ -136,25 +136,25 @@ class _Random:
         return self._actions.next()
 
 
-class Constant:
-    """a = ½ in every channel: the policy that knows nothing."""
+class ConstantPolicy:
+    """a = ½ in every channel."""
 
     def __init__(self, task: Task, lanes: int) -> None:
         self._half = np.full((lanes, task.spec.action_dim), 0.5)
 
     def begin(self, lane: int, episode: int) -> None:
-        """Nothing to begin."""
+        """No effect."""
 
     def act(self, s: Array, observation: Observation) -> Array:
-        """½ everywhere."""
+        """½ in all entries."""
         return self._half
 
 
-class PolicyActor:
-    """A user's policy, deterministic, clipped as the environment clips it.
+class UserPolicy:
+    """A user's deterministic policy, clipped as the environment clips it.
 
     Args:
-      policy: ready to be asked.
+      policy: as returned by `as_policy`.
       state_dim: S.
     """
 
@@ -162,20 +162,20 @@ class PolicyActor:
         self._policy, self._state_dim = policy, state_dim
 
     def begin(self, lane: int, episode: int) -> None:
-        """Nothing to begin: it sees the observation alone."""
+        """No effect: its actions depend on the observation only."""
 
     def act(self, s: Array, observation: Observation) -> Array:
-        """Its actions in joint observations `[B, S + 1 + n]`.
+        """Its actions `[B, A]` for joint observations `[B, S + 1 + n]`.
 
         Raises:
-          PolicyError: it fails, or its actions cannot be used.
+          PolicyError: the policy fails, or its actions are invalid.
         """
         if isinstance(self._policy, Policy):
             return np.clip(_in_blocks(self._policy, observation), 0.0, 1.0)
         S = self._state_dim
         joint = []
         for agent, member in enumerate(self._policy.members):
-            # s, t/T, and this agent's own r_cum/k, of which it is shown its part.
+            # s, t/T and this agent's r_cum/k, of which it observes a part.
             single = observation[:, [*range(S + 1), S + 1 + agent]]
             acted = _in_blocks(member.policy, member.seen(single))
             joint.append(acted[:, : member.action_dim])
@@ -183,7 +183,7 @@ class PolicyActor:
 
 
 def _in_blocks(policy: Callable[[Observation], Array], observation: Observation) -> Array:
-    """The policy's actions, asked in blocks of one size; the last is filled by its last row."""
+    """The policy's actions, in calls of one size; the last row pads the last block."""
     rows = len(observation)
     missing = -rows % _BLOCK
     filled = np.concatenate([observation, np.repeat(observation[-1:], missing, axis=0)])
@@ -191,34 +191,34 @@ def _in_blocks(policy: Callable[[Observation], Array], observation: Observation)
     return np.concatenate(blocks)[:rows]
 
 
-def actor(
+def behaviour_policy(
     recipe: DatasetRecipe,
     index: int,
     task: Task,
     lanes: int,
     policy: Any = None,
     stream: str = "dataset",
-) -> Actor:
-    """Who acts as behaviour `index` of a recipe.
+) -> BehaviourPolicy:
+    """The policy of one of a recipe's behaviours.
 
     Args:
       recipe: the recipe.
-      index: which of its behaviours.
-      task: its task.
+      index: of the behaviour.
+      task: the recipe's task.
       lanes: B.
-      policy: what `evaluate` takes, where the behaviour is a policy.
-      stream: under which its own streams are.
+      policy: for a behaviour of kind "policy": anything that `evaluate` accepts.
+      stream: prefix of the names of its random streams.
 
     Raises:
       PolicyError, MissingDependencyError: the policy cannot be used.
     """
     behaviour: Behaviour = recipe.behaviours[index]
-    own = f"{stream}/{index}"
+    stream = f"{stream}/{index}"
     if behaviour.nu is not None:
-        return _Mixture(task, recipe.seed, behaviour.nu, own, lanes)
+        return _Mixture(task, recipe.seed, behaviour.nu, stream, lanes)
     if behaviour.kind == "random":
-        return _Random(task, recipe.seed, own, lanes)
+        return _Random(task, recipe.seed, stream, lanes)
     prepared = as_policy(
         policy, recipe.spec, action_range=behaviour.action_range, name=behaviour.policy
     )
-    return PolicyActor(prepared, recipe.spec.state_dim)
+    return UserPolicy(prepared, recipe.spec.state_dim)

@@ -1,9 +1,9 @@
-"""From a recipe to `Transitions`: many episodes of one task side by side, on the native batch.
+"""`collect`: generate the `Transitions` of a recipe, many episodes at once.
 
-Episode e of a behaviour is the same whatever runs beside it: its start, each α and its actions are
-of its own part of named streams, and lanes are bit-equal to single environments. So the number of
-lanes changes the time and not the numbers. A set is the first N rows of episodes 0, 1, 2, …, cut
-where N is reached. `B` lanes, `S` state_dim, `A` action_dim, `n` agents, T horizon.
+Episode e of a behaviour does not depend on what runs next to it: its start, each α and its actions
+come from its own part of named streams, and lanes are bit-equal to single environments. So the
+number of lanes changes the time and not the numbers. A data set is the first N rows of episodes
+0, 1, 2, …. `B` lanes, `S` state_dim, `A` action_dim, `n` agents, T horizon.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.arrays import Transitions, agents_of
-from sme_registry.datasets.behaviour import Actor, EpisodeStream, actor
+from sme_registry.datasets.arrays import Transitions, num_agents
+from sme_registry.datasets.behaviour import BehaviourPolicy, EpisodeStream, behaviour_policy
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
 from sme_registry.errors import OptionError
@@ -27,20 +27,20 @@ from sme_registry.task.memory import refuse_above_limit
 Progress = Callable[[int, int], None]
 
 _LANES = 512
-_STEPS = 10**8  # of the environment, beyond which a sub-cube is too small to be collected in
+_MAX_STEPS = 10**8  # of the environment; a sub-cube that needs more is too small
 
 
 class Rows(NamedTuple):
-    """Transitions as they were made, `M` of them; `[M]` where no shape is given.
+    """`M` transitions as arrays; of shape `[M]` unless another one is given.
 
     Attributes:
-      episode, t: which episode of its behaviour, and steps done before this one.
+      episode, t: index of the episode of its behaviour, and steps before this one.
       state, next_state: `[M, S]`.
       observation, next_observation: `[M, S + 1 + n]` float32.
       action: `[M, A]` float32.
       optimal: `[M, A]`.
       values: `[M, 4, n]` similarity, step reward, regret, reward.
-      terminated, truncated: by the task.
+      terminated, truncated: as the task ends episodes.
     """
 
     episode: npt.NDArray[np.int64]
@@ -56,14 +56,14 @@ class Rows(NamedTuple):
     truncated: npt.NDArray[np.bool_]
 
 
-def lanes_for(recipe: DatasetRecipe, share: int) -> int:
-    """How many episodes to run at once: as many as there are to run, within reason."""
+def default_lanes(recipe: DatasetRecipe, rows: int) -> int:
+    """The number of episodes to run at once: about as many as `rows` need, at most 512."""
     per_episode = recipe.spec.horizon * _kept_share(recipe)
-    return int(max(1, min(_LANES, -(-share // max(per_episode, 1e-6)))))
+    return int(max(1, min(_LANES, -(-rows // max(per_episode, 1e-6)))))
 
 
 def _kept_share(recipe: DatasetRecipe) -> float:
-    """The share of uniform states that lies in the recipe's sub-cube."""
+    """The fraction of uniform states that lies in the recipe's sub-cube."""
     return float((1.0 + (recipe.coverage or 0.0)) ** recipe.spec.state_dim)
 
 
@@ -75,82 +75,82 @@ def collect(
     lanes: int | None = None,
     progress: Progress | None = None,
 ) -> Transitions:
-    """Make the transitions of a recipe.
+    """Generate the transitions of a recipe.
 
     Args:
       recipe: the recipe.
-      task: its task, drawn.
-      policies: by the index of their behaviour, those that are the user's.
-      lanes: episodes at once; None takes `lanes_for`. The numbers do not depend on it.
-      progress: called after each step with the transitions made and those wanted.
+      task: its materialised task.
+      policies: the user's policies, by the index of their behaviour.
+      lanes: episodes at once; None takes `default_lanes`. The numbers do not depend on it.
+      progress: called after each step with the transitions collected and their total.
 
     Returns:
-      Exactly `recipe.transitions` of them, behaviour after behaviour.
+      Exactly `recipe.transitions` of them, one behaviour after another.
 
     Raises:
-      OptionError: hardly any state lies in the sub-cube.
-      ResourceLimitError: the set would not fit in memory.
+      OptionError: the sub-cube is too small.
+      ResourceLimitError: the data set would not fit in memory.
       PolicyError, MissingDependencyError: a policy cannot be used.
     """
     spec = recipe.spec
-    S, A, n = spec.state_dim, spec.action_dim, agents_of(spec)
+    S, A, n = spec.state_dim, spec.action_dim, num_agents(spec)
     refuse_above_limit(
         3 * recipe.transitions * (24 * S + 12 * A + 48 * n + 64),
-        f"transitions={recipe.transitions}: a set of state_dim={S}, action_dim={A}",
-        "Make fewer, or several sets under different seeds.",
+        f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}",
+        "Collect fewer, or several data sets with different seeds.",
     )
     done = 0
     parts = []
     for index, share in enumerate(recipe.shares):
-        wide = lanes or lanes_for(recipe, share)
-        acting = actor(recipe, index, task, wide, (policies or {}).get(index))
+        num_lanes = lanes or default_lanes(recipe, share)
+        policy = behaviour_policy(recipe, index, task, num_lanes, (policies or {}).get(index))
 
-        def made(count: int, before: int = done) -> None:
+        def report(count: int, before: int = done) -> None:
             if progress is not None:
                 progress(before + count, recipe.transitions)
 
         rows = rollout(
             task,
-            acting,
-            EpisodeStream(recipe.seed, f"dataset/{index}/start", wide, S, ahead=1),
-            wide,
+            policy,
+            EpisodeStream(recipe.seed, f"dataset/{index}/start", num_lanes, S, ahead=1),
+            num_lanes,
             rows=share,
             coverage=recipe.coverage,
-            made=made,
+            progress=report,
         )
         parts.append(rows)
         done += share
-    return _joined(parts, spec.team is not None)
+    return _concatenate(parts, spec.team is not None)
 
 
 def rollout(
     task: Task,
-    acting: Actor,
+    policy: BehaviourPolicy,
     starts: EpisodeStream,
     lanes: int,
     *,
     rows: int,
     coverage: float | None = None,
-    made: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Rows:
-    """The first `rows` transitions of episodes 0, 1, 2, … that are acted in the sub-cube.
+    """The first `rows` transitions of episodes 0, 1, 2, … whose states are in the sub-cube.
 
     Args:
       task: the task.
-      acting: who acts.
-      starts: a state of each episode, as its first numbers.
-      lanes: episodes at once.
-      rows: how many to keep.
+      policy: the policy that acts.
+      starts: the first numbers of each episode are its initial state.
+      lanes: B, episodes at once.
+      rows: transitions to keep.
       coverage: ε of the sub-cube; None keeps all.
-      made: called after each step with the rows that are there.
+      progress: called after each step with the rows collected.
 
     Raises:
-      OptionError: hardly any state lies in the sub-cube.
-      PolicyError: who acts fails.
+      OptionError: the sub-cube is too small.
+      PolicyError: the policy fails.
     """
     expected = rows / (1.0 + (coverage or 0.0)) ** task.spec.state_dim
-    if expected > _STEPS and expected > rows:
-        raise _too_small(coverage, f"of {rows:,} transitions, about {expected:.1g} steps are due")
+    if expected > _MAX_STEPS and expected > rows:
+        raise _too_small(coverage, f"{rows:,} transitions need about {expected:.1g} steps")
     patience = max(10**6, 20 * expected)
 
     batch = Batch(task, lanes)
@@ -158,104 +158,94 @@ def rollout(
     episode = np.zeros(lanes, np.int64)
     t = np.zeros(lanes, np.int64)
     observation = batch.observe()
-    kept = _Kept(rows)
+    collected = _Collected(rows)
 
     def begin(ended: npt.NDArray[np.int64]) -> None:
         for lane in ended.tolist():
-            episode[lane] = kept.new_episode()
+            episode[lane] = collected.new_episode()
             starts.begin(lane, int(episode[lane]))
-            acting.begin(lane, int(episode[lane]))
+            policy.begin(lane, int(episode[lane]))
         t[ended] = 0
         batch.begin(ended, observation, starts.next(ended))
 
     begin(every)
     s = batch.state
     steps = 0
-    while not kept.enough:
-        # What the environment is given is what the set holds: float32, in the unit range.
-        action = np.clip(acting.act(s, observation), 0.0, 1.0).astype(np.float32)
-        given = batch.advance(action.astype(np.float64))
-        moved = batch.state
+    while not collected.complete:
+        # The environment executes exactly what the data set stores: float32 in the unit range.
+        action = np.clip(policy.act(s, observation), 0.0, 1.0).astype(np.float32)
+        step = batch.advance(action.astype(np.float64))
+        next_s = batch.state
         inside = every if coverage is None else np.flatnonzero(expansion(s) <= coverage)
-        kept.add(
-            Rows(
-                episode[inside],
-                t[inside],
-                s[inside],
-                moved[inside],
-                observation[inside],
-                given.observation[inside],
-                action[inside],
-                given.optimal[inside],
-                given.values[:4, :, inside].transpose(2, 0, 1),
-                given.terminated[inside],
-                given.truncated[inside],
-            )
-        )
+        columns = (
+            episode, t, s, next_s, observation, step.observation, action, step.optimal,
+            step.values[:4].transpose(2, 0, 1), step.terminated, step.truncated,
+        )  # fmt: skip
+        collected.add(Rows._make(column[inside] for column in columns))
         t += 1
         steps += lanes
-        observation = given.observation
-        ended = np.flatnonzero(given.terminated | given.truncated)
+        observation = step.observation
+        ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended):
-            kept.finish(episode[ended])
+            collected.finish(episode[ended])
             begin(ended)
             s = batch.state
         else:
-            s = moved
-        if made is not None:
-            made(min(rows, kept.count))
-        if steps > patience and kept.count < rows:
-            raise _too_small(coverage, f"{steps:,} steps gave {kept.count:,} transitions")
-    return kept.rows()
+            s = next_s
+        if progress is not None:
+            progress(min(rows, collected.count))
+        if steps > patience and collected.count < rows:
+            raise _too_small(coverage, f"{steps:,} steps gave {collected.count:,} transitions")
+    return collected.rows()
 
 
-def _too_small(coverage: float | None, found: str) -> OptionError:
+def _too_small(coverage: float | None, reason: str) -> OptionError:
     return OptionError(
-        f"coverage={coverage}: {found}: must leave states that episodes pass through. Give one "
-        "nearer to 0 (the share of uniform states that is kept is (1 + ε)^S), or fewer transitions."
+        f"coverage={coverage}: {reason}: must be closer to 0 for this state_dim (it keeps a "
+        "fraction (1 + ε)^S of uniform states). Give a larger value, or fewer transitions."
     )
 
 
-class _Kept:
-    """The rows so far, and whether the first `wanted` of them, by episode and step, are there."""
+class _Collected:
+    """The rows so far, and whether they include the first `wanted` by episode and step."""
 
     def __init__(self, wanted: int) -> None:
         self._wanted = wanted
         self._parts: list[Rows] = []
-        self._of_episode = np.zeros(1024, np.int64)
+        self._rows_of = np.zeros(1024, np.int64)
         self._finished = np.zeros(1024, bool)
-        self._begun = 0
+        self._episodes = 0
         self._first_running, self._settled = 0, 0
         self.count = 0
 
     def new_episode(self) -> int:
-        """The number of the next episode."""
-        if self._begun + 1 == len(self._finished):  # one more than has begun, never finished
-            self._of_episode = np.concatenate([self._of_episode, np.zeros_like(self._of_episode)])
+        """The index of the next episode."""
+        if self._episodes + 1 == len(self._finished):  # keep one entry that is never finished
+            self._rows_of = np.concatenate([self._rows_of, np.zeros_like(self._rows_of)])
             self._finished = np.concatenate([self._finished, np.zeros_like(self._finished)])
-        self._begun += 1
-        return self._begun - 1
+        self._episodes += 1
+        return self._episodes - 1
 
     def add(self, rows: Rows) -> None:
-        """One step of the lanes that are kept; no episode twice."""
+        """Add one step of some lanes; no episode twice."""
         self._parts.append(rows)
-        self._of_episode[rows.episode] += 1
+        self._rows_of[rows.episode] += 1
         self.count += len(rows.t)
 
     def finish(self, episodes: npt.NDArray[np.int64]) -> None:
-        """These episodes are over."""
+        """Mark episodes as finished."""
         self._finished[episodes] = True
         while self._finished[self._first_running]:
-            self._settled += int(self._of_episode[self._first_running])
+            self._settled += int(self._rows_of[self._first_running])
             self._first_running += 1
 
     @property
-    def enough(self) -> bool:
-        """Whether no episode that runs on, or is yet to come, can give one of the first rows."""
-        return self._settled + int(self._of_episode[self._first_running]) >= self._wanted
+    def complete(self) -> bool:
+        """Whether no running or future episode can contribute one of the first `wanted` rows."""
+        return self._settled + int(self._rows_of[self._first_running]) >= self._wanted
 
     def rows(self) -> Rows:
-        """The first `wanted` rows in order."""
+        """The first `wanted` rows, by episode and step."""
         episode = np.concatenate([part.episode for part in self._parts])
         t = np.concatenate([part.t for part in self._parts])
         first = np.lexsort((t, episode))[: self._wanted]
@@ -264,8 +254,8 @@ class _Kept:
         )
 
 
-def _joined(parts: list[Rows], team: bool) -> Transitions:
-    """The parts of all behaviours, their trajectories numbered through."""
+def _concatenate(parts: list[Rows], team: bool) -> Transitions:
+    """The rows of all behaviours as one data set, its trajectories numbered from 0."""
     rows = Rows._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
     component = np.repeat(np.arange(len(parts)), [len(part.t) for part in parts])
     # A trajectory ends where the next row is not its next step.
@@ -277,7 +267,7 @@ def _joined(parts: list[Rows], team: bool) -> Transitions:
     )
     similarity, step_reward, regret, reward = np.moveaxis(rows.values, 1, 0)
 
-    def own(values: Array) -> Array:
+    def by_agent(values: Array) -> Array:
         return values.copy() if team else values[:, 0].copy()
 
     return Transitions(
@@ -288,9 +278,9 @@ def _joined(parts: list[Rows], team: bool) -> Transitions:
         terminations=rows.terminated,
         timeouts=ends & ~rows.terminated,
         optimal_actions=rows.optimal,
-        regrets=own(regret),
-        similarities=own(similarity),
-        step_rewards=own(step_reward),
+        regrets=by_agent(regret),
+        similarities=by_agent(similarity),
+        step_rewards=by_agent(step_reward),
         states=rows.state,
         next_states=rows.next_state,
         episodes=np.concatenate([[0], np.cumsum(ends)[:-1]]).astype(np.int64),

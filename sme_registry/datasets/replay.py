@@ -1,7 +1,7 @@
-"""`replay`: every transition of a set once more through its task, from the definition.
+"""`replay`: check every transition of a data set against its task, from the definition.
 
-What is in a file is believed only where the task says the same: the next state to the bit, π*, r̃, r
-and what was paid to 1e-12, and that rows of a trajectory follow one another.
+The next state must agree to the bit; π*, r̃, r and the reward to 1e-12; and the rows of a trajectory
+must follow one another.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.arrays import Transitions, agents_of
+from sme_registry.datasets.arrays import Transitions, num_agents
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.errors import FingerprintMismatchError
 from sme_registry.evaluation.regions import expansion
@@ -19,32 +19,32 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
 TOLERANCE = 1e-12
-_ROUNDED = 1e-6  # of r_cum/k where a trajectory begins within an episode: it is seen as float32
+_ROUNDED = 1e-6  # of r_cum/k of a trajectory that begins within an episode: stored as float32
 _BLOCK = 4096
 
 
 def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
-    """Check a set against its task.
+    """Check a data set against its task.
 
     Args:
-      transitions: the set.
-      recipe: what it says it was made from.
-      task: the recipe's task, drawn here.
+      transitions: the data set.
+      recipe: its recipe.
+      task: the recipe's task, materialised on this machine.
 
     Raises:
-      FingerprintMismatchError: names the first array and row that the task contradicts.
+      FingerprintMismatchError: names the first array and row that differ from the task's.
     """
-    spec, n = recipe.spec, agents_of(recipe.spec)
+    spec, n = recipe.spec, num_agents(recipe.spec)
     S, T, N = spec.state_dim, spec.horizon, len(transitions)
     a = transitions.actions.astype(np.float64)
     optimal = np.concatenate(
         [task.policy(transitions.states[first : first + _BLOCK]) for first in range(0, N, _BLOCK)]
     )
     similarity = task.similarities_of(a, optimal)
-    paid_for = similarity
+    rewarded = similarity
     if task.pays_the_team:
-        paid_for = np.broadcast_to(task.similarity_of(a, optimal)[:, None], similarity.shape)
-    step_reward = task.reward_of(paid_for)
+        rewarded = np.broadcast_to(task.similarity_of(a, optimal)[:, None], similarity.shape)
+    step_reward = task.reward_of(rewarded)
 
     _same("next_states", transitions.next_states, task.transition(transitions.states, a))
     _same("optimal_actions", transitions.optimal_actions, optimal, TOLERANCE)
@@ -59,13 +59,13 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
         ("observations", transitions.observations, transitions.states, t),
         ("next_observations", transitions.next_observations, transitions.next_states, t + 1),
     ):
-        shown = np.column_stack([s, step / T]).astype(np.float32)
-        _same(name, seen[:, : S + 1], shown)
+        inputs = np.column_stack([s, step / T]).astype(np.float32)
+        _same(name, seen[:, : S + 1], inputs)
 
     ends = transitions.terminations | transitions.timeouts
     inner = np.flatnonzero(~ends)
     if not ends[-1]:
-        raise _contradicted("timeouts", N - 1, "the last row must end its trajectory")
+        raise _mismatch("timeouts", N - 1, "the last row must end its trajectory")
     for before, after in (("next_states", "states"), ("next_observations", "observations")):
         _same(before, getattr(transitions, before)[inner], getattr(transitions, after)[inner + 1])
     _same("timeouts", ends | (t + 1 < T), np.ones(N, bool))
@@ -73,52 +73,55 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
     if recipe.coverage is not None:
         _same("states", expansion(transitions.states) <= recipe.coverage, np.ones(N, bool))
 
-    given = transitions.rewards[:, None]
+    rewards = transitions.rewards[:, None]
     if transitions.agent_rewards is not None:
-        given = transitions.agent_rewards
-        _same("rewards", transitions.rewards, given.mean(axis=1), TOLERANCE)
-    reward, allowed = _paid(transitions, step_reward, t, spec.k, T)
-    _same("rewards", given, reward, allowed)
+        rewards = transitions.agent_rewards
+        _same("rewards", transitions.rewards, rewards.mean(axis=1), TOLERANCE)
+    expected, tolerance = _rewards(transitions, step_reward, t, spec.k, T)
+    _same("rewards", rewards, expected, tolerance)
 
 
-def _paid(
+def _rewards(
     transitions: Transitions, step_reward: Array, t: npt.NDArray[np.int64], k: int, horizon: int
 ) -> tuple[Array, Array]:
-    """R of each row and agent, `[N, n]`, and to what it must agree, `[N, 1]`."""
+    """R of each row and agent `[N, n]`, and its tolerance `[N, 1]`."""
     starts = np.concatenate([[0], transitions.ends[:-1]])
     lengths = np.diff([*starts, len(t)])
     S = transitions.states.shape[1]
     accumulated = transitions.observations[starts, S + 1 :].astype(np.float64) * k
-    allowed = k * np.where(np.repeat(t[starts], lengths) == 0, TOLERANCE, _ROUNDED)
+    tolerance = k * np.where(np.repeat(t[starts], lengths) == 0, TOLERANCE, _ROUNDED)
     reward = np.empty_like(step_reward)
-    for step in range(int(lengths.max())):  # step by step, all trajectories side by side
+    for step in range(int(lengths.max())):  # all trajectories at once
         running = np.flatnonzero(lengths > step)
         rows = starts[running] + step
         total = accumulated[running] + step_reward[rows]
         paid = (((t[rows] + 1) % k == 0) | (t[rows] + 1 >= horizon))[:, None]
         reward[rows] = np.where(paid, total, 0.0)
         accumulated[running] = np.where(paid, 0.0, total)
-    return reward, allowed[:, None]
+    return reward, tolerance[:, None]
 
 
 def _same(
-    name: str, found: npt.NDArray[Any], right: npt.NDArray[Any], allowed: float | Array = 0.0
+    name: str,
+    values: npt.NDArray[Any],
+    expected: npt.NDArray[Any],
+    tolerance: float | Array = 0.0,
 ) -> None:
-    """Raise at the first row where an array is not what it must be.
+    """Check that an array has the expected values.
 
     Raises:
-      FingerprintMismatchError: says which and how far off.
+      FingerprintMismatchError: names the first row that differs, and by how much.
     """
-    off = np.abs(found.astype(np.float64) - right.astype(np.float64))
-    wrong = ~(off <= allowed)
+    difference = np.abs(values.astype(np.float64) - expected.astype(np.float64))
+    wrong = ~(difference <= tolerance)
     if wrong.any():
         row = int(np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))[0])
-        raise _contradicted(name, row, f"off by {np.max(off[row]):.3g}")
+        raise _mismatch(name, row, f"off by {np.max(difference[row]):.3g}")
 
 
-def _contradicted(name: str, row: int, what: str) -> FingerprintMismatchError:
+def _mismatch(name: str, row: int, reason: str) -> FingerprintMismatchError:
     return FingerprintMismatchError(
-        f"{name}, row {row}: {what}: the set's numbers are not those of the task drawn on this "
-        "machine. If the file was edited, take it again from its source. If not, this machine's "
-        "NumPy or SciPy draws other numbers: install the versions that the set names."
+        f"{name}, row {row}: {reason}: the data set differs from its task as materialised on this "
+        "machine. If the file was edited, download the data set again. Otherwise NumPy or SciPy "
+        "compute other numbers here: install the versions recorded in the data set."
     )

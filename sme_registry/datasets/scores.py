@@ -1,8 +1,8 @@
-"""What a set's behaviour is worth, beside the policies that know nothing and everything.
+"""Reference scores of a data set: of its behaviour, of the constant ½, and of the optimum.
 
-On the set's own states the numbers are exact: π* is known there. By rollout they are means over
-episodes of their own starts, with standard errors; the optimum's return is T, by construction. Of a
-team every number is the mean over its agents.
+On the data set's own states they are exact, because π* is known there. By rollouts they are means
+over whole episodes with their own starts, with standard errors; the optimum's return is T by
+construction. For a team every number is the mean over its agents.
 """
 
 from __future__ import annotations
@@ -14,7 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from sme_registry.datasets.arrays import Transitions
-from sme_registry.datasets.behaviour import Actor, Constant, EpisodeStream, actor
+from sme_registry.datasets.behaviour import (
+    BehaviourPolicy,
+    ConstantPolicy,
+    EpisodeStream,
+    behaviour_policy,
+)
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
 from sme_registry.spec import Integer, Real, StrictModel
@@ -22,7 +27,7 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
 EPISODES = 100
-_MAX_STEPS = 10**5  # of one reference's rollouts, over all its episodes
+_MAX_STEPS = 10**5  # of the rollouts of one policy, over all episodes
 
 Share = Annotated[Real, Field(ge=0, le=1)]
 
@@ -31,10 +36,10 @@ class Rollouts(StrictModel):
     """Whole episodes of a policy.
 
     Attributes:
-      episodes: how many; 0 where the number is exact without them.
+      episodes: their number; 0 if the values are exact without rollouts.
       mean_return: mean sum of rewards, in [0, T].
       standard_error: of that mean, over episodes.
-      similarity: mean r̃ over their steps.
+      similarity: mean r̃ over all steps.
     """
 
     episodes: Integer
@@ -44,11 +49,11 @@ class Rollouts(StrictModel):
 
 
 class PolicyScore(StrictModel):
-    """What one policy scores.
+    """The scores of one policy.
 
     Attributes:
-      similarity, step_reward: mean r̃ and r over the set's own states.
-      rollouts: over episodes of its own; null where the horizon is too long for them.
+      similarity, step_reward: mean r̃ and r over the data set's states.
+      rollouts: over whole episodes; null if the horizon is too long for them.
     """
 
     similarity: Share
@@ -57,13 +62,13 @@ class PolicyScore(StrictModel):
 
 
 class ReferenceScores(StrictModel):
-    """The references of a set.
+    """The reference scores of a data set.
 
     Attributes:
-      constant: a = ½, the floor.
-      behaviour: what acted in the set.
-      behaviours: each of the recipe's behaviours, over the rows in which it acted.
-      optimum: π*.
+      constant: of a = ½, the lower reference.
+      behaviour: of the policies that collected the data set.
+      behaviours: of each of the recipe's behaviours, over the rows in which it acted.
+      optimum: of π*.
     """
 
     constant: PolicyScore
@@ -78,50 +83,45 @@ def reference_scores(
     transitions: Transitions,
     policies: dict[int, object] | None = None,
 ) -> ReferenceScores:
-    """The scores of the set's behaviour, of a = ½, and of π*.
+    """The scores of the data set's behaviour, of a = ½ and of π*.
 
     Args:
-      recipe: what the set was made from.
+      recipe: of the data set.
       task: its task.
-      transitions: the set.
-      policies: by the index of their behaviour, those that are the user's.
+      transitions: the data set.
+      policies: the user's policies, by the index of their behaviour.
     """
     T = recipe.spec.horizon
     episodes = min(EPISODES, _MAX_STEPS // T)
 
-    def rolled_out(acting: Actor, index: int) -> Rollouts | None:
+    def rollouts(policy: BehaviourPolicy, index: int) -> Rollouts | None:
         if episodes == 0:
             return None
         starts = EpisodeStream(
             recipe.seed, f"dataset/reference/{index}/start", episodes, task.spec.state_dim, ahead=1
         )
-        return _rollouts(*play(task, acting, starts, episodes))
+        return _rollouts(*play(task, policy, starts, episodes))
 
     behaviours = []
     for index in range(len(recipe.behaviours)):
-        own = transitions.components == index
-        acting = actor(
+        rows = transitions.components == index
+        policy = behaviour_policy(
             recipe, index, task, max(1, episodes), (policies or {}).get(index), "dataset/reference"
         )
         behaviours.append(
             PolicyScore(
-                similarity=_mean(transitions.similarities[own]),
-                step_reward=_mean(transitions.step_rewards[own]),
-                rollouts=rolled_out(acting, index),
+                similarity=_mean(transitions.similarities[rows]),
+                step_reward=_mean(transitions.step_rewards[rows]),
+                rollouts=rollouts(policy, index),
             )
         )
-    optimal = transitions.optimal_actions
-    half = task.similarities_of(np.full_like(optimal, 0.5), optimal)
-    paid_for = half
-    if task.pays_the_team:  # for the mean over all channels, of which agents own unequal numbers
-        paid_for = half @ np.array([own.stop - own.start for own in task.owned])
-        paid_for = paid_for / recipe.spec.action_dim
+    similarity, step_reward = _constant_similarity_and_reward(task, transitions)
     weights = [behaviour.weight for behaviour in recipe.behaviours]
     return ReferenceScores(
         constant=PolicyScore(
-            similarity=_mean(half),
-            step_reward=_mean(task.reward_of(paid_for)),
-            rollouts=rolled_out(Constant(task, max(1, episodes)), 0),
+            similarity=similarity,
+            step_reward=step_reward,
+            rollouts=rollouts(ConstantPolicy(task, max(1, episodes)), 0),
         ),
         behaviour=PolicyScore(
             similarity=_mean(transitions.similarities),
@@ -137,35 +137,46 @@ def reference_scores(
     )
 
 
+def _constant_similarity_and_reward(task: Task, transitions: Transitions) -> tuple[float, float]:
+    """Mean r̃ and r of a = ½ on the data set's states."""
+    optimal = transitions.optimal_actions
+    similarity = task.similarities_of(np.full_like(optimal, 0.5), optimal)
+    rewarded = similarity
+    if task.pays_the_team:  # the mean over all channels, of which agents own unequal numbers
+        channels = np.array([owned.stop - owned.start for owned in task.owned])
+        rewarded = (similarity @ channels) / task.spec.action_dim
+    return _mean(similarity), _mean(task.reward_of(rewarded))
+
+
 def play(
-    task: Task, acting: Actor, starts: EpisodeStream, lanes: int
+    task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int
 ) -> tuple[Array, Array, Array]:
-    """One whole episode in each lane.
+    """Play one whole episode in each lane.
 
     Args:
       task: the task.
-      acting: who acts.
-      starts: a state of each episode.
-      lanes: B, the episodes.
+      policy: the policy that acts.
+      starts: the first numbers of each episode are its initial state.
+      lanes: B, the number of episodes.
 
     Returns:
-      `[B]` each: the return, the sum of r̃, and the steps; of a team the mean over its agents.
+      `[B]` each: return, sum of r̃, and number of steps; for a team the means over its agents.
     """
     batch, every = Batch(task, lanes), np.arange(lanes)
     for lane in every.tolist():
         starts.begin(lane, lane)
-        acting.begin(lane, lane)
+        policy.begin(lane, lane)
     observation = batch.observe()
     batch.begin(every, observation, starts.next())
     running = np.ones(lanes, bool)
     sums = np.zeros((3, lanes))
     while running.any():
-        action = np.clip(acting.act(batch.state, observation), 0.0, 1.0).astype(np.float32)
-        given = batch.advance(action.astype(np.float64))
-        similarity, reward = given.values[0].mean(axis=0), given.values[3].mean(axis=0)
+        action = np.clip(policy.act(batch.state, observation), 0.0, 1.0).astype(np.float32)
+        step = batch.advance(action.astype(np.float64))
+        similarity, reward = step.values[0].mean(axis=0), step.values[3].mean(axis=0)
         sums += running * np.stack([reward, similarity, np.ones(lanes)])
-        running &= ~(given.terminated | given.truncated)
-        observation = given.observation
+        running &= ~(step.terminated | step.truncated)
+        observation = step.observation
     returns, similarities, steps = sums
     return returns, similarities, steps
 
@@ -182,7 +193,7 @@ def _rollouts(returns: Array, similarities: Array, steps: Array) -> Rollouts:
 
 
 def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts | None:
-    """The mean over behaviours by their weights, as if each were a policy of its own."""
+    """The mean over behaviours by their weights; None if one is None."""
     known = [score for score in scores if score is not None]
     if len(known) < len(scores):
         return None

@@ -17,7 +17,7 @@ import pytest
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, to_d3rlpy
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -29,7 +29,7 @@ D3RLPY = os.environ.get("SME_D3RLPY_PYTHON") or (
 
 def made(**fields):
     spec = SMESpec(horizon=20, **fields)
-    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(0.8),), transitions=250)
+    recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.8),), transitions=250)
     return collect(recipe, materialize(spec))
 
 

@@ -10,9 +10,9 @@ import pytest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
-from sme_registry.datasets.behaviour import EpisodeStream, Oracle, noise_task
+from sme_registry.datasets.behaviour import EpisodeStream, OptimalPolicy, noise_task
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.errors import (
     FingerprintMismatchError,
     OptionError,
@@ -38,7 +38,7 @@ HALVES = [(0.6, 0.5), ("random", 0.5)]
 
 
 def recipe(spec=None, acting=((0.5, 1.0),), **fields):
-    behaviours = [behaviour_of(what, weight) for what, weight in acting]
+    behaviours = [parse_behaviour(what, weight) for what, weight in acting]
     plain = {"spec": SMESpec.from_dict(spec or {}), "behaviours": behaviours, "transitions": 700}
     return DatasetRecipe.from_dict({**plain, **fields})
 
@@ -201,7 +201,7 @@ def test_coverage_zero_keeps_everything():
 
 
 def test_a_sub_cube_that_hardly_any_state_lies_in_is_refused_before_the_work():
-    with pytest.raises(OptionError, match=r"coverage=-0\.99: of 700 transitions, about"):
+    with pytest.raises(OptionError, match=r"coverage=-0\.99: 700 transitions need about"):
         made(recipe(coverage=-0.99))
 
 
@@ -306,10 +306,10 @@ def test_an_episodes_numbers_are_its_own():
 def test_the_oracle_is_the_optimal_policy_whatever_stands_beside_a_state():
     task = materialize(SMESpec(complexity=10))
     s = np.random.default_rng(0).random((50, 8))
-    together = Oracle(task, 50)(s).copy()
+    together = OptimalPolicy(task, 50)(s).copy()
     np.testing.assert_allclose(together, task.optimal_action(s), atol=1e-12)
     for lane in (0, 17, 49):
-        np.testing.assert_array_equal(Oracle(task, 1)(s[lane : lane + 1])[0], together[lane])
+        np.testing.assert_array_equal(OptimalPolicy(task, 1)(s[lane : lane + 1])[0], together[lane])
 
 
 def test_the_environment_takes_the_actions_of_a_set_as_they_are():

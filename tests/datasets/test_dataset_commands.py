@@ -137,10 +137,10 @@ def test_a_trained_policys_onnx_acts_as_its_zip_does(tmp_path):
         (["--mix", "random"], "must be nu=NU:WEIGHT"),
         (["--mix", "policy=no.zip:1"], "no.zip: cannot be read: No such file"),
         (["--mix", "policy=no.onnx:1"], "Give the path of a saved model (.zip or .onnx)"),
-        (["--nu", "0.5", "--mix", "random:1"], "give one of the two"),
+        (["--nu", "0.5", "--mix", "random:1"], "give only one of them"),
         (["--name", "a.b-v0"], "name='a.b-v0': must be [namespace/]name-v<number>"),
         (["--coverage", "0.2"], "coverage=0.2: must be"),
-        (["--coverage", "-0.99"], "coverage=-0.99: of 50 transitions"),
+        (["--coverage", "-0.99"], "coverage=-0.99: 50 transitions"),
         (["-n", "0"], "transitions=0: must be an integer in [1, "),
         (["--seed", "-1"], "seed=-1: must be an integer in [0, "),
         (["--protocol", "paper-v9"], "'paper-v9': no protocol"),
@@ -154,16 +154,16 @@ def test_bad_input_is_one_line_and_makes_nothing(arguments, message, tmp_path):
     assert not (tmp_path / "minari").exists()
 
 
-def test_a_set_that_is_there_is_kept_unless_told():
+def test_an_existing_data_set_is_kept_without_force():
     good("make", "Default", "-n", "50")
-    assert "is there already, and is the same set. Give" in refused("make", "Default", "-n", "50")
-    for asked, said in [
-        (["-n", "60"], "transitions 50, asked for 60."),
-        (["-n", "50", "--coverage", "0"], "coverage None, asked for 0.0."),
-        (["-n", "60", "--protocol", "quick-v1"], "transitions 50, asked for 60; protocol.states"),
+    assert "already exists and is the same data set. Give" in refused("make", "Default", "-n", "50")
+    for options, difference in [
+        (["-n", "60"], "transitions 50, requested 60."),
+        (["-n", "50", "--coverage", "0"], "coverage None, requested 0.0."),
+        (["-n", "60", "--protocol", "quick-v1"], "transitions 50, requested 60; protocol.states"),
     ]:
-        message = refused("make", "Default", *asked)
-        assert f"is there already, of another recipe: {said}" in message
+        message = refused("make", "Default", *options)
+        assert f"already exists, with another recipe: {difference}" in message
         assert "--force to replace it" in message
     good("make", "Default", "-n", "60", "--force")
     assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
@@ -187,13 +187,13 @@ def test_a_copy_under_another_name_is_not_listed_and_not_valid(tmp_path):
     shutil.copytree(tmp_path / "minari" / own, tmp_path / "minari/sme/Copy-v0")
     listed = good("list")
     assert listed.stdout.count(own) == 1
-    told = " ".join(listed.stderr.split())
-    assert "not listed:" in told
+    stderr = " ".join(listed.stderr.split())
+    assert "not listed:" in stderr
     back = tmp_path / "minari" / own
-    assert f"sme/Copy-v0: holds the set {own}: move or copy it back to {back}, or" in told
+    assert f"sme/Copy-v0: contains the data set {own}. Move or copy it back to {back}, or" in stderr
     assert [found["id"] for found in json.loads(good("list", "--json").stdout)] == [own]
     for name in ("sme/Copy-v0", "minari/sme/Copy-v0"):
-        assert f"Copy-v0: holds the set {own}" in refused("validate", name)
+        assert f"Copy-v0: contains the data set {own}" in refused("validate", name)
     shutil.copytree(tmp_path / "minari" / own, tmp_path / "backup" / own)
     good("validate", own, f"minari/{own}", f"backup/{own}")
 

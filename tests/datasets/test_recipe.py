@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sme_registry.datasets import Behaviour, DatasetRecipe
-from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.datasets.recipe import parse_behaviour
 from sme_registry.errors import PolicyError, SMEError, SpecError
 
 FIELDS = {"spec": {}, "behaviours": [{"kind": "mixture", "nu": 0.5}]}
@@ -44,26 +44,26 @@ def test_the_fields_in_which_recipes_differ_are_named_with_both_values():
     assert recipe().differences(recipe()) == []
     asked = recipe(transitions=200, spec={"complexity": 10}, coverage=-0.2, protocol={"seed": 1})
     assert recipe().differences(asked) == [
-        "spec.complexity 1, asked for 10",
-        "transitions 50000, asked for 200",
-        "coverage None, asked for -0.2",
-        "protocol.seed 0, asked for 1",
+        "spec.complexity 1, requested 10",
+        "transitions 50000, requested 200",
+        "coverage None, requested -0.2",
+        "protocol.seed 0, requested 1",
     ]
 
 
 def test_behaviours_that_differ_are_named_by_their_place_or_their_number():
     halves = recipe(behaviours=weights(0.5, 0.5))
     assert halves.differences(recipe(behaviours=weights(0.5, 0.25, 0.25))) == [
-        "behaviours of 2 entries, asked for 3"
+        "behaviours of 2 entries, requested 3"
     ]
     assert halves.differences(recipe(behaviours=weights(0.25, 0.75))) == [
-        "behaviours.0.weight 0.5, asked for 0.25",
-        "behaviours.1.weight 0.5, asked for 0.75",
+        "behaviours.0.weight 0.5, requested 0.25",
+        "behaviours.1.weight 0.5, requested 0.75",
     ]
     file = {"kind": "policy", "policy": "x", "sha256": "sha256:" + "0" * 64}
     named = recipe(behaviours=[{"kind": "policy", "policy": "x"}])
     (line,) = named.differences(recipe(behaviours=[file]))
-    assert line.startswith("behaviours.0.sha256 None, asked for 'sha256:000")
+    assert line.startswith("behaviours.0.sha256 None, requested 'sha256:000")
 
 
 @pytest.mark.parametrize("nu", [-0.01, 1.01, float("nan"), float("inf"), "0.5", True])
@@ -86,7 +86,7 @@ def test_weights_that_only_floating_point_keeps_from_one_are_taken():
 @pytest.mark.parametrize("weight", [0.0, -0.5, 1.5, float("nan")])
 def test_a_weight_outside_its_range_is_refused(weight):
     with pytest.raises(SpecError, match=r"weight=.*must be a finite number in \(0, 1\]"):
-        behaviour_of(0.5, weight)
+        parse_behaviour(0.5, weight)
 
 
 @pytest.mark.parametrize(
@@ -132,22 +132,22 @@ def test_a_weight_of_less_than_one_transition_is_refused():
 
 
 def test_behaviours_are_written_as_a_person_writes_them(tmp_path):
-    assert behaviour_of(0.5).nu == 0.5
-    assert behaviour_of(np.float32(0.5)).nu == 0.5
-    assert behaviour_of(0).label == "ν = 0"
-    assert behaviour_of("random").kind == "random"
-    assert behaviour_of(lambda observations: observations).label == "policy"
+    assert parse_behaviour(0.5).nu == 0.5
+    assert parse_behaviour(np.float32(0.5)).nu == 0.5
+    assert parse_behaviour(0).label == "ν = 0"
+    assert parse_behaviour("random").kind == "random"
+    assert parse_behaviour(lambda observations: observations).label == "policy"
     path = tmp_path / "mine.zip"
     path.write_bytes(b"abc")
-    made = behaviour_of(path, action_range="symmetric")
+    made = parse_behaviour(path, action_range="symmetric")
     assert made.policy == "mine"
     assert made.sha256 == "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert made.action_range == "symmetric"
     with pytest.raises(PolicyError, match="cannot be read"):
-        behaviour_of(tmp_path / "none.zip")
+        parse_behaviour(tmp_path / "none.zip")
     for wrong in (None, True, [0.5]):
         with pytest.raises(SMEError, match="must be ν"):
-            behaviour_of(wrong)
+            parse_behaviour(wrong)
 
 
 def test_the_expected_similarity_is_one_minus_a_sixth_of_nu():

@@ -12,8 +12,8 @@ import pytest
 from sme_registry import SMESpec, make, materialize
 from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.ground_truth import exact_return, positions
-from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.datasets.recipe import parse_behaviour
+from sme_registry.datasets.returns import exact_return, positions
 from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError, StateError
 from sme_registry.task.draw import Array
 
@@ -82,7 +82,7 @@ def test_from_the_middle_of_an_episode_it_is_what_remains(changes: dict[str, Any
 
 def test_rows_of_a_set_are_rolled_out_from_where_they_were_acted_in() -> None:
     spec = SPEC.derive(k=4)
-    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(0.6),), transitions=90, seed=1)
+    recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.6),), transitions=90, seed=1)
     transitions = collect(recipe, materialize(spec))
     rows = np.array([2, 31, 45, 88])
     where = positions(transitions, spec, rows)
@@ -130,7 +130,7 @@ def test_many_states_at_different_times_keep_their_order() -> None:
     np.testing.assert_allclose(found.undiscounted.mean[last], expected, atol=1e-12)
 
 
-def test_the_interval_of_a_policy_that_draws_holds_its_mean() -> None:
+def test_the_interval_of_a_stochastic_policy_contains_its_mean() -> None:
     # One step: the return of a uniform action is known by quadrature.
     spec = SPEC.derive(state_dim=1, action_dim=1, horizon=1)
     states = np.random.default_rng(2).random((400, 1))
@@ -149,24 +149,24 @@ def test_the_interval_of_a_policy_that_draws_holds_its_mean() -> None:
     assert over.low < truth.mean() < over.high
 
 
-def test_a_policy_that_draws_is_no_exact_return() -> None:
+def test_a_stochastic_policy_has_no_exact_return() -> None:
     random = np.random.default_rng(0)
-    with pytest.raises(OptionError, match="rollouts=1: the policy draws"):
+    with pytest.raises(OptionError, match="rollouts=1: the policy is stochastic"):
         exact_return(lambda o: random.random((len(o), 2)), SPEC, states=STATES)
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "said"),
+    ("changes", "error", "message"),
     [
         ({"states": STATES[:, :2]}, StateError, r"must be of shape \(5, 3\)"),
         ({"states": STATES + 1}, StateError, "outside"),
         ({"states": []}, StateError, r"must be \[M, 3\]"),
         ({"states": 3.0}, StateError, r"must be \[M, 3\]"),
-        ({"t": 30}, StateError, r"t=30: must be whole steps in \[0, 30\)"),
+        ({"t": 30}, StateError, r"t=30: must be an integer in \[0, 30\)"),
         ({"t": 0.5}, StateError, "t=0.5"),
         ({"t": [1, 2]}, StateError, "t of shape"),
         ({"t": "x"}, StateError, "t='x'"),
-        ({"t": np.nan}, StateError, "t: has NaN"),
+        ({"t": np.nan}, StateError, "t: contains NaN"),
         ({"r_cum": 0.1}, StateError, r"r_cum=0.1: must be in \[0, 0\] at t=0"),
         ({"r_cum": -0.1, "t": 1}, StateError, "r_cum=-0.1"),
         ({"actions": STATES}, OptionError, r"must be \(5, 2\)"),
@@ -177,9 +177,9 @@ def test_a_policy_that_draws_is_no_exact_return() -> None:
         ({"policy": lambda o: o}, PolicyError, "policy"),
     ],
 )
-def test_bad_input_is_refused(changes: dict[str, Any], error: type[SMEError], said: str) -> None:
+def test_bad_input_is_refused(changes: dict[str, Any], error: type[SMEError], message: str) -> None:
     arguments = {"policy": policy, "spec": SPEC, "states": STATES, **changes}
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         exact_return(arguments.pop("policy"), arguments.pop("spec"), **arguments)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.datasets import list_datasets, make_dataset, minari_file, open_dataset, replay
+from sme_registry.datasets import list_datasets, make_dataset, open_dataset, replay, storage
 from sme_registry.errors import (
     DigestMismatchError,
     MalformedDocumentError,
@@ -225,7 +225,7 @@ class TestNames:
     @pytest.mark.parametrize("name", ["x-v0", "my/x-v3", "a/-b/x_Y-v12", "ns/deep/er/x-v0"])
     def test_what_is_taken_minari_lists(self, name, tmp_path):
         try:
-            minari_file.checked_id(name)
+            storage.check_id(name)
         except OptionError:
             with pytest.raises(ValueError, match="Malformed"):
                 minari.dataset.minari_dataset.parse_dataset_id(name)
@@ -252,7 +252,7 @@ class TestNames:
 class TestAnExistingSet:
     def test_is_refused_and_left_as_it_is(self, copied):
         before = (copied / NAME / "data" / "main_data.hdf5").read_bytes()
-        with pytest.raises(NameTakenError, match=r"is there already, of another .*--name"):
+        with pytest.raises(NameTakenError, match=r"already exists, with another .*--name"):
             make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
         assert (copied / NAME / "data" / "main_data.hdf5").read_bytes() == before
 
@@ -260,16 +260,16 @@ class TestAnExistingSet:
         def act(observations):
             return observations[:, :4]
 
-        for words in ("", "of the same recipe as far as the name of a policy without a file tells"):
+        for words in ("", "with the same recipe \\(a policy without a file"):
             with pytest.raises(NameTakenError, match=words) if words else nullcontext():
                 make_dataset("Default", mix=[(act, 1.0)], transitions=10, folder=tmp_path)
 
     def test_that_cannot_be_opened_is_refused_without_a_comparison(self, copied):
         edited(copied, lambda data: data["sme"].update(recipe_digest="sha256:" + "0" * 64))
-        with pytest.raises(NameTakenError, match=r"is there already\. Give another --name"):
+        with pytest.raises(NameTakenError, match=r"already exists\. Give another --name"):
             make_dataset("Default", transitions=10, name=NAME, folder=copied)
 
-    def test_is_replaced_when_told_so(self, copied):
+    def test_is_replaced_with_force(self, copied):
         make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied, force=True)
         assert open_dataset(NAME, copied).recipe.transitions == 10
         assert [child.name for child in (copied / "sme").iterdir() if child.is_dir()] == [
@@ -287,14 +287,14 @@ class TestAnExistingSet:
         if foreign == "minari's":
             (place / "data" / "metadata.json").write_text('{"dataset_id": "sme/tests-v0"}')
         before = sorted(tmp_path.rglob("*"))
-        with pytest.raises(NameTakenError, match="no data set of this package"):
+        with pytest.raises(NameTakenError, match="not a data set of this package"):
             make_dataset("Default", transitions=10, name=NAME, folder=tmp_path, force=True)
         assert sorted(tmp_path.rglob("*")) == before
 
 
 KILLED = """
     import os, signal, sys
-    from sme_registry.datasets import make_dataset, minari_file
+    from sme_registry.datasets import make_dataset
     step = sys.argv[2]
     calls = []
     def die(*_):
@@ -310,7 +310,7 @@ KILLED = """
 
 
 class TestAWriterThatFails:
-    @pytest.mark.parametrize("step", ["fsync 1", "fsync 2", "rename"])
+    @pytest.mark.parametrize("step", ["fsync 2", "fsync 3", "rename"])
     def test_killed_in_mid_write_leaves_nothing_that_is_listed(self, step, tmp_path):
         killed = run(KILLED, tmp_path, step)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -353,7 +353,7 @@ class TestAChangedSet:
     def test_of_which_a_number_changed_is_noticed(self, copied):
         with h5py.File(copied / NAME / "data" / "main_data.hdf5", "r+") as file:
             file["episode_1/infos/regret"][3] += 1e-9
-        with pytest.raises(DigestMismatchError, match=r"its arrays have sha256:.* as made"):
+        with pytest.raises(DigestMismatchError, match=r"its arrays have sha256:.* as generated"):
             open_dataset(NAME, copied).transitions()
 
     def test_to_which_minari_added_is_noticed_and_stays_readable_for_minari(self, copied):
@@ -444,8 +444,10 @@ class TestAMisplacedSet:
         found, broken = list_datasets(copied)
         assert [dataset.path for dataset in found] == [copied / NAME]
         assert list(broken) == [copied / misplaced]
-        told = f"holds the set {NAME}: move or copy it back to {copied / NAME}, or remove it"
-        assert told in broken[copied / misplaced]
+        error = (
+            f"contains the data set {NAME}. Move or copy it back to {copied / NAME}, or remove it"
+        )
+        assert error in broken[copied / misplaced]
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
         with pytest.warns(UserWarning, match=f"does not match id '{NAME}'"):
             assert list(minari.list_local_datasets()) == [NAME]
@@ -455,15 +457,15 @@ class TestAMisplacedSet:
     ):
         monkeypatch.chdir(copied / misplaced)
         for given in (misplaced, copied / misplaced, ".", "data"):
-            with pytest.raises(SpecError, match=f"holds the set {NAME}"):
-                minari_file.refuse_misplaced(open_dataset(given, copied), copied)
+            with pytest.raises(SpecError, match=f"contains the data set {NAME}"):
+                storage.check_location(open_dataset(given, copied), copied)
 
     def test_outside_the_folder_of_sets_is_known_by_the_end_of_its_path(self, copied, tmp_path):
         for place, right in [("a/sme/tests-v0", True), ("mine", False), ("sme/copy-v0", False)]:
             shutil.copytree(copied / NAME, tmp_path / place)
-            dataset, told = open_dataset(tmp_path / place), f"back to a folder {NAME}"
-            with nullcontext() if right else pytest.raises(SpecError, match=told):
-                minari_file.refuse_misplaced(dataset, copied)
+            dataset, error = open_dataset(tmp_path / place), f"back to a folder {NAME}"
+            with nullcontext() if right else pytest.raises(SpecError, match=error):
+                storage.check_location(dataset, copied)
 
     def test_a_link_in_the_right_place_is_in_the_right_place(self, copied, tmp_path):
         (copied / NAME).rename(tmp_path / "elsewhere")

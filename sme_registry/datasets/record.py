@@ -1,0 +1,85 @@
+"""`DatasetRecord`: the metadata of a data set, stored under "sme" in Minari's metadata."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field
+
+from sme_registry.datasets.recipe import DatasetRecipe
+from sme_registry.datasets.scores import ReferenceScores
+from sme_registry.errors import DigestMismatchError, SpecError
+from sme_registry.spec import Digest, Integer, StrictModel
+from sme_registry.spec.sme_spec import Seed
+
+KEY = "sme"
+
+
+class Seeds(StrictModel):
+    """Seeds of the task and of the data (starts, α, ã and random actions)."""
+
+    task: Seed
+    data: Integer
+
+
+class DatasetRecord(StrictModel):
+    """Provenance, reference scores and digests of a data set.
+
+    Attributes:
+      recipe, recipe_digest: all that the data set was generated from.
+      spec_digest, protocol_digest: of the recipe's task and evaluation protocol.
+      seeds: of the task and of the data.
+      nu: ν if a single mixture acted; null for several behaviours or another policy.
+      trajectories: E, the number of Minari episodes.
+      scores: of the behaviour and of the reference policies.
+      arrays_digest: over all arrays, see `Transitions.digest`.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    schema_version: Literal[1] = 1
+    recipe: DatasetRecipe
+    recipe_digest: Digest
+    spec_digest: Digest
+    protocol_digest: Digest
+    seeds: Seeds
+    nu: float | None
+    trajectories: Annotated[Integer, Field(ge=1)]
+    scores: ReferenceScores
+    arrays_digest: Digest
+    versions: dict[str, str]
+
+    @classmethod
+    def from_dict(cls, data: Any, source: str = "") -> Self:
+        """Validate a record and the digests of its documents.
+
+        Args:
+          data: plain data.
+          source: what to call it in an error, such as its path.
+
+        Raises:
+          SpecError: a field is invalid, or the schema version is not 1.
+          DigestMismatchError: a digest does not match its document.
+        """
+        version = data.get("schema_version") if isinstance(data, dict) else None
+        if type(version) is int and version != 1:
+            age = "an older" if version < 1 else "a newer"
+            raise SpecError(
+                f"{source}: {KEY}.schema_version={version}: must be 1. The data set was written by "
+                f"{age} version of this package. Read it with that version or with Minari, or "
+                "generate it again from its recipe."
+            )
+        record = super().from_dict(data, f"{source}: {KEY}")
+        for field, document in (
+            ("recipe_digest", record.recipe),
+            ("spec_digest", record.recipe.spec),
+            ("protocol_digest", record.recipe.protocol),
+        ):
+            recorded = getattr(record, field)
+            if recorded != document.digest:
+                raise DigestMismatchError(
+                    f"{source}: {KEY}.{field}={recorded!r}: the stored "
+                    f"{field.removesuffix('_digest')} has {document.digest!r}. One of them was "
+                    "changed after the data set was generated. Download the data set again, or "
+                    "generate it again."
+                )
+        return record

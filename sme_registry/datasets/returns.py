@@ -1,0 +1,255 @@
+"""`exact_return`: the exact return of a policy, by rollout in its task.
+
+Off-policy evaluation estimates from data what a policy would earn. Here the task is known and its
+transitions are deterministic, so the return can be computed:
+
+    G(s, t, r_cum) = Σ_i γ^i R_{t+1+i}     from the step after t to the end of the episode; γ = 1
+                                           for the undiscounted return
+
+R is the reward as paid, so r_cum, k, r_min, D and the horizon all matter. `M` states, `S`
+state_dim, `A` action_dim, T horizon.
+
+Exact means up to rounding. The transition doubles differences at each step, so two policies whose
+actions differ in the last bit of float32 are in different states after some 25 steps. A network
+rounds differently in batches of another size. The same call gives the same numbers; on another
+machine or in another batch a trajectory of the same task diverges after those steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import stdtrit
+
+from sme_registry.datasets.arrays import Transitions
+from sme_registry.envs.batch import Batch, Observation
+from sme_registry.envs.options import initial_states
+from sme_registry.errors import OptionError, SpecError, StateError
+from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.rollouts import LANES
+from sme_registry.evaluation.rollouts import rollouts as run_rollouts
+from sme_registry.io import integer_in
+from sme_registry.spec import SMESpec, SpecLike
+from sme_registry.spec.document import plain_number
+from sme_registry.task import Task, load_task
+from sme_registry.task.draw import Array
+
+CONFIDENCE = 0.95
+_ROUNDED = 1e-6  # of r_cum, which an observation stores as float32
+
+Steps = npt.NDArray[np.int64]
+
+
+class Estimate(NamedTuple):
+    """A mean and its 95 % interval, each a number or `[M]`; an exact value has zero width."""
+
+    mean: Any
+    low: Any
+    high: Any
+
+
+@dataclass(frozen=True, eq=False)
+class ExactReturn:
+    """The returns of a policy from `M` states.
+
+    Attributes:
+      undiscounted: `[M]` each: mean, low and high.
+      discounted: the same with `gamma`.
+      lengths: `[M]` mean steps to the end of the episode.
+      similarity: `[M]` mean r̃ over them.
+      gamma: γ.
+      rollouts: episodes from each state; 1 for a deterministic policy.
+    """
+
+    undiscounted: Estimate
+    discounted: Estimate
+    lengths: Array
+    similarity: Array
+    gamma: float
+    rollouts: int
+
+    def over_states(self) -> tuple[Estimate, Estimate]:
+        """The mean over all states, undiscounted and discounted, with its interval.
+
+        The interval assumes that the states are independent draws from a distribution. For rows of
+        the same trajectories it is too narrow.
+
+        Raises:
+          OptionError: there is only one state.
+        """
+        if len(self.lengths) < 2:
+            raise OptionError("states: an interval over states requires at least 2 of them.")
+        return _interval(self.undiscounted.mean), _interval(self.discounted.mean)
+
+
+def exact_return(
+    policy: Any,
+    spec: SpecLike,
+    *,
+    states: npt.ArrayLike,
+    t: npt.ArrayLike = 0,
+    r_cum: npt.ArrayLike = 0.0,
+    actions: npt.ArrayLike | None = None,
+    gamma: float = 0.99,
+    rollouts: int = 1,
+    action_range: str | None = None,
+) -> ExactReturn:
+    """Run a policy from given states of a task to the end of the episode.
+
+    Args:
+      policy: anything that `evaluate` accepts: a callable `[B, S + 2] → [B, A]`, a model, or the
+        path of one.
+      spec: a single-agent task: a spec, its fields, an id, a digest or a path.
+      states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
+      t: `[M]` or one number, steps completed before, in [0, T).
+      r_cum: `[M]` or one number, the rewards since the last payout, in [0, t mod k].
+      actions: `[M, A]` in [0, 1], executed in the first step instead of the policy's. The return
+        is then Q(s, a) instead of V(s).
+      gamma: γ in [0, 1] of the discounted return.
+      rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
+        for a stochastic one, whose mean gets a 95 % interval (Student's t).
+      action_range: of the policy's actions; None takes its own, and "unit" for a callable.
+
+    Returns:
+      The returns.
+
+    Raises:
+      UnknownNameError, SpecError: no such task, or it is a team's.
+      StateError: states, t or r_cum have the wrong shape or impossible values.
+      OptionError: another argument is out of range, or the policy is stochastic and `rollouts` is
+        1.
+      PolicyError: the policy cannot be used.
+    """
+    task = load_task(spec)
+    if task.spec.team is not None:
+        raise SpecError("team: must be null here. Give a single-agent task.")
+    gamma = _unit_number("gamma", gamma)
+    rollouts = integer_in("rollouts", rollouts, 1, 10**6)
+    checked_policy = as_policy(policy, task.spec, action_range=action_range)
+    states, t, r_cum = _starts(task.spec, states, t, r_cum)
+    first_actions = (
+        None if actions is None else _actions(actions, len(states), task.spec.action_dim)
+    )
+    if rollouts == 1:
+        _check_deterministic(checked_policy, task, states, t, r_cum)
+    results = [
+        run_rollouts(
+            checked_policy, task, states, t=t, r_cum=r_cum, actions=first_actions, gamma=gamma
+        )
+        for _ in range(rollouts)
+    ]
+    lengths = np.stack([each.length for each in results])
+    return ExactReturn(
+        _interval(np.stack([each.episode_return for each in results])),
+        _interval(np.stack([each.discounted_return for each in results])),
+        lengths.mean(axis=0),
+        np.average([each.similarity for each in results], axis=0, weights=lengths),
+        gamma,
+        rollouts,
+    )
+
+
+def positions(
+    transitions: Transitions, spec: SMESpec, rows: npt.ArrayLike | None = None
+) -> dict[str, Any]:
+    """The states, times and accumulated rewards of rows of a data set, for `exact_return`.
+
+        exact_return(policy, spec, **positions(transitions, spec, rows))
+
+    Args:
+      transitions: a single-agent data set.
+      spec: its task.
+      rows: `[M]` indices, or a mask; None for all.
+
+    Returns:
+      `states` `[M, S]` and `t` `[M]`, exact, and `r_cum` `[M]` as an observation stores it, to a
+      relative precision of 6e-8.
+    """
+    chosen = slice(None) if rows is None else np.asarray(rows)
+    seen = transitions.observations[chosen].astype(np.float64)
+    S = spec.state_dim
+    t = np.rint(seen[:, S] * spec.horizon).astype(np.int64)
+    r_cum = np.minimum(seen[:, S + 1] * spec.k, t % spec.k)
+    return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
+
+
+def _starts(
+    spec: SMESpec, states: npt.ArrayLike, t: npt.ArrayLike, r_cum: npt.ArrayLike
+) -> tuple[Array, Steps, Array]:
+    """States `[M, S]`, steps `[M]` and accumulated rewards `[M]`, checked."""
+    S, T, k = spec.state_dim, spec.horizon, spec.k
+    M = len(states) if isinstance(states, np.ndarray | list | tuple) else 0
+    if M == 0:
+        raise StateError(f"states={states!r:.60}: must be [M, {S}], one row for each start.")
+    s = initial_states(states, (M, S))
+    steps, accumulated = _column("t", t, M), _column("r_cum", r_cum, M)
+    wrong = (steps != np.rint(steps)) | (steps < 0) | (steps >= T)
+    if wrong.any():
+        raise StateError(f"t={steps[wrong][0]:g}: must be an integer in [0, {T}).")
+    since = steps % k
+    wrong = (accumulated < 0) | (accumulated > since + _ROUNDED)
+    if wrong.any():
+        raise StateError(
+            f"r_cum={accumulated[wrong][0]:g}: must be in [0, {since[wrong][0]:g}] at "
+            f"t={steps[wrong][0]:g}, the number of steps since the last payout (k={k})."
+        )
+    return s, steps.astype(np.int64), accumulated
+
+
+def _actions(actions: npt.ArrayLike, rows: int, action_dim: int) -> Array:
+    try:
+        array = np.asarray(actions, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (rows, action_dim) or not ((array >= 0) & (array <= 1)).all():
+        raise OptionError(
+            f"actions of shape {array.shape}: must be ({rows}, {action_dim}), each in [0, 1]."
+        )
+    return array
+
+
+def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
+    try:
+        column = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise StateError(f"{name}={value!r:.60}: must be a number or an array of them.") from None
+    if column.shape not in ((), (rows,)):
+        raise StateError(f"{name} of shape {column.shape}: must be ({rows},), or one number.")
+    if not np.isfinite(column).all():
+        raise StateError(f"{name}: contains NaN or infinity. Give finite numbers.")
+    return np.broadcast_to(column, (rows,)).copy()
+
+
+def _unit_number(name: str, value: Any) -> float:
+    number = plain_number(value)
+    valid = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number <= 1
+    if not valid:
+        raise OptionError(f"{name}={value!r:.60}: must be a number in [0, 1].")
+    return float(number)
+
+
+def _check_deterministic(
+    policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Steps, r_cum: Array
+) -> None:
+    """Raise if two calls of a policy with the same observations give different actions."""
+    batch = Batch(task, min(len(s), LANES))
+    batch.place(s[:LANES], t[:LANES], r_cum[:LANES, None])
+    if not np.array_equal(policy(batch.observe()), policy(batch.observe())):
+        raise OptionError(
+            "rollouts=1: the policy is stochastic, so the return of one episode is not exact. Give "
+            "rollouts=30 or more for a mean with its interval."
+        )
+
+
+def _interval(samples: Array) -> Estimate:
+    """Mean over the first axis and its Student's t interval; of one sample, the sample."""
+    count, mean = len(samples), samples.mean(axis=0)
+    if count == 1:
+        return Estimate(mean, mean, mean)
+    error = samples.std(axis=0, ddof=1) / np.sqrt(count)
+    half = stdtrit(count - 1, 0.5 + CONFIDENCE / 2) * error
+    return Estimate(mean, mean - half, mean + half)

@@ -1,0 +1,351 @@
+"""Data sets on disk, in Minari's folders: written completely or not at all, and checked on reading.
+
+    <folder>/<namespace>/<name>-v<N>/data/main_data.hdf5   the arrays, see `minari_format`
+                                          metadata.json    Minari's, with `DatasetRecord` as "sme"
+
+The folder is MINARI_DATASETS_PATH, else ~/.minari/datasets, unless another one is passed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sme_registry.datasets.arrays import Transitions
+from sme_registry.datasets.minari_format import (
+    DATA,
+    METADATA,
+    NAMESPACE_METADATA,
+    minari_dataset,
+    minari_metadata,
+    read_hdf5,
+    require_minari,
+    to_hdf5,
+)
+from sme_registry.datasets.recipe import DatasetRecipe
+from sme_registry.datasets.record import KEY, DatasetRecord
+from sme_registry.errors import (
+    DigestMismatchError,
+    MalformedDocumentError,
+    NameTakenError,
+    OptionError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+    did_you_mean,
+)
+from sme_registry.io import build_folder, read_json, to_json, write_atomically
+
+NAMESPACE = "sme"
+_ID = re.compile(r"(?P<namespace>(?:[A-Za-z0-9_-]+/)*)(?P<name>[A-Za-z0-9_-]+)-v(?P<v>[0-9]+)")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set on disk, with its metadata read and checked.
+
+    Attributes:
+      id: Minari's id, such as `sme/Default-v1-nu50-seed7-v0`.
+      path: its folder, which contains `data/`.
+      record: provenance, scores and digests.
+    """
+
+    id: str
+    path: Path
+    record: DatasetRecord
+
+    @property
+    def recipe(self) -> DatasetRecipe:
+        """All that it was generated from."""
+        return self.record.recipe
+
+    @property
+    def size_bytes(self) -> int:
+        """Total size of its files."""
+        return sum(file.stat().st_size for file in (self.path / "data").iterdir())
+
+    def minari(self) -> Any:
+        """The data set as a `minari.MinariDataset`.
+
+        Raises:
+          MissingDependencyError: Minari is not installed.
+        """
+        return minari_dataset(self.path / "data")
+
+    def transitions(self) -> Transitions:
+        """All transitions as aligned arrays, bit for bit as they were written.
+
+        Raises:
+          MissingDependencyError: Minari or h5py is not installed.
+          MalformedDocumentError: the file cannot be read.
+          DigestMismatchError: the arrays were changed after the data set was generated.
+        """
+        require_minari()
+        path = self.path / "data" / DATA
+        try:
+            transitions = read_hdf5(path, self.record)
+        except (OSError, KeyError, ValueError, RuntimeError) as error:
+            raise MalformedDocumentError(
+                f"{path}: cannot be read: {str(error).strip(chr(39))}. Download the data set "
+                "again, or generate it again (--force)."
+            ) from None
+        if transitions.digest != self.record.arrays_digest:
+            raise DigestMismatchError(
+                f"{path}: its arrays have {transitions.digest[:19]}…: must be "
+                f"{self.record.arrays_digest[:19]}…, as generated. They were changed or extended. "
+                "Download the data set again, generate it again (--force), or read it with Minari, "
+                "which does not check digests."
+            )
+        return transitions
+
+
+def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
+    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets."""
+    if folder is not None:
+        return Path(folder)
+    configured = os.environ.get("MINARI_DATASETS_PATH")
+    return Path(configured) if configured is not None else Path.home() / ".minari" / "datasets"
+
+
+def check_id(dataset_id: str) -> str:
+    """Check that Minari accepts an id; it must be ASCII and have a version.
+
+    Raises:
+      OptionError: the id is invalid.
+    """
+    match = _ID.fullmatch(dataset_id)
+    namespace = match["namespace"] if match else ""
+    # Minari's own pattern requires two characters; `data` is the folder inside a data set.
+    short = bool(namespace) and len(namespace) < 3
+    if match is None or "data" in namespace.split("/") or short:
+        raise OptionError(
+            f"name={dataset_id!r}: must be [namespace/]name-v<number> of letters, digits, '_' and "
+            "'-' (a namespace of two characters or more, and not 'data'), as in 'sme/mine-v0'."
+        )
+    return dataset_id
+
+
+def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
+    """Check that a data set may be written to a path.
+
+    Args:
+      target: its folder.
+      folder: the root of all data sets.
+      recipe: of the new data set; the error compares it with an existing one's.
+      force: whether an existing data set of this package may be replaced.
+
+    Raises:
+      NameTakenError: the target exists, and `force` is false or it is not a data set of this
+        package.
+      OptionError: the target is inside another data set.
+    """
+    for parent in target.relative_to(folder).parents:
+        if parent != Path() and (folder / parent / "data").exists():
+            raise OptionError(
+                f"name: {folder / parent} is a data set, and Minari lists none inside another. "
+                "Give another namespace."
+            )
+    if not os.path.lexists(target):
+        return
+    if not force:
+        raise NameTakenError(
+            f"{target} already exists{_comparison(target, recipe)}. Give another --name or --out, "
+            "or --force to replace it (in Python, force=True)."
+        )
+    try:
+        replaceable = KEY in _read_metadata(target)
+    except SMEError:
+        replaceable = False
+    if not replaceable:
+        raise NameTakenError(
+            f"{target} already exists and is not a data set of this package, so it is not "
+            "replaced. Give another --name or --out, or remove it yourself."
+        )
+
+
+def _comparison(target: Path, recipe: DatasetRecipe) -> str:
+    """How an existing data set differs from a new one; empty if it cannot be opened."""
+    try:
+        existing = open_dataset(target).recipe
+    except SMEError:
+        return ""
+    if existing.digest != recipe.digest:
+        return f", with another recipe: {'; '.join(existing.differences(recipe))}"
+    if any(
+        behaviour.kind == "policy" and behaviour.sha256 is None for behaviour in existing.behaviours
+    ):
+        return ", with the same recipe (a policy without a file is compared by its name)"
+    return " and is the same data set"
+
+
+def write_dataset(
+    dataset_id: str,
+    record: DatasetRecord,
+    transitions: Transitions,
+    folder: Path,
+    *,
+    force: bool = False,
+) -> Dataset:
+    """Write a data set completely or not at all.
+
+    Args:
+      dataset_id: Minari's id.
+      record: its metadata.
+      transitions: its arrays.
+      folder: the root of all data sets.
+      force: whether an existing data set of this package is replaced; it remains in place until
+        the new one is complete.
+
+    Raises:
+      OptionError: the id is invalid, or the folder cannot be written to.
+      NameTakenError: see `check_target`.
+      MissingDependencyError: Minari or h5py is not installed.
+    """
+    require_minari()
+    target = folder / check_id(dataset_id)
+    check_target(target, folder, record.recipe, force)
+    content = to_hdf5(transitions, record)
+    metadata = minari_metadata(dataset_id, record, len(content))
+    with build_folder(target, force=force) as building:
+        _write_namespaces(target.parent, folder)
+        (building / "data").mkdir()
+        (building / "data" / DATA).write_bytes(content)
+        (building / "data" / METADATA).write_bytes(to_json(metadata).encode())
+    return Dataset(dataset_id, target, record)
+
+
+def _write_namespaces(namespace: Path, folder: Path) -> None:
+    """Write the empty metadata by which Minari recognises a namespace, and those above it."""
+    while namespace != folder:
+        path = namespace / NAMESPACE_METADATA
+        if not path.exists():
+            write_atomically(path, "{}")
+        namespace = namespace.parent
+
+
+def open_dataset(
+    id_or_path: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None
+) -> Dataset:
+    """Open a data set of this package by its id or its path. Reads only the metadata.
+
+    Args:
+      id_or_path: an id, or the path of a data set's folder (or of the `data/` in it).
+      folder: the root of all data sets; None for Minari's folder.
+
+    Raises:
+      UnknownNameError: no such data set exists.
+      MalformedDocumentError: it was not written by this package, or its metadata cannot be read.
+      SpecError: a field of its record is invalid, or its schema version is not supported.
+      DigestMismatchError: its spec, recipe or protocol was changed.
+    """
+    root = datasets_folder(folder)
+    path = Path(id_or_path)
+    path = path.parent if path.name == "data" else path
+    is_id = isinstance(id_or_path, str) and _ID.fullmatch(id_or_path)
+    if is_id and (root / id_or_path / "data").is_dir():
+        path = root / id_or_path
+    if not (path / "data").is_dir():
+        known = [dataset_id for dataset_id, _ in _folders(root)]
+        raise UnknownNameError(
+            f"{os.fspath(id_or_path)!r}: is neither the id of a data set in {root} nor the path of "
+            f"one.{did_you_mean(os.fspath(id_or_path), known)} `sme dataset list` lists them."
+        )
+    metadata = _read_metadata(path)
+    if KEY not in metadata:
+        raise MalformedDocumentError(
+            f"{path / 'data' / METADATA}: was not written by `sme dataset make`. Minari can open "
+            "it: minari.MinariDataset(path)."
+        )
+    return _dataset(path, metadata)
+
+
+def _read_metadata(path: Path) -> dict[str, Any]:
+    """The metadata of a data set's folder; empty if it is not a JSON object."""
+    metadata = read_json(path / "data" / METADATA)
+    return metadata if isinstance(metadata, dict) else {}
+
+
+def _dataset(path: Path, metadata: dict[str, Any]) -> Dataset:
+    """The data set of a folder and its metadata, which must hold a record."""
+    source = path / "data" / METADATA
+    record = DatasetRecord.from_dict(metadata[KEY], str(source))
+    for field, expected in (
+        ("total_steps", record.recipe.transitions),
+        ("total_episodes", record.trajectories),
+    ):
+        if metadata.get(field) != expected:
+            raise DigestMismatchError(
+                f"{source}: {field}={metadata.get(field)!r}: must be {expected}, as generated. The "
+                "data set was extended. Download it again, or read it with Minari."
+            )
+    return Dataset(str(metadata.get("dataset_id")), path, record)
+
+
+def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
+    """Check that the path of a data set agrees with its id.
+
+    Inside the root, the path relative to it must equal the id, as in Minari; elsewhere the path
+    must end with the id.
+
+    Args:
+      dataset: the data set.
+      folder: the root of all data sets; None for Minari's folder.
+
+    Raises:
+      SpecError: they differ, so the id would open another data set or none.
+    """
+    # Not resolved: a symbolic link in the right place is correct.
+    path, root = Path(os.path.abspath(dataset.path)), Path(os.path.abspath(datasets_folder(folder)))
+    inside = path.is_relative_to(root)
+    id_parts = tuple(dataset.id.split("/"))
+    if id_parts != (path.relative_to(root).parts if inside else path.parts[-len(id_parts) :]):
+        home = root / dataset.id if inside else f"a folder {dataset.id}"
+        raise SpecError(
+            f"{path}: contains the data set {dataset.id}. Move or copy it back to {home}, or "
+            "remove it if that already exists. To change its name, generate it with --name."
+        )
+
+
+def list_datasets(
+    folder: str | os.PathLike[str] | None = None,
+) -> tuple[list[Dataset], dict[Path, str]]:
+    """All data sets of this package in a folder, and those that are broken or misplaced.
+
+    Args:
+      folder: the root of all data sets; None for Minari's folder.
+
+    Returns:
+      The valid data sets in order of their ids, and the error of each other one by its path.
+    """
+    root = datasets_folder(folder)
+    datasets: list[Dataset] = []
+    errors: dict[Path, str] = {}
+    for dataset_id, path in _folders(root):
+        try:
+            metadata = _read_metadata(path)
+            if KEY in metadata:
+                dataset = _dataset(path, metadata)
+                check_location(dataset, root)
+                datasets.append(dataset)
+        except SMEError as error:
+            errors[root / dataset_id] = str(error)
+    return datasets, errors
+
+
+def _folders(root: Path, namespace: str = "") -> Iterator[tuple[str, Path]]:
+    """`(id, folder)` of everything that Minari considers a data set, in order."""
+    path = root / namespace
+    try:
+        children = sorted(child.name for child in path.iterdir() if child.is_dir())
+    except OSError:
+        return
+    if "data" in children and namespace:
+        yield namespace, path
+        return
+    for child in children:
+        if not child.startswith("."):
+            yield from _folders(root, f"{namespace}/{child}" if namespace else child)
