@@ -28,7 +28,6 @@ from sme_registry.spec import (
     Real,
     SchemaVersion,
     StrictModel,
-    explained,
 )
 
 METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
@@ -134,7 +133,7 @@ class Result(Document):
     @model_validator(mode="after")
     def _status_fits(self) -> Self:
         if (self.status == "scored") != (self.scores is not None):
-            raise explained("scores: required if status is 'scored', not allowed otherwise.")
+            raise ValueError("scores: required if status is 'scored', not allowed otherwise.")
         if (self.status == "rejected") != (self.code in CODES):
-            raise explained("code: required if status is 'rejected', not allowed otherwise.")
+            raise ValueError("code: required if status is 'rejected', not allowed otherwise.")
         return self

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, field_validator
+from pydantic import Field
 
 from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
 from leaderboard.errors import Rejection
@@ -25,7 +25,6 @@ from sme_registry.spec import (
     Name,
     SchemaVersion,
     StrictModel,
-    explained,
 )
 
 FILE = "submission.json"
@@ -40,6 +39,14 @@ Knowledge = Literal["generic", "family", "oracle"]
 
 _Line = Annotated[str, Field(min_length=1, max_length=80)]
 _Text = Annotated[str, Field(max_length=2000)]
+_Link = Annotated[
+    str,
+    Field(
+        max_length=300,
+        pattern=r"^https://[!-~]+$",
+        description="an https:// link of at most 300 characters, without spaces",
+    ),
+]
 _Count = Annotated[Integer, Field(ge=0, le=10**12)]
 UtcTime = Annotated[
     str,
@@ -134,25 +141,13 @@ class Submission(Document):
     track: Track = "open"
     suite: SuiteReference
     method: Method
-    code: Annotated[str, Field(max_length=300, pattern=r"^https://[!-~]+$")] | None = None
+    code: _Link | None = None
     submitter: Submitter
     created: UtcTime
     runs: Annotated[tuple[Run, ...], Field(min_length=1, max_length=1000, strict=False)]
     runs_started: dict[Name, _Count]
     training: Training = Training()
     statement: _Text = ""
-
-    @field_validator("code", mode="wrap")
-    @classmethod
-    def _link(cls, value: Any, read: ValidatorFunctionWrapHandler) -> str | None:
-        try:
-            link: str | None = read(value)
-        except ValidationError:
-            raise explained(
-                f"code={value!r:.80}: must be an https:// link of at most 300 characters, none "
-                "of them a space. Leave it out where there is none."
-            ) from None
-        return link
 
     def signed(self, key: SigningKey) -> SignedSubmission:
         """This submission with its signature; the key must be the submitter's."""

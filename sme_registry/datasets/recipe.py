@@ -25,9 +25,8 @@ from sme_registry.spec import (
     SchemaVersion,
     SMESpec,
     StrictModel,
-    explained,
 )
-from sme_registry.spec.document import plain_number, show
+from sme_registry.spec.document import plain_number, short_repr
 
 _TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating point
 
@@ -56,17 +55,17 @@ class Behaviour(StrictModel):
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> Self:
         if (self.kind == "mixture") != (self.nu is not None):
-            raise explained(
+            raise ValueError(
                 f"nu={self.nu}: must be a number in [0, 1] for kind='mixture' and null otherwise, "
                 f"and kind={self.kind!r}."
             )
         if (self.kind == "policy") != (self.policy is not None):
-            raise explained(
+            raise ValueError(
                 f"policy={self.policy!r}: must be a name for kind='policy' and null otherwise, "
                 f"and kind={self.kind!r}."
             )
         if self.kind != "policy" and (self.sha256 is not None or self.action_range is not None):
-            raise explained(
+            raise ValueError(
                 "sha256, action_range: must be null unless kind='policy'. Leave them out."
             )
         return self
@@ -104,13 +103,13 @@ class DatasetRecipe(Document):
     def _weights_add_up(self) -> Self:
         total = math.fsum(behaviour.weight for behaviour in self.behaviours)
         if abs(total - 1.0) > _TOLERANCE:
-            raise explained(
+            raise ValueError(
                 f"weight: {' + '.join(f'{b.weight:g}' for b in self.behaviours)} = {total:.10g}: "
                 "must add up to 1. Change one of the weights."
             )
         empty = next((i for i, share in enumerate(self.shares) if share == 0), None)
         if empty is not None:
-            raise explained(
+            raise ValueError(
                 f"weight={self.behaviours[empty].weight:g}: gives less than one of "
                 f"{self.transitions} transitions. Use more transitions, or remove the behaviour."
             )
@@ -156,7 +155,7 @@ def _differences(path: str, ours: Any, theirs: Any) -> list[str]:
     elif isinstance(ours, list) and isinstance(theirs, list):
         return [f"{path} of {len(ours)} entries, requested {len(theirs)}"]
     else:
-        return [f"{path} {show(ours)}, requested {show(theirs)}"]
+        return [f"{path} {short_repr(ours)}, requested {short_repr(theirs)}"]
     return [
         line
         for name, (left, right) in pairs.items()
@@ -191,7 +190,7 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
         fields |= {"kind": "policy", "policy": name}
     else:
         raise SpecError(
-            f"behaviour={show(policy)}: must be ν in [0, 1], 'random', a callable, a "
+            f"behaviour={short_repr(policy)}: must be ν in [0, 1], 'random', a callable, a "
             "Stable-Baselines3 model, or the path of a .zip or .onnx file."
         )
     if fields["kind"] == "policy":

@@ -9,7 +9,6 @@ from sme_registry.spec.document import (
     Real,
     SchemaVersion,
     StrictModel,
-    explained,
 )
 from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.protocol import EvaluationProtocol
@@ -45,5 +44,4 @@ __all__ = [
     "SuiteFile",
     "TeamSpec",
     "as_spec",
-    "explained",
 ]

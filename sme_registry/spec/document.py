@@ -1,40 +1,36 @@
 """The base of every document: frozen, strict, hashed by its canonical JSON.
 
 digest = "sha256:" + hex(SHA-256(RFC 8785 canonical JSON of all fields)), so equal documents have
-equal digests on every machine, whatever the key order or the way a number was written.
+equal digests on every machine, regardless of key order and of how a number was written.
 """
 
 from __future__ import annotations
 
 import hashlib
-import types
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import rfc8785
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
-    ModelWrapValidatorHandler,
     ValidationError,
     model_validator,
 )
-from pydantic.fields import FieldInfo
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import ErrorDetails
 
 from sme_registry.errors import SpecError, did_you_mean
 
-_EXPLAINED = "document"  # the error type of lines that already are in our words
-_NOT_AN_OBJECT = ": must be an object of named fields"
-_SHOWN = 60  # characters of a bad value that an error repeats
+_MAX_REPR = 60
 
 
 def plain_number(value: Any) -> Any:
-    """NumPy's scalars as Python's, so that a sweep over `np.arange` needs no casts; no booleans.
+    """NumPy's numbers as Python's, so that a sweep over `np.arange` needs no casts.
 
-    Negative zero becomes zero: the two are equal, so they must not differ in text.
+    Negative zero becomes zero: the two are equal, so they must not differ in text. Booleans and
+    everything else stay as they are.
     """
     if type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0:
         kind = value.dtype.kind
@@ -43,47 +39,34 @@ def plain_number(value: Any) -> Any:
     return value + 0.0 if type(value) is float else value
 
 
-def _plain_numbers(data: Any) -> Any:
-    """`plain_number` of each of a mapping's values, and of the entries of those that are lists.
-
-    Here and not as validators of the fields' types: Pydantic's JSON Schema loses the bounds of a
-    number that has a validator of its own.
-    """
-    if not isinstance(data, dict):
-        return data
-    return {
-        name: [plain_number(entry) for entry in value]
-        if type(value) in (list, tuple)
-        else plain_number(value)
-        for name, value in data.items()
-    }
-
-
 def _integer_only(value: Any) -> Any:
-    """Refuse what Python calls equal to an integer: `Literal[1]` takes True and 1.0 for 1."""
+    """Reject what Python calls equal to an integer: `Literal[1]` takes True and 1.0 for 1."""
     number = plain_number(value)
     if type(number) is not int:
-        raise ValueError("not an integer")
+        raise ValueError("must be 1. Leave it out for the default, 1.")
     return number
 
 
 Integer = int
 Real = Annotated[float, Field(allow_inf_nan=False)]
 SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$", min_length=1, max_length=64)]
+Name = Annotated[
+    str,
+    Field(
+        pattern=r"^[A-Za-z0-9_-]+$",
+        min_length=1,
+        max_length=64,
+        description="a string of 1 to 64 letters, digits, '_' and '-'",
+    ),
+]
 Digest = Annotated[
     str,
     Field(pattern=r"^sha256:[0-9a-f]{64}$", description="'sha256:' and 64 lower-case hex digits"),
 ]
 
 
-def explained(message: str) -> PydanticCustomError:
-    """An error for a validator to raise whose text is already field, value, range and fix."""
-    return PydanticCustomError(_EXPLAINED, "{message}", {"message": message})
-
-
 class StrictModel(BaseModel):
-    """Frozen and strict; unknown fields are refused, in words that say what to do."""
+    """Frozen and strict; invalid and unknown fields are errors that say how to correct them."""
 
     # An instance of a subclass has more fields than its place: equal digests, unequal documents.
     model_config = ConfigDict(
@@ -94,19 +77,32 @@ class StrictModel(BaseModel):
         revalidate_instances="subclass-instances",
     )
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _in_our_words(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def __init__(self, **data: Any) -> None:
         try:
-            return handler(_plain_numbers(data))
+            super().__init__(**data)
         except ValidationError as error:
-            lines = [
-                InitErrorDetails(
-                    type=explained(_explain(cls, line)), loc=line["loc"], input=line["input"]
-                )
-                for line in _without_echoes(error.errors())
-            ]
-            raise ValidationError.from_exception_data(cls.__name__, lines) from None
+            raise _spec_error(type(self), error, "") from None
+
+    # As Pydantic marks its own: nested models are validated without it, so that the outermost
+    # model alone writes the message, with whole paths.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _plain_numbers(cls, data: Any) -> Any:
+        """`plain_number` of every value, and of the entries of lists.
+
+        Not validators of the fields' types: Pydantic's JSON Schema loses the bounds of a number
+        that has a validator of its own.
+        """
+        if not isinstance(data, dict):
+            return data
+        return {
+            name: [plain_number(entry) for entry in value]
+            if type(value) in (list, tuple)
+            else plain_number(value)
+            for name, value in data.items()
+        }
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
@@ -120,15 +116,12 @@ class StrictModel(BaseModel):
           The document.
 
         Raises:
-          SpecError: one line for each field that is wrong, missing or unknown.
+          SpecError: one line for each field that is invalid, missing or unknown.
         """
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            lines = [line["msg"] for line in error.errors()]
-            head = f"{source or cls.__name__}: "
-            text = lines[0] if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
-            raise SpecError(head + text) from None
+            raise _spec_error(cls, error, source) from None
 
     def to_dict(self) -> dict[str, Any]:
         """Every field as plain JSON data."""
@@ -136,7 +129,7 @@ class StrictModel(BaseModel):
 
 
 class Document(StrictModel):
-    """What has an identity: equal documents have equal digests, and the other way round."""
+    """A model with an identity: equal documents have equal digests, unequal ones do not."""
 
     def canonical_json(self) -> bytes:
         """The RFC 8785 canonical JSON of every field."""
@@ -148,119 +141,124 @@ class Document(StrictModel):
         return "sha256:" + hashlib.sha256(self.canonical_json()).hexdigest()
 
 
-def _without_echoes(lines: list[Any]) -> list[Any]:
-    """Drop "too short" where entries were wrong: Pydantic counts only those that were right."""
-    return [
-        line
-        for line in lines
-        if line["type"] != "too_short"
-        or not any(
-            len(other["loc"]) > len(line["loc"]) and other["loc"][: len(line["loc"])] == line["loc"]
-            for other in lines
-        )
-    ]
-
-
-def _explain(document: type[StrictModel], line: Any) -> str:
-    """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
-    location, value = line["loc"], line["input"]
-    if line["type"] == _EXPLAINED:
-        return _from_the_root(
-            str(line["msg"]), location, nested=isinstance(value, dict | BaseModel)
-        )
-    if not location:
-        return f"{document.__name__}{_NOT_AN_OBJECT}, got {show(value)}."
-    path = ".".join(str(part) for part in location)
-    fields = document.model_fields
-    name = str(location[0])
-    if line["type"] == "extra_forbidden":
-        hint = did_you_mean(name, fields) or f" Known fields: {', '.join(fields)}."
-        return f"{path}={show(value)}: unknown field.{hint} Rename or remove it."
-    if name not in fields:  # a key that is not a string
-        return f"{path}: field names must be strings. Known fields: {', '.join(fields)}."
-    field = fields[name]
-    if line["type"] == "missing":
-        return f"{path}: missing: must be {_allowed(field)}. Add it."
-    fix = "Correct it."
-    if not field.is_required() and len(location) == 1:
-        fix = f"Leave it out for the default, {show(field.get_default(call_default_factory=True))}."
-    allowed = f"must be {_allowed(field)}" if len(location) == 1 else str(line["msg"])
-    return f"{path}={show(value)}: {allowed}. {fix}"
-
-
-def _from_the_root(message: str, location: tuple[int | str, ...], *, nested: bool) -> str:
-    """A nested document's line with its field's whole path: `team.agents.1.observes=…`."""
-    parts = [str(part) for part in location]
-    path = ".".join(parts)
-    for start in range(len(parts)):
-        tail = ".".join(parts[start:])
-        if message.startswith((f"{tail}=", f"{tail}:")):
-            return path + message[len(tail) :]
-    if not parts:
-        return message
-    if _NOT_AN_OBJECT in message:
-        return path + message[message.index(_NOT_AN_OBJECT) :]
-    if isinstance(location[-1], int) and not nested:  # one entry of a list of scalars
-        return path + message[message.index("=") :]
-    return f"{path}.{message}"
-
-
-def show(value: Any) -> str:
-    """A bad value as an error repeats it: cut to a length that fits a line."""
+def short_repr(value: Any) -> str:
+    """A value as an error repeats it: cut to a length that fits on a line."""
     try:
         text = repr(value)
     except RecursionError:
         text = f"a {type(value).__name__} nested too deeply"
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+    return text if len(text) <= _MAX_REPR else text[: _MAX_REPR - 1] + "…"
 
 
-def _allowed(field: FieldInfo) -> str:
-    """The values a field takes, in words."""
-    low, high = "", ""
-    shortest, longest, pattern = 0, 0, None
-    for bound in field.metadata:
-        pattern = getattr(bound, "pattern", None) or pattern
-        match bound:
-            case Ge(ge=limit):
-                low = f"[{limit}"
-            case Gt(gt=limit):
-                low = f"({limit}"
-            case Le(le=limit):
-                high = f"{limit}]"
-            case Lt(lt=limit):
-                high = f"{limit})"
-            case MinLen(min_length=shortest):
-                pass
-            case MaxLen(max_length=longest):
-                pass
-    if field.annotation is str:
-        if pattern is not None and field.description:
-            return field.description
-        letters = "letters, digits, '_' and '-'" if pattern is not None else "characters"
-        return f"a string of {shortest} to {longest} {letters}"
-    span = f"in {low or '(−∞'}, {high or '∞)'}" if low or high else ""
-    if longest:
-        span = f"of {shortest} to {longest} entries"
-    kind = _kind(field.annotation)
-    return f"{kind} {span}".strip() if kind else (span or field.description or "of another form")
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
 
 
-def _kind(annotation: Any) -> str:
-    origin = get_origin(annotation)
-    if origin is Annotated:
-        return _kind(get_args(annotation)[0])
-    if annotation is int:
-        return "an integer"
-    if annotation is float:
-        return "a finite number"
-    if origin is Literal:
-        return " or ".join(repr(choice) for choice in get_args(annotation))
-    if origin is tuple:
-        return "a list"
-    if origin in (Union, types.UnionType):
-        return " or ".join(filter(None, (_kind(member) for member in get_args(annotation))))
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return f"an object: {', '.join(annotation.model_fields)}"
-    if annotation is type(None):
-        return "null"
-    return ""
+def refuse_repeated_names(field: str, members: Sequence[_Named]) -> None:
+    """Raise where two members of a field have the same name.
+
+    Raises:
+      ValueError: for Pydantic, which makes an error of the document of it.
+    """
+    names = [member.name for member in members]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{field}: the name {name!r} is given twice. Rename one of them.")
+
+
+def _spec_error(model: type[StrictModel], error: ValidationError, source: str) -> SpecError:
+    """Pydantic's errors as a SpecError, one line each."""
+    lines = error.errors()
+    parents = {line["loc"][:depth] for line in lines for depth in range(len(line["loc"]))}
+    # Pydantic counts only valid entries: a list of one invalid entry is also "too short".
+    lines = [line for line in lines if line["type"] != "too_short" or line["loc"] not in parents]
+    texts = [_explain(model, line) for line in lines]
+    text = texts[0] if len(texts) == 1 else "".join(f"\n  {text}" for text in texts)
+    return SpecError(f"{source or model.__name__}: {text}")
+
+
+def _explain(model: type[StrictModel], line: ErrorDetails) -> str:
+    """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
+    root = model.model_json_schema()
+    location, kind = line["loc"], line["type"]
+    path = ".".join(str(part) for part in location)
+    value = short_repr(line["input"])
+    if kind in ("extra_forbidden", "invalid_key"):
+        known = _resolved(root, _schema_at(root, location[:-1])).get("properties", {})
+        hint = did_you_mean(str(location[-1]), known) or f" Known fields: {', '.join(known)}."
+        if kind == "invalid_key":
+            return f"{path}: field names must be strings.{hint}"
+        return f"{path}={value}: unknown field.{hint} Rename or remove it."
+    schema = _schema_at(root, location)
+    if kind == "value_error":
+        message = str(line["ctx"]["error"])
+        if "properties" not in _resolved(root, schema):
+            return f"{path}={value}: {message}"
+        return f"{path}.{message}" if path else message  # of a model: names its field
+    if kind == "missing":
+        return f"{path}: missing: must be {_allowed(root, schema)}. Add it."
+    if kind in ("model_type", "model_attributes_type"):
+        return f"{path}{': ' if path else ''}must be an object of named fields, got {value}."
+    fix = "Correct it."
+    if "default" in schema:
+        fix = f"Leave it out for the default, {short_repr(schema['default'])}."
+    allowed = f"must be {_allowed(root, schema)}" if schema else line["msg"]
+    return f"{path}={value}: {allowed}. {fix}"
+
+
+def _schema_at(root: dict[str, Any], location: tuple[int | str, ...]) -> dict[str, Any]:
+    """The JSON Schema of a place in a document; empty where the schema does not describe it."""
+    schema = root
+    for part in location:
+        schema = _resolved(root, schema)
+        if isinstance(part, int):
+            schema = schema.get("items", {})
+        else:
+            named = schema.get("properties", {})
+            schema = named.get(part) or schema.get("additionalProperties") or {}
+    return schema
+
+
+def _resolved(root: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """The definition that a schema refers to, directly or as an optional value; else itself."""
+    for option in schema.get("anyOf", [schema]):
+        if "$ref" in option:
+            definition: dict[str, Any] = root["$defs"][option["$ref"].rpartition("/")[2]]
+            return definition
+    return schema
+
+
+def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
+    """What a JSON Schema allows, in words."""
+    if "anyOf" in schema:
+        return " or ".join(_allowed(root, option) for option in schema["anyOf"])
+    if "const" in schema or "enum" in schema:
+        return " or ".join(repr(value) for value in schema.get("enum", [schema.get("const")]))
+    schema = _resolved(root, schema)
+    match schema.get("type"):
+        case "integer" | "number" as kind:
+            noun = "an integer" if kind == "integer" else "a finite number"
+            low = f"[{schema['minimum']}" if "minimum" in schema else "(−∞"
+            high = f"{schema['maximum']}]" if "maximum" in schema else "∞)"
+            if "exclusiveMinimum" in schema:
+                low = f"({schema['exclusiveMinimum']}"
+            if "exclusiveMaximum" in schema:
+                high = f"{schema['exclusiveMaximum']})"
+            return noun if (low, high) == ("(−∞", "∞)") else f"{noun} in {low}, {high}"
+        case "string" if "pattern" in schema and "description" in schema:
+            return str(schema["description"])
+        case "string":
+            return "a string" + _length(schema, "Length", "characters")
+        case "array":
+            return "a list" + _length(schema, "Items", "entries")
+        case "object":
+            return f"an object: {', '.join(schema.get('properties', ['names with values']))}"
+        case "boolean":
+            return "true or false"
+    return str(schema.get("type", schema.get("description", "of another form")))
+
+
+def _length(schema: dict[str, Any], of: str, unit: str) -> str:
+    shortest, longest = schema.get(f"min{of}", 0), schema.get(f"max{of}")
+    return "" if longest is None else f" of {shortest} to {longest} {unit}"

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sme_registry.spec.document import Document, Integer, Real, SchemaVersion, explained, show
+from sme_registry.spec.document import Document, Integer, Real, SchemaVersion, short_repr
 
 
 class EvaluationProtocol(Document):
@@ -32,8 +32,8 @@ class EvaluationProtocol(Document):
     def _shells_are_nested(self) -> Self:
         levels = (0.0, *self.epsilons)
         if any(outer <= inner for inner, outer in itertools.pairwise(levels)):
-            raise explained(
-                f"epsilons={show(list(self.epsilons))}: must increase, from above 0. "
+            raise ValueError(
+                f"epsilons={short_repr(list(self.epsilons))}: must increase, from above 0. "
                 "Sort them and remove repeats and zeros."
             )
         return self

@@ -25,9 +25,9 @@ from sme_registry.spec.document import (
     Integer,
     Real,
     SchemaVersion,
-    explained,
     plain_number,
-    show,
+    refuse_repeated_names,
+    short_repr,
 )
 
 MAX_DIM = 2**20
@@ -42,8 +42,8 @@ def _seed(value: Any) -> int | str:
     number = plain_number(value)
     if isinstance(number, int) and not isinstance(number, bool) and 0 <= number < MAX_SEED:
         return number
-    raise explained(
-        f"seed={show(value)}: must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
+    raise ValueError(
+        f"must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
         "'0x…' of 1 to 64 hex digits. Leave it out for the default, 0."
     )
 
@@ -67,14 +67,14 @@ def _observed(value: Any) -> Any:
         return value
     channels = [plain_number(c) for c in value] if isinstance(value, list | tuple) else None
     if not channels or any(type(c) is not int or c < 0 for c in channels):
-        raise explained(
-            f"observes={show(value)}: must be 'all' or a list of state channels, each an integer "
-            "in [0, state_dim). Leave it out for 'all'."
+        raise ValueError(
+            "must be 'all' or a list of state channels, each an integer in [0, state_dim). "
+            "Leave it out for 'all'."
         )
     if sorted(set(channels)) != channels:
-        raise explained(
-            f"observes={show(value)}: channels must be in increasing order, each once. "
-            f"Write {show(sorted(set(channels)))}."
+        raise ValueError(
+            "channels must be in increasing order, each once. "
+            f"Write {short_repr(sorted(set(channels)))}."
         )
     return tuple(channels)
 
@@ -129,10 +129,7 @@ class TeamSpec(Document):
 
     @model_validator(mode="after")
     def _unique_names(self) -> Self:
-        names = [agent.name for agent in self.agents]
-        for name in names:
-            if names.count(name) > 1:
-                raise explained(f"agents: the name {name!r} is given twice. Rename one of them.")
+        refuse_repeated_names("agents", self.agents)
         return self
 
 
@@ -179,16 +176,17 @@ class Setting(Document):
             return self
         owned = sum(agent.action_dim for agent in self.team.agents)
         if owned != self.action_dim:
-            raise explained(
+            raise ValueError(
                 f"team.agents: their action channels add up to {owned}: must be "
                 f"action_dim={self.action_dim}. Change an agent's action_dim, or the task's."
             )
         for agent in self.team.agents:
             if agent.observes != "all" and agent.observes[-1] >= self.state_dim:
-                raise explained(
-                    f"team.agents.{agent.name}.observes={show(list(agent.observes))}: must be in "
+                observes = short_repr(list(agent.observes))
+                raise ValueError(
+                    f"team.agents.{agent.name}.observes={observes}: must be in "
                     f"[0, state_dim={self.state_dim}). Remove channel {agent.observes[-1]}, or "
-                    "raise state_dim."
+                    "increase state_dim."
                 )
         return self
 
@@ -228,4 +226,4 @@ def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
         return value
     if isinstance(value, dict):
         return SMESpec.from_dict(value)
-    raise SpecError(f"{show(value)}: must be an SMESpec or a mapping of its fields.")
+    raise SpecError(f"{short_repr(value)}: must be an SMESpec or a mapping of its fields.")

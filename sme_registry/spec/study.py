@@ -17,7 +17,7 @@ from sme_registry.spec.document import (
     Name,
     SchemaVersion,
     StrictModel,
-    explained,
+    refuse_repeated_names,
 )
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import Setting, SMESpec
@@ -28,7 +28,7 @@ Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 def _refuse_team(setting: Setting, field: str) -> None:
     if setting.team is not None:
-        raise explained(
+        raise ValueError(
             f"{field}.team: must be null: a study's cells are one agent's tasks, and this one is "
             f"for {len(setting.team.agents)}. Remove it, and train teams with `sme train`."
         )
@@ -113,13 +113,8 @@ class StudyPlan(Document):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> Self:
-        for field in ("classes", "algorithms"):
-            names = [member.name for member in getattr(self, field)]
-            for name in names:
-                if names.count(name) > 1:
-                    raise explained(
-                        f"{field}: the name {name!r} is given twice. Rename one of them."
-                    )
+        refuse_repeated_names("classes", self.classes)
+        refuse_repeated_names("algorithms", self.algorithms)
         for i, member in enumerate(self.classes):
             _refuse_team(member.setting, f"classes.{i}.setting")
         return self

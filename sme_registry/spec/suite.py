@@ -9,7 +9,13 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from sme_registry.spec.document import Document, Name, SchemaVersion, explained, show
+from sme_registry.spec.document import (
+    Document,
+    Name,
+    SchemaVersion,
+    refuse_repeated_names,
+    short_repr,
+)
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
 
 
@@ -23,7 +29,9 @@ class SuiteClass(Document):
     @model_validator(mode="after")
     def _seeds_differ(self) -> Self:
         if len(set(self.seeds)) != len(self.seeds):
-            raise explained(f"seeds={show(list(self.seeds))}: each may stand once. Remove repeats.")
+            raise ValueError(
+                f"seeds={short_repr(list(self.seeds))}: must be distinct. Remove repeats."
+            )
         return self
 
     @property
@@ -41,10 +49,7 @@ class Suite(Document):
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
-        names = [member.name for member in self.classes]
-        for name in names:
-            if names.count(name) > 1:
-                raise explained(f"classes: the name {name!r} is given twice. Rename one of them.")
+        refuse_repeated_names("classes", self.classes)
         return self
 
     @property

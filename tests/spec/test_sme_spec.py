@@ -189,7 +189,7 @@ class TestSuites:
         )
 
     def test_a_setting_with_a_seed_is_refused_as_it_would_be_lost(self):
-        with pytest.raises(ValidationError, match=r"setting\.seed=3"):
+        with pytest.raises(SpecError, match=r"setting\.seed=3"):
             SuiteClass(name="deep", setting=SMESpec(seed=3), seeds=[1])
 
     def test_suites_are_equal_exactly_where_their_digests_are(self):
