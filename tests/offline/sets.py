@@ -7,11 +7,11 @@ from typing import Any
 from sme_registry import SMESpec, materialize
 from sme_registry.datasets import DatasetRecipe, Transitions
 from sme_registry.datasets.collect import collect
-from sme_registry.datasets.recipe import behaviour_of
+from sme_registry.datasets.recipe import parse_behaviour
 
 TINY = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
 
 
 def transitions_of(spec: SMESpec = TINY, nu: Any = 0.5, count: int = 600) -> Transitions:
-    recipe = DatasetRecipe(spec=spec, behaviours=(behaviour_of(nu),), transitions=count, seed=3)
+    recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(nu),), transitions=count, seed=3)
     return collect(recipe, materialize(spec))

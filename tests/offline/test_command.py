@@ -68,7 +68,7 @@ def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["tiny-v1"], "no data set of this id"),
+        (["tiny-v1"], "is neither the id of a data set"),
         (["tiny-v0", "-a", "ddpg"], "algorithm='ddpg'"),
         (["tiny-v0", "--steps", "0"], "steps=0"),
         (["tiny-v0", "--batch-size", "61"], "batch_size=61"),

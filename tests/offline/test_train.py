@@ -212,7 +212,7 @@ def test_bad_input_is_refused(
 def test_what_is_no_data_set_is_refused() -> None:
     with pytest.raises(OptionError, match="must be a data set"):
         short([1, 2, 3])
-    with pytest.raises(UnknownNameError, match="no data set of this id"):
+    with pytest.raises(UnknownNameError, match="is neither the id of a data set"):
         short("sme/nothing-v0", spec=None)
 
 
