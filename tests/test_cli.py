@@ -538,7 +538,7 @@ class TestEvaluate:
             (("math:nothing", "Default"), "cannot be imported"),
             (("math:pi", "Default"), "must be a function"),
             (("math:sqrt", "Default"), "failed on observations"),
-            (("nowhere.zip", "Default"), "no such file"),
+            (("nowhere.zip", "Default"), "does not exist"),
             (("optimal", "Defalt"), "Did you mean"),
             (("optimal", "Default", "--protocol", "papr-v1"), "Did you mean 'paper-v1'"),
             (("optimal", "Default", "--action-range", "both"), "action_range='both'"),

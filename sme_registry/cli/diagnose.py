@@ -12,7 +12,6 @@ from rich.markup import escape
 
 from sme_registry import load
 from sme_registry.cli import names
-from sme_registry.cli.policies import find_policy
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json, write_atomically
 from sme_registry.terminal.output import err, out, print_json
@@ -139,9 +138,7 @@ def _subject(
     if task is not None:
         spec = load(task).derive(**names.overrides(set_ or []))
         shown = run if os.sep not in run else None
-        return diagnosis.of_policy(
-            find_policy(run, spec), spec, action_range=action_range, name=shown
-        )
+        return diagnosis.of_policy(run, spec, action_range=action_range, name=shown)
     if cell is not None:
         return diagnosis.of_cell(run, cell)
     if not Path(run).is_dir() and (Path(run).is_file() or ":" in run or os.sep not in run):

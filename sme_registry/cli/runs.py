@@ -12,8 +12,8 @@ from rich.markup import escape
 
 from sme_registry import load
 from sme_registry.cli import names
-from sme_registry.cli.policies import REFERENCES, find_policy
 from sme_registry.errors import OptionError
+from sme_registry.evaluation.references import POLICIES
 from sme_registry.spec import SMESpec
 from sme_registry.terminal.output import err, out, print_json
 
@@ -32,7 +32,7 @@ def evaluate(
         str,
         typer.Argument(
             metavar="POLICY",
-            help=f"A .zip, .onnx or .npz, module:function, or {', '.join(REFERENCES)}.",
+            help=f"A .zip, .onnx or .npz, module:function, or {', '.join(POLICIES)}.",
         ),
     ],
     task: TaskName,
@@ -80,19 +80,16 @@ def evaluate(
     target = None if out_folder is None else out_folder / "evaluation.json"
     if target is not None and target.exists() and not force:
         raise OptionError(f"{target}: is there already. Give another --out, or --force.")
-    found = find_policy(policy, spec)
+    prepared = evaluation.as_policy(policy, spec, action_range=action_range)
     states = judged_by.states_per_region * len(judged_by.edges)
-    shown = policy if policy in REFERENCES or ":" in policy else Path(policy).stem
     with Progress("evaluating", states, unit="states", console=err()) as progress:
         report = evaluation.evaluate(
-            found,
+            prepared,
             spec,
             judged_by,
-            action_range=action_range,
-            name=shown,
             progress=lambda done, total: progress.update(done),
         )
-    written = [] if target is None else [report.write(target), *_figures(report, found, target)]
+    written = [] if target is None else [report.write(target), *_figures(report, prepared, target)]
     if json:
         print_json(report.to_dict())
     else:

@@ -177,7 +177,7 @@ class UserPolicy:
         for agent, member in enumerate(self._policy.members):
             # s, t/T and this agent's r_cum/k, of which it observes a part.
             single = observation[:, [*range(S + 1), S + 1 + agent]]
-            acted = _in_blocks(member.policy, member.seen(single))
+            acted = _in_blocks(member.policy, member.observe(single))
             joint.append(acted[:, : member.action_dim])
         return np.clip(np.concatenate(joint, axis=1), 0.0, 1.0)
 

@@ -1,7 +1,15 @@
 """Evaluation within and out of distribution: a policy and a task to a report."""
 
 from sme_registry.evaluation.evaluate import evaluate, resolve_protocol
-from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy, load_sb3
+from sme_registry.evaluation.policies import (
+    OfflinePolicy,
+    Policy,
+    TeamPolicy,
+    as_policy,
+    load_onnx,
+    load_sb3,
+)
+from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.report import (
     AgentReport,
     ChannelReport,
@@ -13,11 +21,14 @@ __all__ = [
     "AgentReport",
     "ChannelReport",
     "EvaluationReport",
+    "OfflinePolicy",
     "Policy",
     "RegionReport",
     "TeamPolicy",
     "as_policy",
     "evaluate",
+    "load_onnx",
     "load_sb3",
+    "reference_policy",
     "resolve_protocol",
 ]

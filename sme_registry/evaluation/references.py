@@ -1,19 +1,19 @@
-"""The policies that every report shows beside the one in question, on the same states.
+"""The reference policies that every report shows next to the evaluated one, on the same states.
 
 optimal                π*: similarity 1, normalised regret 0
-linear_least_squares   the affine map of the state fitted to π*, clipped to [0, 1]; of a team, each
-                       agent's own map of the channels that it observes
-best_constant          the constant action of least mean |a − a*|: each channel's median of a*
+linear_least_squares   the affine map of the state fitted to π*, clipped to [0, 1]; in a team each
+                       agent has its own map of the channels that it observes
+best_constant          the constant action with the smallest mean |a − a*|: the medians of a*
 constant_half          a = ½: normalised regret 1
 uniform_random         a ~ U([0, 1]^A), drawn anew in each state
 
-The two fitted ones know the training cube only: they are fitted on the states of WD, at most
-`FIT_STATES` of them (all, under paper-v1), and used unchanged in every other region. So they lose
-outside what an agent that learnt no more than they did would lose. Judged in WD on the states they
-were fitted on, they look too good there where those are not many times state_dim.
+The two fitted ones are fitted on the states of WD, at most `FIT_STATES` of them (all of them under
+paper-v1), and used unchanged in every other region: outside they lose as much as an agent would
+that learned no more. In WD they are evaluated on the states they were fitted on, which flatters
+them unless there are many times more states than state_dim.
 
-An agent's reference knows no more than the agent: a linear map of the whole state, fitted to all
-channels at once, would be another policy, which no agent that observes a part of it could follow.
+An agent's reference uses only what the agent observes: a linear map of the whole state is another
+policy, which no agent that observes a part of the state could execute.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _FIT_NUMBERS = 2**24  # of the states and actions kept for the fit, 128 MiB as f
 
 
 def fit_states(spec: SMESpec) -> int:
-    """How many states of WD the fit keeps; fewer where a state is large."""
+    """How many states of WD the fit uses; fewer if a state is large."""
     return max(1, min(FIT_STATES, _FIT_NUMBERS // (spec.state_dim + spec.action_dim)))
 
 
@@ -57,7 +57,7 @@ class References:
       constant: `[A]` the best constant action.
       slope: `[S, A]` of the linear policy, about the cube's centre; 0 where the agent that owns
         the action channel does not observe the state channel.
-      intercept: `[A]` its action there.
+      intercept: `[A]` its action at the centre.
     """
 
     constant: Array
@@ -65,7 +65,7 @@ class References:
     intercept: Array
 
     def actions(self, s: Array, optimal: Array, random: Array) -> dict[str, Array]:
-        """Every reference's actions in states `[B, S]`, by name.
+        """The actions of every reference policy, by name.
 
         Args:
           s: `[B, S]` states.
@@ -73,7 +73,7 @@ class References:
           random: `[B, A]` uniform numbers in (0, 1).
 
         Returns:
-          `[B, A]` each, or `[A]` where an action is constant; all in [0, 1].
+          `[B, A]` each, or `[A]` for a constant action; all in [0, 1].
         """
         linear = (s - 0.5) @ self.slope
         linear += self.intercept
@@ -89,7 +89,7 @@ class References:
 def fit(
     s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
 ) -> References:
-    """Fit the references on states of WD and their optimal actions.
+    """Fit the references to the optimal actions in states of WD.
 
     Args:
       s: `[N, S]` states.
@@ -100,13 +100,13 @@ def fit(
     S, A = s.shape[1], optimal.shape[1]
     slope, intercept = np.zeros((S, A)), np.empty(A)
     owned_by_observed: dict[tuple[int, ...], list[int]] = {}
-    for observed, own in [(range(S), slice(0, A))] if agents is None else agents:
-        owned_by_observed.setdefault(tuple(observed), []).extend(range(own.start, own.stop))
-    for channels, owned in owned_by_observed.items():
-        design = np.concatenate([s[:, channels] - 0.5, np.ones((len(s), 1))], axis=1)
-        solution = np.linalg.lstsq(design, optimal[:, owned])[0]
-        slope[np.ix_(channels, owned)] = solution[:-1]
-        intercept[owned] = solution[-1]
+    for observed, owned in [(range(S), slice(0, A))] if agents is None else agents:
+        owned_by_observed.setdefault(tuple(observed), []).extend(range(owned.start, owned.stop))
+    for observed, columns in owned_by_observed.items():
+        design = np.concatenate([s[:, observed] - 0.5, np.ones((len(s), 1))], axis=1)
+        solution = np.linalg.lstsq(design, optimal[:, columns])[0]
+        slope[np.ix_(observed, columns)] = solution[:-1]
+        intercept[columns] = solution[-1]
     return References(np.median(optimal, axis=0), slope, intercept)
 
 
@@ -114,7 +114,17 @@ def _optimal(spec: SMESpec) -> Joint:
     return engine(materialize(spec)).optimal_action
 
 
-def _constant(spec: SMESpec) -> Joint:
+def _linear(spec: SMESpec) -> Joint:
+    fitted = _fit_uniform(spec)
+    return lambda s: (s - 0.5) @ fitted.slope + fitted.intercept
+
+
+def _best_constant(spec: SMESpec) -> Joint:
+    constant = _fit_uniform(spec).constant
+    return lambda s: np.tile(constant, (len(s), 1))
+
+
+def _constant_half(spec: SMESpec) -> Joint:
     return lambda s: np.full((len(s), spec.action_dim), 0.5)
 
 
@@ -123,47 +133,62 @@ def _random(spec: SMESpec) -> Joint:
     return lambda s: generator.random((len(s), spec.action_dim))
 
 
-def _linear(spec: SMESpec) -> Joint:
+def _fit_uniform(spec: SMESpec) -> References:
+    """The references fitted on states of their own, uniform in the training cube."""
     task = materialize(spec)
     s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
     agents = zip(task.observed, task.owned, strict=True)
-    fitted = fit(s, engine(task).optimal_action(s), agents)
-    return lambda s: (s - 0.5) @ fitted.slope + fitted.intercept
+    return fit(s, engine(task).optimal_action(s), agents)
 
 
-# The ones that can be asked by name, without a protocol.
-POLICIES: dict[str, Callable[[SMESpec], Joint]] = {
+_BY_NAME: dict[str, Callable[[SMESpec], Joint]] = {
     "optimal": _optimal,
-    "constant": _constant,
-    "random": _random,
-    "linear": _linear,
+    "linear_least_squares": _linear,
+    "best_constant": _best_constant,
+    "constant_half": _constant_half,
+    "uniform_random": _random,
 }
+SHORT_NAMES = {
+    "linear": "linear_least_squares",
+    "constant": "constant_half",
+    "random": "uniform_random",
+}
+POLICIES = (*NAMES, *SHORT_NAMES)
+"""Names that `reference_policy` accepts: the reports' names, and short ones."""
 
 
 def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
-    """A policy that learns nothing, as `evaluate` takes it.
+    """A reference policy, as `evaluate` accepts it.
+
+    Unlike the references of a report, the fitted ones are fitted on states of their own.
 
     Args:
       name: one of `POLICIES`.
       spec: the task.
 
     Returns:
-      From observations `[B, S + 2]` to actions `[B, A]` of the unit range; of a team, one for each
-      agent.
+      A function from observations `[B, S + 2]` to actions `[B, A]` of the unit range; for a team,
+      one for each agent.
     """
-    joint, S = POLICIES[name](spec), spec.state_dim
+    joint, S = _BY_NAME[SHORT_NAMES.get(name, name)](spec), spec.state_dim
     if spec.team is None:
-        return lambda observations: joint(observations[:, :S].astype(np.float64))
+
+        def act_alone(observations: Observation) -> Array:
+            return joint(observations[:, :S].astype(np.float64))
+
+        act_alone.__name__ = name
+        return act_alone
     task = materialize(spec)
 
-    def of(observed: tuple[int, ...], own: slice) -> Act:
+    def of_agent(observed: tuple[int, ...], owned: slice) -> Act:
         def act(observations: Observation) -> Array:
-            # What the agent does not observe has no part in its own channels of the joint action.
+            # The agent's channels of the joint action do not depend on what it does not observe.
             s = np.zeros((len(observations), S))
             s[:, observed] = observations[:, : len(observed)]
-            return joint(s)[:, own]
+            return joint(s)[:, owned]
 
+        act.__name__ = name
         return act
 
     agents = zip(task.names, task.observed, task.owned, strict=True)
-    return {agent: of(observed, own) for agent, observed, own in agents}
+    return {agent: of_agent(observed, owned) for agent, observed, owned in agents}

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from sme_registry.datasets import Transitions
-from sme_registry.offline.policy import Layer
+from sme_registry.evaluation.policies.npz import Layer
 
 
 class Batch(NamedTuple):

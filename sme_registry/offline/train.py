@@ -32,6 +32,7 @@ from sme_registry.errors import (
     SpecError,
 )
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.evaluation.policies.npz import Layer, OfflinePolicy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.offline.hyperparameters import (
@@ -40,7 +41,6 @@ from sme_registry.offline.hyperparameters import (
     hyperparameters_of,
     known_algorithm,
 )
-from sme_registry.offline.policy import Layer, OfflinePolicy
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel, plain_number
 from sme_registry.task import Task, load_spec, materialize, streams

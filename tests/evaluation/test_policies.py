@@ -11,8 +11,13 @@ from typer.testing import CliRunner
 
 import sme_registry
 from sme_registry.cli import app
-from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
-from sme_registry.evaluation import as_policy, evaluate
+from sme_registry.errors import (
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    UnknownNameError,
+)
+from sme_registry.evaluation import OfflinePolicy, as_policy, evaluate, references
 from sme_registry.spec import SMESpec
 
 SPEC = SMESpec(state_dim=3, action_dim=2)
@@ -97,6 +102,58 @@ def test_an_unknown_action_range_is_refused():
         judged(constant(0.5, 0.5), action_range="wide")
 
 
+@pytest.mark.parametrize("reference", references.NAMES)
+def test_a_reference_policy_goes_by_the_name_that_reports_use(reference):
+    report = judged(reference)
+    assert report.policy == reference
+    for row, expected in zip(report.regions, report.references[reference], strict=True):
+        assert row.similarity == pytest.approx(expected.similarity, abs=0.05)
+
+
+def test_the_short_name_of_a_reference_is_the_same_policy():
+    assert set(references.SHORT_NAMES.values()) < set(references.NAMES)
+    for short, full in references.SHORT_NAMES.items():
+        assert judged(short).regions == judged(full).regions
+
+
+def test_a_function_goes_by_its_module_and_name(tmp_path, monkeypatch):
+    (tmp_path / "policies_for_a_test.py").write_text("def act(o):\n    return o[:, :2]\nx = 3\n")
+    monkeypatch.chdir(tmp_path)
+    report = judged("policies_for_a_test:act")
+    assert report.policy == "policies_for_a_test:act"
+    assert report.regions == judged(lambda o: o[:, :2]).regions
+    with pytest.raises(PolicyError, match="is a int: must be a function"):
+        judged("policies_for_a_test:x")
+    with pytest.raises(PolicyError, match="cannot be imported"):
+        judged("no_such_module:act")
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_one(tmp_path):
+    with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):
+        judged("liner")
+    with pytest.raises(PolicyError, match="is a folder"):
+        judged(str(tmp_path))
+
+
+def test_an_offline_policy_scores_as_its_file(tmp_path):
+    layers = [(np.full((2, 5), 0.3, np.float32), np.zeros(2, np.float32))]
+    policy = OfflinePolicy(layers, {"algorithm": "bc"})
+    path = policy.save(tmp_path / "policy.npz")
+    live, saved = judged(policy), judged(str(path))
+    assert (live.policy, saved.policy) == ("bc", "policy")
+    assert saved.regions == live.regions
+    with pytest.raises(PolicyError, match=r"\[B, 5\] .*: must be \[B, 10\] and \[B, 4\]"):
+        evaluate(path, "Default", PROTOCOL)
+
+
+def test_a_prepared_policy_is_accepted_as_it_is():
+    prepared = as_policy(constant(-0.5, 1.0), SPEC, action_range="symmetric", name="mine")
+    again = as_policy(prepared, SPEC)
+    assert (again.name, again.action_range) == ("mine", "symmetric")
+    assert judged(prepared) == judged(constant(-0.5, 1.0), action_range="symmetric", name="mine")
+    assert as_policy(prepared, SPEC, name="other").name == "other"
+
+
 def test_a_policy_is_named_after_its_function():
     def careful(observations):
         return np.full((len(observations), 2), 0.5)
@@ -109,10 +166,10 @@ def test_a_policy_is_named_after_its_function():
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("absent.zip", None, "there is no such file"),
+        ("absent.zip", None, "does not exist"),
         ("text.zip", b"hello", "not a model that Stable-Baselines3 saved"),
         ("policy", b"\x08\x07", "not a model that Stable-Baselines3 saved"),
-        ("absent.onnx", None, r"there is no such file. Give the path of an \.onnx"),
+        ("absent.onnx", None, r"does not exist. Give the path of an \.onnx"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused(tmp_path, name, content, message):
@@ -250,7 +307,7 @@ def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_rang
         ({"a": 3}, r"its outputs are a tensor\(float\) \['batch', 3\]: must be .* \[batch, 2\]"),
         ({"batch": 1}, "the batch of any size"),
         ({"dtype": "DOUBLE"}, r"its inputs are o tensor\(double\)"),
-        ({"operator": "Nonsense"}, "not a network that onnxruntime loads"),
+        ({"operator": "Nonsense"}, "not a network that onnxruntime can load"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
@@ -263,7 +320,7 @@ def test_an_onnx_file_that_does_not_fit_is_refused(onnx, tmp_path, made, message
 @pytest.mark.parametrize("content", [b"", b"\x08\x07", b"hello"])
 def test_bytes_that_are_no_onnx_file_are_refused(onnx, tmp_path, content):
     (tmp_path / "actor.onnx").write_bytes(content)
-    with pytest.raises(PolicyError, match="not a network that onnxruntime loads"):
+    with pytest.raises(PolicyError, match="not a network that onnxruntime can load"):
         judged(str(tmp_path / "actor.onnx"))
 
 

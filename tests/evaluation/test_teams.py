@@ -183,21 +183,30 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
         assert list(numbers(found.agents["agent_0"])) == list(numbers(alone))
 
 
-def test_the_references_of_the_command_line_act_for_teams_as_the_reports_own():
-    from sme_registry.cli.policies import find_policy
-
+def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report():
     def inside(name):
-        return evaluate(find_policy(name, SPEC), SPEC, SMALL).agents
+        return evaluate(name, SPEC, SMALL).agents
 
     for name, same, near in (
         ("optimal", "optimal", 1e-9),
         ("constant", "constant_half", 0.0),
+        ("best_constant", "best_constant", 0.05),  # fitted on other states
         ("linear", "linear_least_squares", 0.05),  # fitted on other states
         ("random", "uniform_random", 0.3),
     ):
         for agent in inside(name).values():
             found, expected = agent.regions[0], agent.references[same][0]
             assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
+
+
+def test_agents_of_a_team_may_have_policies_by_name():
+    mixed = {**dict.fromkeys(NAMES, "optimal"), NAMES[1]: "constant_half"}
+    report = evaluate(mixed, SPEC, SMALL)
+    regrets = [report.agents[name].regions[0].normalised_regret for name in NAMES]
+    assert regrets == pytest.approx([0.0, 1.0, 0.0], abs=1e-9)
+    prepared = as_policy("linear", SPEC)
+    assert as_policy(prepared, SPEC) is prepared
+    assert (prepared.name, evaluate(prepared, SPEC, SMALL).policy) == ("linear", "linear")
 
 
 def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
@@ -312,10 +321,10 @@ def with_(**changed):
         (with_(right_1=lambda o: np.full((len(o), 2), np.nan)), r"^right_1: .*NaN or infinite"),
         (with_(left_0=lambda o: 1 / 0), r"^left_0: .*ZeroDivisionError"),
         (with_(right_0=None), r"^right_0: policy=None: must be a callable .*\[B, 5\] .*\[B, 3\]"),
-        (with_(right_0="absent.zip"), r"^right_0: absent\.zip: there is no such file"),
+        (with_(right_0="absent.zip"), r"^right_0: absent\.zip does not exist"),
         (None, r"must be a dict from each agent's name to its policy; or .*\[B, 9\] to .*\[B, 3\]"),
-        (half(6), r"^left_0: .*\(200, 6\): must be of shape \(200, 3\).*asked for each agent"),
-        (lambda o: o @ np.ones((6, 6)), r"^left_0: .*ValueError: .* for separate policies give a"),
+        (half(6), r"^left_0: .*\(200, 6\): must be of shape \(200, 3\).*called for each agent"),
+        (lambda o: o @ np.ones((6, 6)), r"^left_0: .*ValueError: .* for separate policies pass a"),
         (lambda o: np.where(o[:, 7:8] == 1, np.nan, np.full((len(o), 3), 0.5)), "^right_0: .*NaN"),
     ],
 )  # fmt: skip

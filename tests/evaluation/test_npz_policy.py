@@ -1,4 +1,4 @@
-"""A trained policy: what it answers, and its file."""
+"""A trained policy in NumPy, and its file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.offline import OfflinePolicy
+from sme_registry.evaluation import OfflinePolicy
 
 SPEC = SMESpec(state_dim=2, action_dim=2)
 
@@ -89,7 +89,7 @@ def test_the_files_of_these_tests_are_read_where_nothing_is_wrong(tmp_path: Path
         (lambda: b"PK\x03\x04 cut", "not a policy"),
         (lambda: stored()[:-40], "not a policy"),
         (lambda: stored(about=None), "about"),
-        (lambda: stored(about=np.frombuffer(b"{}", np.uint8)), "does not say so"),
+        (lambda: stored(about=np.frombuffer(b"{}", np.uint8)), "does not name its kind"),
         (lambda: stored(b1=None), "b1"),
         (lambda: stored(W1=np.zeros((8, 9), np.float32)), "layer 1 has shapes"),
         (lambda: stored(W0=np.zeros((8, 4))), "not float32"),
@@ -108,7 +108,7 @@ def test_what_is_no_policy_is_refused(
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(PolicyError, match=r"nothing\.npz: there is no such file"):
+    with pytest.raises(PolicyError, match=r"nothing\.npz does not exist"):
         OfflinePolicy.load(tmp_path / "nothing.npz")
 
 

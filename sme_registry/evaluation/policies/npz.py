@@ -1,9 +1,8 @@
-"""`OfflinePolicy`: a trained policy in NumPy, and its file. No PyTorch here.
+"""`OfflinePolicy`: a trained network in NumPy, and its .npz file. It needs no PyTorch.
 
     h_0 = o,  h_i = max(0, W_i h_{i−1} + b_i),  a = (1 + tanh(W_n h_{n−1} + b_n)) / 2
 
-The file is NumPy's .npz: `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Reading one runs
-no code of whoever wrote it.
+The file holds `W0`, `b0`, `W1`, … in order, and `about`, a JSON text. Reading it runs no code.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ class OfflinePolicy:
 
     Attributes:
       layers: `(W [out, in], b [out])` float32, first to last.
-      about: what it was trained on and how, plain JSON data.
-      name: what reports call it.
+      about: what it was trained on and how, plain JSON data; "algorithm" names it in reports.
     """
 
     layers: Sequence[Layer]
@@ -72,13 +70,13 @@ class OfflinePolicy:
           `[B, A]` float32 in [0, 1].
 
         Raises:
-          PolicyError: of another width.
+          PolicyError: they have another width.
         """
         x = np.asarray(observations, dtype=np.float32)
         if x.ndim != 2 or x.shape[1] != self.observation_dim:
             raise PolicyError(
-                f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Ask the "
-                "policy on the task it was trained for."
+                f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Evaluate "
+                "the policy on the task it was trained for."
             )
         *inner, (W, b) = self.layers
         for weight, bias in inner:
@@ -91,7 +89,7 @@ class OfflinePolicy:
         return u
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it whole or not at all; the same policy gives the same bytes.
+        """Write the file completely or not at all; equal policies give equal bytes.
 
         Raises:
           OptionError: the path does not end in .npz, or cannot be written.
@@ -110,10 +108,10 @@ class OfflinePolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> OfflinePolicy:
-        """Read one that `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
-          PolicyError: missing, or no such file.
+          PolicyError: it does not exist, or is not such a file.
         """
         refused = f"{os.fspath(path)}: not a policy that `sme offline train` wrote"
         try:
@@ -129,14 +127,14 @@ class OfflinePolicy:
                 layers = [(stored[f"W{i}"], stored[f"b{i}"]) for i in range(count)]
         except FileNotFoundError:
             raise PolicyError(
-                f"{os.fspath(path)}: there is no such file. Give the path of a policy (.npz)."
+                f"{os.fspath(path)} does not exist. Give the path of a policy (.npz)."
             ) from None
         except PolicyError:
             raise
         except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, SMEError) as error:
             raise PolicyError(f"{refused}: {type(error).__name__}: {error}.") from None
         if not isinstance(about, dict) or about.pop("kind", None) != KIND:
-            raise PolicyError(f"{refused}: it does not say so.")
+            raise PolicyError(f"{refused}: its `about` does not name its kind.")
         _refuse_other_layers(layers, refused)
         return cls(layers, about)
 

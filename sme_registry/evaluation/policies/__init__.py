@@ -1,0 +1,22 @@
+"""Policies: every form in which a user may give one, as one checked function of observations.
+
+callable · Stable-Baselines3 model or .zip · .onnx file · .npz file of an offline policy ·
+`module:function` · name of a reference policy · for teams also a dict by agent.
+"""
+
+from sme_registry.evaluation.policies.forms import as_policy
+from sme_registry.evaluation.policies.npz import OfflinePolicy
+from sme_registry.evaluation.policies.onnx import load_onnx
+from sme_registry.evaluation.policies.policy import Policy
+from sme_registry.evaluation.policies.sb3 import load_sb3
+from sme_registry.evaluation.policies.team import Member, TeamPolicy
+
+__all__ = [
+    "Member",
+    "OfflinePolicy",
+    "Policy",
+    "TeamPolicy",
+    "as_policy",
+    "load_onnx",
+    "load_sb3",
+]
