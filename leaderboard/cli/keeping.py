@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,6 @@ from rich.markup import escape
 
 from leaderboard.cli.options import BoardFolder, ProtocolName, SuiteName, find_suite
 from leaderboard.errors import BoardError
-from sme_registry.errors import MissingDependencyError
 from sme_registry.terminal import Progress, err, out, print_json
 
 
@@ -130,15 +128,11 @@ def serve(
 
       sme-leaderboard serve board --port 8000 --workers 2
     """
-    if importlib.util.find_spec("fastapi") is None or importlib.util.find_spec("uvicorn") is None:
-        raise MissingDependencyError(
-            "serve: FastAPI and uvicorn are needed. Run `pip install 'sme-registry[leaderboard]'`."
-        )
     from leaderboard.documents.board import Folder
-    from leaderboard.web import app as server
+    from leaderboard.web.serve import serve as serve_board
 
-    Folder(board).read()  # what is no board is refused before anything listens
-    server.serve(board, host=host, port=port, workers=workers)
+    Folder(board).read()  # a wrong folder fails before anything listens
+    serve_board(board, host=host, port=port, workers=workers)
 
 
 def reindex(board: BoardFolder = Path("board")) -> None:

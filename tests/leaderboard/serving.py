@@ -13,11 +13,12 @@ from typing import Any
 
 import uvicorn
 
-from leaderboard.web.app import _listening, _url, create_app
+from leaderboard.web.app import create_app
+from leaderboard.web.serve import listen, url_of
 
 _SERVE = """
 import sys
-from leaderboard.web.app import serve
+from leaderboard.web.serve import serve
 serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(url, flush=True))
 """
 
@@ -25,7 +26,7 @@ serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(
 @contextlib.contextmanager
 def serving(path: Path, **options: Any) -> Iterator[str]:
     """A server in a thread; yields its URL."""
-    with _listening("127.0.0.1", 0) as listener:
+    with listen("127.0.0.1", 0) as listener:
         config = uvicorn.Config(
             create_app(path, **options), http="h11", ws="none", log_level="critical"
         )
@@ -33,7 +34,7 @@ def serving(path: Path, **options: Any) -> Iterator[str]:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
-            yield _url(listener)
+            yield url_of(listener)
         finally:
             server.should_exit = True
             thread.join(10)

@@ -13,6 +13,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import Rejection
+from leaderboard.intake import references
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
@@ -45,6 +46,13 @@ def code_of(call: Callable[[], Any]) -> str:
     return caught.value.code
 
 
+def receive(store: Store, signed: SignedSubmission, at: datetime.datetime | None = None) -> str:
+    """Admit a submission from its bytes, as a server does."""
+    read = SignedSubmission.read(signed.to_bytes())
+    intake.admit(store, read, at)
+    return read.id
+
+
 def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmission:
     """A submission of a file that is on the board, whatever it is."""
     digest = "sha256:" + hashlib.sha256(data).hexdigest()
@@ -62,8 +70,8 @@ def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmissio
 def test_a_submission_is_kept_once(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
-    assert intake.receive(store, signed.to_bytes()) == signed.id
-    assert intake.receive(store, signed.to_bytes()) == signed.id
+    assert receive(store, signed) == signed.id
+    assert receive(store, signed) == signed.id
     assert [entry.id for entry in store.entries()] == [signed.id]
     assert store.head.sequence == 1
 
@@ -71,22 +79,22 @@ def test_a_submission_is_kept_once(store: Store, key: SigningKey) -> None:
 def test_a_known_submission_is_known_whatever_its_age(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
-    intake.receive(store, signed.to_bytes())
+    receive(store, signed)
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=999)
-    assert intake.receive(store, signed.to_bytes(), at=later) == signed.id
+    assert receive(store, signed, at=later) == signed.id
 
 
 def test_a_submission_that_is_old_is_refused(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=15)
-    assert code_of(lambda: intake.receive(store, signed.to_bytes(), at=later)) == "stale_time"
+    assert code_of(lambda: receive(store, signed, at=later)) == "stale_time"
     assert store.entries() == []
 
 
 def test_an_artefact_that_is_not_there_is_missed(store: Store, key: SigningKey) -> None:
     signed, _ = tiny_submission(store, key)
-    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "artefact_missing"
+    assert code_of(lambda: receive(store, signed)) == "artefact_missing"
 
 
 def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -> None:
@@ -95,7 +103,7 @@ def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -
     plain = signed.submission.to_dict()
     plain["runs"][0]["artefact"]["size"] -= 1
     other = type(signed.submission).from_dict(plain).signed(key)
-    assert code_of(lambda: intake.receive(store, other.to_bytes())) == "artefact_digest"
+    assert code_of(lambda: receive(store, other)) == "artefact_digest"
     assert store.entries() == []
 
 
@@ -112,7 +120,7 @@ def test_artefacts_pass_the_gate_with_the_widths_of_their_spec(
     store: Store, key: SigningKey, data: bytes, code: str
 ) -> None:
     signed = with_artefact(store, key, data)
-    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == code
+    assert code_of(lambda: receive(store, signed)) == code
     assert store.entries() == []
 
 
@@ -122,7 +130,7 @@ def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> N
     for run in plain["runs"]:
         run["artefact"] = None
     failed = type(signed.submission).from_dict(plain).signed(key)
-    assert intake.receive(store, failed.to_bytes()) == failed.id
+    assert receive(store, failed) == failed.id
 
 
 def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKey) -> None:
@@ -134,10 +142,10 @@ def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKe
         first = store.usage.submission_times(key.public, ANY_TIME)[0]
         free = datetime.datetime.fromisoformat(first) + datetime.timedelta(days=1)
         with pytest.raises(Rejection, match=f"quota: .* after {utc(free)}") as caught:
-            intake.receive(store, signed.to_bytes())
+            receive(store, signed)
         assert caught.value.code == "quota"
         after = free + datetime.timedelta(seconds=2)
-        assert intake.receive(store, signed.to_bytes(), at=after) == signed.id
+        assert receive(store, signed, at=after) == signed.id
 
 
 def test_the_quota_of_one_key_is_not_anothers(tmp_path: Path, key: SigningKey) -> None:
@@ -146,7 +154,7 @@ def test_the_quota_of_one_key_is_not_anothers(tmp_path: Path, key: SigningKey) -
         other = SigningKey.generate()
         signed, artefacts = tiny_submission(store, other, 2)
         put(store, other, artefacts)
-        assert intake.receive(store, signed.to_bytes()) == signed.id
+        assert receive(store, signed) == signed.id
 
 
 def test_a_board_where_many_wait_takes_no_more(tmp_path: Path, key: SigningKey) -> None:
@@ -154,7 +162,7 @@ def test_a_board_where_many_wait_takes_no_more(tmp_path: Path, key: SigningKey) 
         put_submission(store, key, 1)
         signed, artefacts = tiny_submission(store, key, 2)
         put(store, key, artefacts)
-        assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "quota"
+        assert code_of(lambda: receive(store, signed)) == "quota"
         assert len(intake.submit_references(store)) == 2  # without them nothing is ever shown
 
 
@@ -205,10 +213,9 @@ def test_reference_rows_stay_where_other_versions_write_other_bytes(
 ) -> None:
     ids = intake.submit_references(store)
     others = [
-        (name, knowledge, lambda _: linear_onnx(7), text)
-        for name, knowledge, _, text in intake._REFERENCES
+        reference._replace(onnx=lambda _: linear_onnx(7)) for reference in references.REFERENCES
     ]
-    monkeypatch.setattr(intake, "_REFERENCES", others)
+    monkeypatch.setattr(references, "REFERENCES", others)
     assert intake.submit_references(store) == ids
     assert len(store.entries()) == 2
 
@@ -245,7 +252,7 @@ def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
     entry = store.entry(signed.id)
     assert entry is not None
     assert entry.status == "withdrawn"
-    assert code_of(lambda: intake.receive(store, signed.to_bytes())) == "withdrawn"
+    assert code_of(lambda: receive(store, signed)) == "withdrawn"
 
 
 def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:

@@ -154,7 +154,7 @@ def test_what_a_process_finds_altered_stops_them_all(store, board):
 
 
 def test_processes_that_only_die_are_given_up(store, board, monkeypatch):
-    monkeypatch.setattr(scorer, "_BARREN_DEATHS", 2)
+    monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
     assert store.queue.waiting() == 3
@@ -164,7 +164,7 @@ def test_scorers_killed_over_a_reference_row_leave_it_to_be_scored(store, monkey
     references = intake.submit_references(store)
     for attempt in range(ATTEMPTS):
         store.queue.abandon(store.queue.claim(f"killed {attempt}").worker)
-    monkeypatch.setattr(scorer, "_BARREN_DEATHS", 2)
+    monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
 
     def kill_once_it_claims(pid):
         while store.queue.claimable() == store.queue.waiting():

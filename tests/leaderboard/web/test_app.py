@@ -21,7 +21,8 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
-from leaderboard.web.app import HTTP_CODES, serve
+from leaderboard.web.errors import HTTP_CODES, STATUSES
+from leaderboard.web.serve import serve
 from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
 from tests.leaderboard.serving import serving, serving_process
 from tests.leaderboard.web.site import boards
@@ -265,19 +266,19 @@ def test_scores_are_withheld_until_the_references_are_right(url: str, store: Sto
     code = ("onnx_op", "node 3: op_type='Loop': must be one of the list.")
     rejected = boards.submit(store, key, "Broken", None, rejected=code)
     assert refusal(HTTP.get(url, headers=JSON)) == (503, "not_publishable")
-    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
-    assert (told["status"], told["result"]) == ("scored", None)
-    assert "reference row 'optimal': missing" in told["withheld"]
-    assert "0.2" not in json.dumps(told)
-    told = HTTP.get(f"{url}/api/submissions/{hex_of(rejected)}").json()
-    assert (told["status"], told["result"]["code"]) == ("rejected", "onnx_op")
+    view = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert (view["status"], view["result"]) == ("scored", None)
+    assert "reference row 'optimal': missing" in view["withheld"]
+    assert "0.2" not in json.dumps(view)
+    view = HTTP.get(f"{url}/api/submissions/{hex_of(rejected)}").json()
+    assert (view["status"], view["result"]["code"]) == ("rejected", "onnx_op")
 
     for name, level in (("optimal", 0.0), ("constant", 1.0)):
         own = store.folder.signing_key()
         boards.submit(store, own, name, [level] * 6, family="reference", spread=0.0)
-    told = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
-    assert told["result"]["scores"]["normalised_regret"][0]["value"] > 0
-    assert told["withheld"] == ""
+    view = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
+    assert view["result"]["scores"]["normalised_regret"][0]["value"] > 0
+    assert view["withheld"] == ""
 
 
 def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]]) -> None:
@@ -527,8 +528,8 @@ def test_a_submission_is_taken_once(url: str, store: Store, key: SigningKey) -> 
     assert (first.status_code, second.status_code) == (202, 200)
     assert first.json() == second.json()
     assert first.json()["id"] == signed.id
-    told = HTTP.get(url + first.json()["url"]).json()
-    assert (told["id"], told["status"]) == (signed.id, "waiting")
+    view = HTTP.get(url + first.json()["url"]).json()
+    assert (view["id"], view["status"]) == (signed.id, "waiting")
     assert [entry.id for entry in store.entries()] == [signed.id]
 
 
@@ -703,8 +704,8 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
         answer = HTTP.post(path, json=own.to_dict())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")
     assert refusal(post(url, signed.to_bytes())) == (410, "withdrawn")
-    told = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}").json()
-    assert told["withdrawal"] == own.to_dict()
+    view = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}").json()
+    assert view["withdrawal"] == own.to_dict()
 
 
 @pytest.mark.parametrize(
@@ -741,11 +742,12 @@ def test_a_fault_of_the_server_is_told_to_its_log_only(
 
 
 def test_every_code_of_the_server_is_explained() -> None:
+    from leaderboard import web
     from leaderboard.errors import CODES
-    from leaderboard.web import app as server
 
-    source = Path(server.__file__).read_text()
-    used = set(re.findall(r'Refusal\(\s*"(\w+)"', source)) | set(server._STATUS)
+    source = "".join(path.read_text() for path in Path(web.__file__).parent.glob("*.py"))
+    used = set(re.findall(r'RequestError\(\s*"(\w+)"', source)) | set(STATUSES)
+    assert used > set(STATUSES)
     assert used <= set(HTTP_CODES) | set(CODES)
     assert not set(HTTP_CODES) & set(CODES)
 
