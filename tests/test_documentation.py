@@ -15,7 +15,7 @@ from sme_registry.spec import EnvFile, SMESpec, SuiteFile
 from sme_registry.spec.catalogue import names
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
 @pytest.mark.parametrize(
