@@ -1,14 +1,14 @@
-"""`Bundle`: a submission as a folder, read with care; and `make_bundle`, which makes one of runs.
+"""`Bundle`: a submission as a folder; `make_bundle`: a bundle from training runs.
 
-    submission.json             a signed submission
+    submission.json             the signed submission
     artefacts/<64 hex>.onnx     each policy that it names, by the SHA-256 of its bytes
 
-Runs come from the folders that `sme train` wrote, or from a table, `runs.json`:
+Runs are folders that `sme train` wrote, or a table, `runs.json`:
 
     [{"spec": "SME/Default-v1", "policy": "seed0.onnx", "steps": 100000, "seed": 0}, …]
 
-with `spec` an id, a digest or a path, and `policy` an .onnx, a Stable-Baselines3 .zip, or null
-where the run failed. Paths in a table are relative to it.
+`spec` is an id, a digest or a path. `policy` is an .onnx, a Stable-Baselines3 .zip, or null if the
+run failed. Paths in a table are relative to it.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ import contextlib
 import errno
 import hashlib
 import os
-import shutil
 import stat
 import statistics
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from leaderboard.artefact.gate import inspect
 from leaderboard.documents.board import hex_of
@@ -45,7 +44,7 @@ from leaderboard.documents.submission import (
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError, SMEError, SpecError
-from sme_registry.io import read_json, write_atomically
+from sme_registry.io import build_folder, read_json, refuse_existing, write_atomically
 from sme_registry.spec import Integer, StrictModel, SuiteFile
 from sme_registry.training import RunRecord
 
@@ -57,11 +56,11 @@ _RANGES = {"unit": "[0, 1]", "symmetric": "[-1, 1]"}
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle's folder, its submission read and its signature verified.
+    """A bundle whose signature is verified.
 
     Attributes:
-      folder: where it is.
-      signed: the submission.
+      folder: its path.
+      signed: the signed submission.
     """
 
     folder: Path
@@ -69,18 +68,18 @@ class Bundle:
 
     @classmethod
     def read(cls, folder: str | os.PathLike[str]) -> Bundle:
-        """Read a bundle's submission; its artefacts are read when they are asked for.
+        """Read a bundle's submission. Artefacts are read on request.
 
         Raises:
-          Rejection: `artefact_path` where the file is a link or no plain file, and what
-            `SignedSubmission.read` raises.
+          Rejection: `artefact_path` if the file is a link or not a regular file, and the codes of
+            `SignedSubmission.read`.
           OptionError: the folder or its submission is missing.
         """
         folder = Path(folder)
-        text = _read_plain(folder, (FILE,), MAX_BYTES)
+        text = _read_regular(folder, (FILE,), MAX_BYTES)
         if text is None:
             raise OptionError(
-                f"{folder}: holds no {FILE}. Make a bundle with `sme-leaderboard new`."
+                f"{folder}: contains no {FILE}. Create a bundle with `sme-leaderboard new`."
             )
         return cls(folder, SignedSubmission.read(text))
 
@@ -88,8 +87,8 @@ class Bundle:
         """The bytes of an artefact that the submission names.
 
         Raises:
-          Rejection: `artefact_missing`, `artefact_path` where it, or its folder, is a link or no
-            plain file, `too_large`, or `artefact_digest` where hash or size are others.
+          Rejection: `artefact_missing`; `artefact_path` if the file or its folder is a link or not
+            regular; `too_large`; or `artefact_digest` if hash or size differ.
         """
         sizes = {
             run.artefact.size
@@ -101,11 +100,11 @@ class Bundle:
                 "artefact_missing", f"artefact={digest:.80}: no run of the submission names it."
             )
         name = f"{hex_of(digest)}.onnx"
-        data = _read_plain(self.folder, (ARTEFACTS, name), MAX_ARTEFACT_BYTES)
+        data = _read_regular(self.folder, (ARTEFACTS, name), MAX_ARTEFACT_BYTES)
         if data is None:
             raise Rejection(
                 "artefact_missing",
-                f"{ARTEFACTS}/{name}: is not in the bundle. Put it there, or make the bundle anew.",
+                f"{ARTEFACTS}/{name}: is missing from the bundle. Add it, or recreate the bundle.",
             )
         if len(data) > MAX_ARTEFACT_BYTES:
             raise Rejection(
@@ -118,7 +117,7 @@ class Bundle:
                 "artefact_digest",
                 f"{ARTEFACTS}/{name}: {len(data):,} bytes of {_digest_of(data)}: must be "
                 f"{' and '.join(f'{size:,}' for size in sorted(sizes))} bytes of {digest}. "
-                "Make the bundle anew.",
+                "Recreate the bundle.",
             )
         return data
 
@@ -144,85 +143,66 @@ def make_bundle(
     """Export the policies of runs, and sign a submission of them.
 
     Args:
-      folder: of the bundle; made whole or not at all.
-      suite: which suite it is for.
-      key: the submitter's.
-      runs: folders that `sme train` wrote, folders with such folders in them, and tables. A
-        Stable-Baselines3 .zip is code: give only what you trust.
-      method: its name, as the board shows it.
-      submitter: likewise.
+      folder: the bundle to write; written completely or not at all.
+      suite: the suite of the runs.
+      key: the submitter's key.
+      runs: folders that `sme train` wrote, folders that contain such folders, and tables. A
+        Stable-Baselines3 .zip can run code when it is loaded: give only files that you trust.
+      method: its name on the board.
+      submitter: the submitter's name on the board.
       version: of the method.
-      family: the kind of method; None takes its name.
+      family: the kind of method; None repeats the method's name.
       knowledge: what the method knows of the task, as in `Method`.
       code: a link to the method's code.
-      statement: what a reader should know.
-      runs_started: of each class, all runs ever started with this method; of classes left out,
-        the runs listed.
-      training: facts of the training; None takes them from the runs' records.
-      force: replace a bundle that is there.
-      progress: called after each run with the runs done and the runs in all.
+      statement: notes for readers.
+      runs_started: all runs ever started with this method, by class; for other classes, the number
+        of listed runs.
+      training: facts of the training; None takes them from the records of the runs.
+      force: replace an existing bundle.
+      progress: called after each run with the number of finished runs and of all runs.
 
     Returns:
       The bundle, as `Bundle.read` reads it.
 
     Raises:
-      OptionError: the folder exists, or a path of `runs` is none of what is described.
-      SpecError, UnknownNameError: a table or record is wrong.
+      OptionError: the folder exists, or a path in `runs` is none of the above.
+      SpecError, UnknownNameError: a table or record is invalid.
       PolicyError: a model cannot be exported.
-      Rejection: the board would refuse the submission, with the code that it would say.
-      MissingDependencyError: a .zip is given, and what exports it is not installed.
+      Rejection: the board would reject the submission, with the same code.
+      MissingDependencyError: exporting a .zip needs a package that is not installed.
     """
     folder = Path(folder)
     _refuse_existing(folder, force)
     listed = [run for path in runs for run in _runs_of(Path(path), suite)]
     _refuse_other_specs(listed, suite)
-
-    counts = _listed_by_class(listed, suite)
-    records = [run.record for run in listed if run.record is not None]
-    facts = _facts(records) if training is None else training
-
-    def submission(artefacts: Sequence[Artefact | None]) -> Submission:
-        made = Submission.from_dict(
-            {
-                "suite": {"name": suite.versioned_name, "digest": suite.digest},
-                "method": {
-                    "name": method,
-                    "version": version,
-                    "family": method if family is None else family,
-                    "knowledge": knowledge,
-                },
-                "code": code,
-                "submitter": {"name": submitter, "key": key.public},
-                "created": now(),
-                "runs": [
-                    {
-                        "spec": run.spec.digest,
-                        "seed": run.seed,
-                        "steps": run.steps,
-                        "artefact": artefact,
-                    }
-                    for run, artefact in zip(listed, artefacts, strict=True)
-                ],
-                "runs_started": {**counts, **(runs_started or {})},
-                "training": facts,
-                "statement": statement,
-            }
-        )
-        check_names(made)
-        check_runs(suite.suite, made)
-        return made
-
-    # What is wrong whatever the policies are, is told before they are exported.
-    SignedSubmission.read(submission(_smallest(listed)).signed(key).to_bytes())
-    with _made_whole(folder, force) as temporary:
+    fields = {
+        "suite": {"name": suite.versioned_name, "digest": suite.digest},
+        "method": {
+            "name": method,
+            "version": version,
+            "family": method if family is None else family,
+            "knowledge": knowledge,
+        },
+        "code": code,
+        "submitter": {"name": submitter, "key": key.public},
+        "runs_started": {**_listed_by_class(listed, suite), **(runs_started or {})},
+        "training": _training_facts(listed) if training is None else training,
+        "statement": statement,
+    }
+    # Everything that does not depend on the policies is checked before they are exported.
+    unexported = _submission(fields, suite, listed, _placeholders(listed))
+    SignedSubmission.read(unexported.signed(key).to_bytes())
+    with build_folder(folder, force=force) as building:
+        (building / ARTEFACTS).mkdir()
         artefacts = []
         for done, run in enumerate(listed, start=1):
-            artefacts.append(_put_artefact(run, temporary))
+            artefacts.append(_put_artefact(run, building))
             if progress is not None:
                 progress(done, len(listed))
-        signed = submission(artefacts).signed(key)
-        write_atomically(temporary / FILE, signed.to_bytes())
-        Bundle.read(temporary)
+        signed = _submission(fields, suite, listed, artefacts).signed(key)
+        write_atomically(building / FILE, signed.to_bytes())
+        Bundle.read(building)
+        _refuse_existing(folder, force)
     return Bundle(folder, signed)
 
 
@@ -236,13 +216,13 @@ class _Row(StrictModel):
 
 
 @dataclass(frozen=True)
-class _Listed:
-    """A run to be submitted.
+class _SubmittedRun:
+    """A run to submit.
 
     Attributes:
-      source: what errors call it.
-      policy: an .onnx or a .zip; None where the run failed.
-      record: where `sme train` wrote one.
+      source: its name in errors.
+      policy: an .onnx or a .zip; None if the run failed.
+      record: of a run of `sme train`.
     """
 
     source: str
@@ -253,11 +233,11 @@ class _Listed:
     record: RunRecord | None = None
 
 
-def _runs_of(path: Path, suite: SuiteFile) -> list[_Listed]:
-    """The runs that a path means.
+def _runs_of(path: Path, suite: SuiteFile) -> list[_SubmittedRun]:
+    """The runs of a folder or a table.
 
     Raises:
-      OptionError: it means none.
+      OptionError: the path is neither.
     """
     if path.is_dir():
         folders = sorted(found.parent for found in path.rglob(_RECORD))
@@ -266,29 +246,29 @@ def _runs_of(path: Path, suite: SuiteFile) -> list[_Listed]:
     elif path.suffix == ".json" and path.is_file():
         return _table(path, suite)
     raise OptionError(
-        f"runs={str(path)!r}: must be a folder of `sme train`, a folder with such folders in it, "
-        "or a table of runs (.json). Correct the path."
+        f"runs={str(path)!r}: must be a folder of `sme train`, a folder that contains such "
+        "folders, or a table of runs (.json). Correct the path."
     )
 
 
-def _trained(folder: Path) -> _Listed:
+def _trained(folder: Path) -> _SubmittedRun:
     record = RunRecord.read(folder)
     if record is None or record.status != "finished" or not (folder / _MODEL).is_file():
         raise OptionError(
-            f"{folder}: holds a run that has not finished. Go on with it (`sme train --resume`), "
-            "or list it in a table with policy null, which scores 1."
+            f"{folder}: contains an unfinished run. Resume it (`sme train --resume`), or list it "
+            "in a table with policy null, which scores 1."
         )
-    return _Listed(
+    return _SubmittedRun(
         str(folder), record.spec, record.seed, record.steps_done, folder / _MODEL, record
     )
 
 
-def _table(path: Path, suite: SuiteFile) -> list[_Listed]:
+def _table(path: Path, suite: SuiteFile) -> list[_SubmittedRun]:
     rows = read_json(path)
     if not isinstance(rows, list):
         raise SpecError(
-            f"{path}: must be a list of runs, each with spec, policy, steps and seed. A run's "
-            "record is given by its folder."
+            f"{path}: must be a list of runs, each with spec, policy, steps and seed. For a "
+            "run of `sme train`, give its folder."
         )
     instances = {spec.digest: spec for spec in suite.suite.instances}
     listed = []
@@ -299,7 +279,7 @@ def _table(path: Path, suite: SuiteFile) -> list[_Listed]:
         if policy is not None and policy.suffix not in (".onnx", ".zip"):
             raise SpecError(
                 f"{source}: policy={row.policy!r}: must be the path of an .onnx or a "
-                "Stable-Baselines3 .zip, or null where the run failed. Correct it."
+                "Stable-Baselines3 .zip, or null if the run failed. Correct it."
             )
         try:
             spec = instances.get(row.spec) or load(
@@ -307,28 +287,28 @@ def _table(path: Path, suite: SuiteFile) -> list[_Listed]:
             )
         except SMEError as error:
             raise SpecError(f"{source}: {error}") from None
-        listed.append(_Listed(source, spec, row.seed, row.steps, policy))
+        listed.append(_SubmittedRun(source, spec, row.seed, row.steps, policy))
     return listed
 
 
-def _refuse_other_specs(listed: list[_Listed], suite: SuiteFile) -> None:
-    """Raise where runs are on specs that are no instance of the suite; names them."""
+def _refuse_other_specs(listed: list[_SubmittedRun], suite: SuiteFile) -> None:
+    """Raise if a run's spec is not an instance of the suite, and name such runs."""
     known = {spec.digest for spec in suite.suite.instances}
-    strangers = [
+    unknown = [
         f"{run.source} ({run.spec.content_name})" for run in listed if run.spec.digest not in known
     ]
-    if strangers:
-        more = f" and {len(strangers) - 5} more" if len(strangers) > 5 else ""
+    if unknown:
+        more = f" and {len(unknown) - 5} more" if len(unknown) > 5 else ""
         raise Rejection(
             "unknown_spec",
-            f"runs: {', '.join(strangers[:5])}{more}: must be on one of the {len(known)} instances "
-            f"of {suite.versioned_name} (`sme show {suite.name}`). Leave them out, or name the "
-            "suite that they are of.",
+            f"runs: {', '.join(unknown[:5])}{more}: must be on one of the {len(known)} instances "
+            f"of {suite.versioned_name} (`sme show {suite.name}`). Leave them out, or name their "
+            "suite.",
         )
 
 
-def _listed_by_class(listed: list[_Listed], suite: SuiteFile) -> dict[str, int]:
-    """How many runs of each class are listed, 0 where none is."""
+def _listed_by_class(listed: list[_SubmittedRun], suite: SuiteFile) -> dict[str, int]:
+    """Number of listed runs of each class."""
     digests = Counter(run.spec.digest for run in listed)
     return {
         member.name: sum(digests[spec.digest] for spec in member.instances)
@@ -336,8 +316,26 @@ def _listed_by_class(listed: list[_Listed], suite: SuiteFile) -> dict[str, int]:
     }
 
 
-def _facts(records: list[RunRecord]) -> Training:
-    """What the runs' records say of the training; empty where there are none."""
+def _submission(
+    fields: dict[str, Any],
+    suite: SuiteFile,
+    listed: list[_SubmittedRun],
+    artefacts: Sequence[Artefact | None],
+) -> Submission:
+    """The submission of runs with these artefacts, checked as the board checks it."""
+    runs = [
+        {"spec": run.spec.digest, "seed": run.seed, "steps": run.steps, "artefact": artefact}
+        for run, artefact in zip(listed, artefacts, strict=True)
+    ]
+    submission = Submission.from_dict({**fields, "created": now(), "runs": runs})
+    check_names(submission)
+    check_runs(suite.suite, submission)
+    return submission
+
+
+def _training_facts(listed: list[_SubmittedRun]) -> Training:
+    """Facts of the training from the records of the runs; empty without records."""
+    records = [run.record for run in listed if run.record is not None]
     if not records:
         return Training()
     libraries, settings = set(), set()
@@ -351,27 +349,27 @@ def _facts(records: list[RunRecord]) -> Training:
         )
     seconds = [record.wall_seconds for record in records]
     return Training(
-        library=_cut("; ".join(sorted(libraries)), 200),
-        hyperparameters=_cut("\n".join(sorted(settings)), 2000),
+        library=_shortened("; ".join(sorted(libraries)), 200),
+        hyperparameters=_shortened("\n".join(sorted(settings)), 2000),
         hardware=f"CPU; {statistics.median(seconds):,.0f} s a run (median of {len(records)}), "
-        f"{sum(seconds) / 3600:,.1f} h in all",
+        f"{sum(seconds) / 3600:,.1f} h in total",
     )
 
 
-def _cut(text: str, length: int) -> str:
+def _shortened(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-def _smallest(listed: list[_Listed]) -> list[Artefact | None]:
-    """What stands for the policies, one of its own for each, until there are any."""
+def _placeholders(listed: list[_SubmittedRun]) -> list[Artefact | None]:
+    """A distinct artefact for each policy that is not exported yet."""
     return [
         None if run.policy is None else Artefact(sha256=f"sha256:{number:064x}", size=1)
         for number, run in enumerate(listed)
     ]
 
 
-def _put_artefact(run: _Listed, bundle: Path) -> Artefact | None:
-    """Write a run's policy into the bundle, by its hash."""
+def _put_artefact(run: _SubmittedRun, bundle: Path) -> Artefact | None:
+    """Write a run's policy into the bundle, named by its hash."""
     if run.policy is None:
         return None
     try:
@@ -384,7 +382,7 @@ def _put_artefact(run: _Listed, bundle: Path) -> Artefact | None:
     return artefact
 
 
-def _policy_bytes(run: _Listed, policy: Path, bundle: Path) -> bytes:
+def _policy_bytes(run: _SubmittedRun, policy: Path, bundle: Path) -> bytes:
     if policy.suffix == ".zip":
         from leaderboard.artefact.export_sb3 import export_sb3
 
@@ -394,7 +392,7 @@ def _policy_bytes(run: _Listed, policy: Path, bundle: Path) -> bytes:
         return data
     try:
         with policy.open("rb") as stream:
-            return stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than `inspect` lets through
+            return stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than `inspect` allows
     except OSError as error:
         raise OptionError(
             f"{run.source}: policy={str(policy)!r}: cannot be read: {error.strerror}. "
@@ -403,84 +401,43 @@ def _policy_bytes(run: _Listed, policy: Path, bundle: Path) -> bytes:
 
 
 def _refuse_existing(folder: Path, force: bool) -> None:
-    """Raise where something is at the folder's path that must not be replaced."""
+    """Raise if the folder exists, unless `force` is set and it contains nothing but a bundle."""
+    refuse_existing(folder, force=force)
     if not os.path.lexists(folder):
         return
-    if not force:
+    others = {folder.name}
+    if folder.is_dir() and not folder.is_symlink():
+        others = {path.name for path in folder.iterdir()} - {FILE, ARTEFACTS}
+    if others:
         raise OptionError(
-            f"{folder}: is there already. Give another folder, or --force (in Python force=True) "
-            "to replace the bundle."
-        )
-    strangers = (
-        {path.name for path in folder.iterdir()} - {FILE, ARTEFACTS}
-        if folder.is_dir() and not folder.is_symlink()
-        else {folder.name}
-    )
-    if strangers:
-        raise OptionError(
-            f"{folder}: is no bundle, or holds other files, such as {min(strangers)!r}, and is "
-            "left as it is. Give another folder."
+            f"{folder}: is not a bundle, or contains other files, such as {min(others)!r}, and is "
+            "not replaced. Give another folder."
         )
 
 
-@contextlib.contextmanager
-def _made_whole(folder: Path, force: bool) -> Iterator[Path]:
-    """A new folder beside `folder`, put in its place if the block succeeds, removed if not."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:64]}.", dir=folder.parent))
-    except OSError as error:
-        raise _unwritable(folder, error) from None
-    made, replaced = temporary / "made", temporary / "replaced"
-    try:
-        made.mkdir()
-        (made / ARTEFACTS).mkdir()
-        yield made
-        for path in (made / ARTEFACTS, made):
-            _sync(path)
-        _refuse_existing(folder, force)
-        try:
-            if force and folder.exists():
-                os.rename(folder, replaced)
-            os.rename(made, folder)
-        except OSError as error:
-            if replaced.exists():
-                os.rename(replaced, folder)
-            raise _unwritable(folder, error) from None
-        _sync(folder.parent)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+def _read_regular(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | None:
+    """A regular file inside a folder, up to one byte above the limit; None if it does not exist.
 
-
-def _unwritable(folder: Path, error: OSError) -> OptionError:
-    return OptionError(
-        f"{folder}: cannot be written: {error.strerror}. Give a path in a folder that you may "
-        "write to."
-    )
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _read_plain(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | None:
-    """A plain file inside a folder, up to a byte above the limit; None where there is none.
-
-    Opened part by part and without following links, so that nothing outside the folder is read,
-    whoever changes it meanwhile; and without waiting, so that a pipe is refused and not read.
+    Each part of the path is opened relative to the one before and links are not followed, so that
+    nothing outside the folder is read even if the folder changes meanwhile. Opening never blocks,
+    so that a pipe is rejected. Systems without these calls (Windows) check the path instead.
 
     Raises:
-      Rejection: `artefact_path` where a part is a link or no plain file.
+      Rejection: `artefact_path` if a part is a link or not regular.
     """
     name = "/".join(parts)
     refused = Rejection(
         "artefact_path",
-        f"{name}: must be a plain file inside the bundle, and no link. Copy the file there.",
+        f"{name}: must be a regular file inside the bundle, not a link. Copy the file there.",
     )
+    if os.open not in os.supports_dir_fd:
+        path = folder.joinpath(*parts)
+        if not os.path.lexists(path):
+            return None
+        if not path.is_file() or path.resolve() != folder.resolve().joinpath(*parts):
+            raise refused
+        with path.open("rb") as stream:
+            return stream.read(limit + 1)
     with contextlib.ExitStack() as opened:
         try:
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -495,7 +452,7 @@ def _read_plain(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | Non
             if error.errno in (errno.ELOOP, errno.ENOTDIR, errno.ENXIO):
                 raise refused from None
             raise OptionError(
-                f"{folder / name}: cannot be read: {error.strerror}. Make it readable."
+                f"{folder / name}: cannot be read: {error.strerror}. Check its permissions."
             ) from None
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise refused

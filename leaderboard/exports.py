@@ -1,7 +1,7 @@
-"""A ranking as JSON, CSV or LaTeX. Each file says what it is of: suite, protocol, log and date.
+"""A ranking as JSON, CSV or LaTeX. Each file names its suite, protocol, log entry and date.
 
-What submitters wrote is made harmless: a cell of text that a spreadsheet would take for a formula
-begins with an apostrophe, and what LaTeX would take for a command is shown as it was written.
+Text from submitters is made harmless: a cell that a spreadsheet would run as a formula begins with
+an apostrophe, and LaTeX commands are escaped.
 """
 
 from __future__ import annotations
@@ -15,27 +15,11 @@ from leaderboard.documents.result import METRICS, Estimate
 from leaderboard.documents.submission import now
 from leaderboard.scoring.ranking import Metric, RankedRow
 from sme_registry.io import to_json as plain_to_json
-from sme_registry.terminal import fixed
+from sme_registry.terminal import escape_latex, fixed
 
 Head = tuple[int, str]
 
 _FORMULA_STARTS = tuple("=+-@＝＋－＠|%")
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "_": r"\_",
-    "%": r"\%",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-}
 
 
 def to_json(
@@ -48,25 +32,22 @@ def to_json(
     """A ranking as JSON.
 
     Args:
-      rows: of `ranking`.
-      metric: by which they were ranked.
-      board: whose they are.
+      rows: from `ranking`.
+      metric: by which they are ranked.
+      board: the board.
       head: number and digest of the log's last entry.
-      date: as documents write it; None for now.
+      date: UTC time as documents write it; None for now.
 
     Returns:
-      The file's text.
+      The content of the file.
     """
     return plain_to_json(
         {
             "title": board.title,
-            **_of(board, head, date),
+            **_provenance(board, head, date),
             "metric": metric,
             "rows": [
-                {
-                    **_facts(row),
-                    "scores": row.entry.scores and row.entry.scores.to_dict(),
-                }
+                {**_facts(row), "scores": row.entry.scores and row.entry.scores.to_dict()}
                 for row in rows
             ],
         }
@@ -80,18 +61,18 @@ def to_csv(
     head: Head,
     date: str | None = None,
 ) -> str:
-    """A ranking as CSV: one line of names, one line each; what it is of, in each line's last cells.
+    """A ranking as CSV: a header, then one line per entry; the last cells repeat the provenance.
 
-    Arguments as of `to_json`.
+    Arguments: see `to_json`.
     """
     regions = range(len(board.protocol.edges))
     columns = [*METRICS, *(f"normalised_regret_{region}" for region in regions)]
     stream = io.StringIO()
-    # Text always in quotes: where a spreadsheet splits at semicolons, too, it stays one cell.
+    # Text is always quoted, so that a spreadsheet that splits at semicolons keeps it in one cell.
     writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\r\n")
     for index, row in enumerate(rows):
         scores = row.entry.scores
-        assert scores is not None  # whatever is in a ranking has some
+        assert scores is not None  # every row of a ranking has scores
         estimates = [getattr(scores, name) for name in METRICS] + list(scores.normalised_regret)
         cells: dict[str, Any] = {**_facts(row), "ranked_by": metric}
         for column, estimate in zip(columns, estimates, strict=True):
@@ -100,10 +81,10 @@ def to_csv(
                 f"{column}_low": estimate.low,
                 f"{column}_high": estimate.high,
             }
-        cells |= _of(board, head, date)
+        cells |= _provenance(board, head, date)
         if index == 0:
             writer.writerow(cells)
-        writer.writerow(map(_harmless, cells.values()))
+        writer.writerow(map(_csv_cell, cells.values()))
     return stream.getvalue()
 
 
@@ -114,11 +95,12 @@ def to_latex(
     head: Head,
     date: str | None = None,
 ) -> str:
-    """A ranking as a `tabular` for the package booktabs; what it is of, in comments above it.
+    """A ranking as a LaTeX `tabular` (package booktabs), its provenance in comments above.
 
-    Arguments as of `to_json`.
+    Arguments: see `to_json`.
     """
-    lines = [f"% {name}: {_latex(str(value))}" for name, value in _of(board, head, date).items()]
+    provenance = _provenance(board, head, date)
+    lines = [f"% {name}: {_latex(str(value))}" for name, value in provenance.items()]
     lines += [
         f"% ranked by {metric}; regrets: 0 optimal, 1 the constant policy; 95 % intervals",
         r"\begin{tabular}{rllrrr}",
@@ -129,7 +111,7 @@ def to_latex(
     ]
     for row in rows:
         entry, scores = row.entry, row.entry.scores
-        assert scores is not None  # whatever is in a ranking has some
+        assert scores is not None  # every row of a ranking has scores
         rank = "--" if row.first is None else str(row.first)
         if row.first != row.last:
             rank += f"--{row.last}"
@@ -143,8 +125,7 @@ def to_latex(
     return "\n".join(lines) + "\n"
 
 
-def _of(board: BoardDocument, head: Head, date: str | None) -> dict[str, Any]:
-    """What a file is of."""
+def _provenance(board: BoardDocument, head: Head, date: str | None) -> dict[str, Any]:
     return {
         "suite": board.suite_name,
         "suite_digest": board.suite.digest,
@@ -177,8 +158,8 @@ def _facts(row: RankedRow) -> dict[str, Any]:
     }
 
 
-def _harmless(cell: Any) -> Any:
-    """A cell that no spreadsheet takes for a formula; numbers stay numbers."""
+def _csv_cell(cell: Any) -> Any:
+    """A cell that no spreadsheet runs as a formula; numbers stay numbers."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
@@ -190,12 +171,11 @@ def _harmless(cell: Any) -> Any:
 
 
 def _latex(text: str) -> str:
-    """Text that LaTeX shows as it was written, on one line."""
-    return "".join(_LATEX.get(letter, letter) for letter in one_line(text))
+    return escape_latex(one_line(text))
 
 
 def one_line(text: str) -> str:
-    """Text without line ends, and without what is not seen but turns others' direction."""
+    """Text on one line, without invisible characters such as those that reverse the direction."""
     return "".join(letter for letter in " ".join(text.split()) if letter.isprintable())
 
 

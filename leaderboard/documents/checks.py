@@ -1,19 +1,19 @@
-"""`check_submission`: whether a signed submission is one for this board.
+"""`check_submission`: whether a board accepts a signed submission.
 
-What the schema cannot know. In this order, the first that fails is told:
+Checks that the schema cannot express, in this order. The first failure is reported:
 
-    unsafe_name      names, texts and links hold only characters that are safe to show, and no
-                     name passes for the board's own
-    unknown_suite    it is of this board's suite and track
-    schema           its time is a time
-    stale_time       and near the board's
+    unsafe_name      names, texts and links contain only safe characters, and no name imitates
+                     the board's own
+    unknown_suite    suite and track are the board's
+    schema           the time exists
+    stale_time       and is near the board's
     unknown_spec     every run is on an instance of the suite
     duplicate_run    no run, and no artefact within one instance, is listed twice
     missing_run      every instance has a run, and every class a count of the runs started
-    schema           which is no more than a result can hold
-    too_large        no artefact is above this board's limit
+    schema           that count fits into a result
+    too_large        no artefact exceeds the board's limit
 
-Reference submissions, signed by the board itself, are checked like any other.
+Reference submissions, signed by the board itself, pass the same checks.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ from leaderboard.errors import BoardError, Rejection
 from sme_registry.spec import Suite
 
 THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
-"""The submitter and the family of the board's own reference rows, and of nobody else's."""
+"""Submitter and family reserved for the board's own reference rows."""
 
 MINUTES_AHEAD = 10
 
-# ASCII only: a letter of another script that looks alike would let one method pass for another.
+# ASCII only: a similar letter of another script would let one method imitate another.
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
-# Control and format characters (those that turn the direction of writing are among the latter),
-# surrogates, and separators of lines and paragraphs.
+# Control characters, format characters (some reverse the direction of text), surrogates,
+# line separators and paragraph separators.
 _UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def check_submission(board: BoardDocument, submission: Submission, at: datetime.datetime) -> None:
-    """Refuse a submission that is not one for this board.
+    """Reject a submission that this board does not accept.
 
     Args:
       board: the board.
-      submission: whose signature is verified already.
+      submission: with a verified signature.
       at: the board's time, with a time zone.
 
     Raises:
-      Rejection: the first of this module's codes that fits, in its order.
+      Rejection: the first code that applies, in the order above.
     """
     check_names(submission, board.key)
     _check_suite(board, submission)
@@ -76,11 +76,11 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
 
 
 def check_names(submission: Submission, board_key: str | None = None) -> None:
-    """Refuse what would be unsafe to show: markup, formulas, control characters, the board's names.
+    """Reject what is unsafe to show: markup, formulas, control characters, the board's own names.
 
     Args:
       submission: the submission.
-      board_key: whose submissions alone may be called so; None where the board is not known yet.
+      board_key: the key that may use the board's names; None if the board is not known yet.
 
     Raises:
       Rejection: `unsafe_name`.
@@ -95,8 +95,8 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
         if not _NAME.fullmatch(name):
             raise Rejection(
                 "unsafe_name",
-                f"{field}={name!a}: must begin with a letter or digit, and hold letters "
-                "a–z, digits, single spaces and '._+-()' only. Rename it.",
+                f"{field}={name!a}: must begin with a letter or digit, and contain only "
+                "letters a–z, digits, single spaces and '._+-()'. Rename it.",
             )
     for field, name, reserved in (
         ("submitter.name", submission.submitter.name, THE_BOARD),
@@ -105,13 +105,12 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
         if _folded(name) == reserved and submission.submitter.key != board_key:
             raise Rejection(
                 "unsafe_name",
-                f"{field}={name!a}: is what the board's own reference rows are called: must be "
-                "another name. Rename it.",
+                f"{field}={name!a}: reserved for the board's own reference rows. Rename it.",
             )
     if submission.code is not None and not _LINK.fullmatch(submission.code):
         raise Rejection(
             "unsafe_name",
-            f"code={submission.code!a}: must be a link of the characters that links have. "
+            f"code={submission.code!a}: must contain only the characters of a URL. "
             "Write others as %XX.",
         )
     for field, text in (
@@ -124,7 +123,7 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
 
 
 def check_text(field: str, text: str) -> None:
-    """Refuse a text of several lines that holds what could disguise what is shown beside it.
+    """Reject a text whose invisible characters could disguise what is shown next to it.
 
     Raises:
       Rejection: `unsafe_name`.
@@ -133,22 +132,22 @@ def check_text(field: str, text: str) -> None:
         if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
             raise Rejection(
                 "unsafe_name",
-                f"{field}: holds {letter!a}: must hold no control characters but line breaks. "
-                "Remove it.",
+                f"{field}: contains {letter!a}: must contain no control characters except line "
+                "breaks. Remove it.",
             )
 
 
 def _folded(name: str) -> str:
-    """A name without what a reader overlooks: case, width of letters, spaces."""
+    """A name normalised for comparison: case, width of letters and spaces do not matter."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def check_runs(suite: Suite, submission: Submission) -> None:
-    """Refuse runs that are not on the suite's instances, listed twice, missing or uncounted.
+    """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
 
     Raises:
-      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` where more runs were
-        started than a result can hold.
+      Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
+        started than fit into a result.
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
     for index, run in enumerate(submission.runs):
@@ -157,7 +156,7 @@ def check_runs(suite: Suite, submission: Submission) -> None:
                 "unknown_spec",
                 f"runs.{index}.spec={run.spec}: must be the digest of one of the suite's "
                 f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
-                "or submit to the board of its suite.",
+                "or submit to a board of its suite.",
             )
     _check_duplicates(submission)
     ran = {run.spec for run in submission.runs}
@@ -174,24 +173,24 @@ def check_runs(suite: Suite, submission: Submission) -> None:
 def refuse_unsubmittable(board: BoardDocument) -> None:
     """Refuse a board whose suite needs more runs than a submission can list.
 
-    Needed is a run on each instance, and in each class as many as ranking needs.
+    An entry needs one run on each instance, and `runs_to_rank` runs in each class.
 
     Raises:
-      BoardError: they do not fit into the bytes of a submission.
+      BoardError: they exceed the size limit of a submission.
     """
     needed = sum(max(len(one.instances), board.runs_to_rank) for one in board.suite.classes)
     most = most_runs(board)
     if needed > most:
         raise BoardError(
-            f"suite={board.suite_name}: an entry would need {needed:,} runs, one on each instance "
-            f"and {board.runs_to_rank} in each class to be ranked: must be at most {most}, which "
-            f"the {MAX_BYTES:,} bytes of a submission hold. Make a board of fewer classes or "
-            "instances, or one that ranks with fewer runs."
+            f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, one on each instance "
+            f"and {board.runs_to_rank} in each class: must be at most {most}, which fit into the "
+            f"{MAX_BYTES:,} bytes of a submission. Use fewer classes or instances, or lower "
+            "runs_to_rank."
         )
 
 
 def most_runs(board: BoardDocument) -> int:
-    """How many runs a submission to a board can list, with ample numbers and short texts."""
+    """Number of runs that fit into a submission to a board, with short texts."""
     digest = board.suite.digest
     run = Run(
         spec=digest,
@@ -220,7 +219,7 @@ def _check_suite(board: BoardDocument, submission: Submission) -> None:
         raise Rejection(
             "unknown_suite",
             f"suite={submission.suite.name}, {submission.suite.digest}: must be "
-            f"{expected.name}, {expected.digest}. Make the bundle for this board's suite.",
+            f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
         )
     if submission.track != board.track:
         raise Rejection(
@@ -235,18 +234,18 @@ def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
         moment = datetime.datetime.fromisoformat(created)
     except ValueError:
         raise Rejection(
-            "schema", f"created={created!r}: must be a time that exists. Correct it."
+            "schema", f"created={created!r}: must be an existing time. Correct it."
         ) from None
     if moment - at > datetime.timedelta(minutes=MINUTES_AHEAD):
         raise Rejection(
             "stale_time",
             f"created={created}: must be at most {MINUTES_AHEAD} minutes ahead of the board's "
-            "clock. Set your clock, and sign it again.",
+            "clock. Set your clock, and sign again.",
         )
     if at - moment > datetime.timedelta(days=age_days):
         raise Rejection(
             "stale_time",
-            f"created={created}: must be at most {age_days} days old. Sign it again.",
+            f"created={created}: must be at most {age_days} days old. Sign again.",
         )
 
 
@@ -258,8 +257,8 @@ def _check_duplicates(submission: Submission) -> None:
         if before != index:
             raise Rejection(
                 "duplicate_run",
-                f"runs.{index}.seed={run.seed}: runs.{before} has the same spec and seed: must be "
-                "another run. Remove one of them.",
+                f"runs.{index}.seed={run.seed}: runs.{before} has the same spec and seed. Remove "
+                "one of them.",
             )
         if run.artefact is None:
             continue
@@ -267,8 +266,8 @@ def _check_duplicates(submission: Submission) -> None:
         if before != index:
             raise Rejection(
                 "duplicate_run",
-                f"runs.{index}.artefact.sha256={run.artefact.sha256}: runs.{before} of the same "
-                "spec has the same policy: must be another run's. Remove one of them.",
+                f"runs.{index}.artefact.sha256={run.artefact.sha256}: runs.{before} has the same "
+                "spec and the same policy. Remove one of them.",
             )
 
 
@@ -285,7 +284,7 @@ def _check_started(submission: Submission, listed: Counter[str]) -> None:
         if started.get(name, 0) < count:
             raise Rejection(
                 "missing_run",
-                f"runs_started.{name}={started.get(name)}: must be at least {count}, the runs "
-                "listed. Count every run that was ever started with this method.",
+                f"runs_started.{name}={started.get(name)}: must be at least {count}, the number of "
+                "listed runs. Count every run that was ever started with this method.",
             )
     refuse_countless(started)

@@ -84,9 +84,9 @@ def test_a_bundle_reads_as_it_was_made(bundle):
 
 
 def test_a_folder_without_a_submission_is_refused(tmp_path):
-    with pytest.raises(OptionError, match="holds no submission"):
+    with pytest.raises(OptionError, match="contains no submission"):
         Bundle.read(tmp_path)
-    with pytest.raises(OptionError, match="holds no submission"):
+    with pytest.raises(OptionError, match="contains no submission"):
         Bundle.read(tmp_path / "absent")
 
 
@@ -115,9 +115,9 @@ def test_an_artefact_that_no_run_names_is_refused(bundle):
 def test_a_missing_artefact_is_refused(bundle):
     digest = bundle.signed.submission.runs[0].artefact.sha256
     artefact_path(bundle).unlink()
-    refused("artefact_missing", "is not in the bundle", bundle.artefact, digest)
+    refused("artefact_missing", "is missing from the bundle", bundle.artefact, digest)
     shutil.rmtree(bundle.folder / "artefacts")
-    refused("artefact_missing", "is not in the bundle", bundle.artefact, digest)
+    refused("artefact_missing", "is missing from the bundle", bundle.artefact, digest)
 
 
 @pytest.mark.parametrize("change", [lambda data: data[:-1], lambda data: data[:-1] + b"\xff"])
@@ -174,18 +174,18 @@ def replaced_by_nowhere(path, target):
 @pytest.mark.parametrize(
     "replace", [replaced_by_link, replaced_by_folder, replaced_by_pipe, replaced_by_nowhere]
 )
-def test_only_plain_files_are_read(bundle, tmp_path, replace):
+def test_only_regular_files_are_read(bundle, tmp_path, replace):
     digest = bundle.signed.submission.runs[0].artefact.sha256
     replace(artefact_path(bundle), tmp_path / "elsewhere" / "policy.onnx")
-    refused("artefact_path", "must be a plain file inside the bundle", bundle.artefact, digest)
+    refused("artefact_path", "must be a regular file inside the bundle", bundle.artefact, digest)
     replace(bundle.folder / "submission.json", tmp_path / "elsewhere" / "submission.json")
-    refused("artefact_path", "must be a plain file", Bundle.read, bundle.folder)
+    refused("artefact_path", "must be a regular file", Bundle.read, bundle.folder)
 
 
 def test_a_folder_of_artefacts_that_is_a_link_is_refused(bundle, tmp_path):
     replaced_by_link(bundle.folder / "artefacts", tmp_path / "elsewhere" / "artefacts")
     digest = bundle.signed.submission.runs[0].artefact.sha256
-    refused("artefact_path", "must be a plain file inside the bundle", bundle.artefact, digest)
+    refused("artefact_path", "must be a regular file inside the bundle", bundle.artefact, digest)
 
 
 # --- making ------------------------------------------------------------------------------------
@@ -296,10 +296,10 @@ def test_a_run_that_has_not_finished_is_refused(tmp_path, trained):
     copied = shutil.copytree(trained, tmp_path / "runs")
     folder = copied / "A2C" / "0"
     RunRecord.read(folder).updated(status="running").write(folder)
-    nothing_is_left(tmp_path, OptionError, "0: holds a run that has not finished", copied)
+    nothing_is_left(tmp_path, OptionError, "0: contains an unfinished run", copied)
     RunRecord.read(folder).updated(status="finished").write(folder)
     (folder / "model.zip").unlink()
-    nothing_is_left(tmp_path, OptionError, "0: holds a run that has not finished", copied)
+    nothing_is_left(tmp_path, OptionError, "0: contains an unfinished run", copied)
 
 
 # --- what cannot be made leaves nothing --------------------------------------------------------
@@ -409,8 +409,8 @@ def test_a_submission_of_too_many_runs_is_refused_before_exporting(tmp_path, tab
     assert seen == []
 
 
-def test_a_bundle_that_is_there_is_replaced_only_when_told(tmp_path, table, bundle):
-    with pytest.raises(OptionError, match="bundle: is there already"):
+def test_an_existing_bundle_is_replaced_only_with_force(tmp_path, table, bundle):
+    with pytest.raises(OptionError, match="bundle already exists"):
         made(bundle.folder, table, method="Other")
     assert Bundle.read(bundle.folder) == bundle
     again = made(bundle.folder, table, method="Other", force=True)
@@ -435,7 +435,7 @@ def test_what_is_no_bundle_is_never_replaced(tmp_path, table, bundle, kind):
         target.write_text("all of it")
     else:
         target.symlink_to(bundle.folder)
-    with pytest.raises(OptionError, match="mine: is no bundle, or holds other files"):
+    with pytest.raises(OptionError, match="mine: is not a bundle, or contains other files"):
         made(target, table, force=True)
     assert target.is_symlink() == (kind == "link")
     assert Bundle.read(bundle.folder) == bundle
