@@ -102,9 +102,9 @@ def diagnose(
     if against is not None:
         study, colon, key = against.rpartition(":")
         if task is None and colon and not Path(against).exists():
-            other = diagnosis.of_cell(study, key)
+            other = diagnosis.load_cell(study, key)
         elif task is None and cell is not None and not Path(against).exists():
-            other = diagnosis.of_cell(run, against)
+            other = diagnosis.load_cell(run, against)
         else:
             other = _subject(against, task, None, set_, action_range)
     found = diagnosis.diagnose(
@@ -119,7 +119,7 @@ def diagnose(
     if json:
         print_json(found.to_dict())
     else:
-        from sme_registry.diagnosis.words import terminal
+        from sme_registry.diagnosis.render import terminal
 
         for part in terminal(found):
             out().print(part)
@@ -138,19 +138,19 @@ def _subject(
     if task is not None:
         spec = load(task).derive(**names.overrides(set_ or []))
         shown = run if os.sep not in run else None
-        return diagnosis.of_policy(run, spec, action_range=action_range, name=shown)
+        return diagnosis.load_policy(run, spec, action_range=action_range, name=shown)
     if cell is not None:
-        return diagnosis.of_cell(run, cell)
+        return diagnosis.load_cell(run, cell)
     if not Path(run).is_dir() and (Path(run).is_file() or ":" in run or os.sep not in run):
         raise OptionError(
             f"run={run!r}: is no folder. Give one that `sme train` wrote, or with a policy the "
             "task that it is for, as in --task Default."
         )
-    return diagnosis.of_run(run)
+    return diagnosis.load_run(run)
 
 
 def _write(found: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
-    from sme_registry.diagnosis.words import markdown
+    from sme_registry.diagnosis.render import markdown
 
     figures: tuple[Path, ...] = ()
     if importlib.util.find_spec("matplotlib") is None:

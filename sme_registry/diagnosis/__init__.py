@@ -1,7 +1,15 @@
-"""The diagnosis of one run: where its regret sits, and what the evidence says about why."""
+"""The diagnosis of one run: where its regret is, and what the evidence says about why."""
 
 from sme_registry.diagnosis.diagnose import diagnose
-from sme_registry.diagnosis.report import Diagnosis, Finding
-from sme_registry.diagnosis.subject import Subject, of_cell, of_policy, of_run
+from sme_registry.diagnosis.document import Diagnosis, Verdict
+from sme_registry.diagnosis.subject import Subject, load_cell, load_policy, load_run
 
-__all__ = ["Diagnosis", "Finding", "Subject", "diagnose", "of_cell", "of_policy", "of_run"]
+__all__ = [
+    "Diagnosis",
+    "Subject",
+    "Verdict",
+    "diagnose",
+    "load_cell",
+    "load_policy",
+    "load_run",
+]

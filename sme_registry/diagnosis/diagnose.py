@@ -1,23 +1,24 @@
-"""`diagnose`: a subject to a `Diagnosis`; seconds, and with the capacity probe some more."""
+"""`diagnose`: a subject to a `Diagnosis`. It takes seconds; the capacity probe takes longer."""
 
 from __future__ import annotations
 
-import platform
-import sys
 from collections.abc import Callable
-from importlib import metadata
+from dataclasses import dataclass
 
-from sme_registry.diagnosis import measure, rules
-from sme_registry.diagnosis.report import Capacity, Diagnosis, Numbers
+from sme_registry.diagnosis import measure, rollouts, verdicts
+from sme_registry.diagnosis.comparison import compare
+from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
+from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.diagnosis.subject import Subject
-from sme_registry.errors import OptionError
+from sme_registry.io import integer_in, versions
 from sme_registry.spec import EvaluationProtocol
-from sme_registry.spec.document import plain_number
 from sme_registry.task import Task, materialize
 from sme_registry.training.numpy_policy import Perceptron
 
+__all__ = ["EPISODES", "STATES", "diagnose"]
+
 STATES, EPISODES = 8192, 64
-_SPREAD_STATES = 256
+_EXPLORATION_STATES = 256
 
 
 def diagnose(
@@ -30,130 +31,114 @@ def diagnose(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Measure a policy beside the references, and say what follows.
+    """Measure a policy and the references, and answer every question about its regret.
 
     Args:
-      subject: what `of_run`, `of_cell` or `of_policy` returned.
-      against: another run, such as one with a single axis changed. It is measured in the same way.
-      probe_capacity: fit a network of the same layers to a*; tens of seconds. Does nothing where
-        the policy's network is not known.
-      states: uniform states, in [64, 1,000,000]; fewer are taken where a state is large.
-      episodes: side by side, in [8, 10,000]; likewise.
+      subject: from `load_run`, `load_cell` or `load_policy`.
+      against: another run, e.g. with a single axis changed. It is measured in the same way.
+      probe_capacity: fit a network of the same layers to a*; tens of seconds. Ignored if the
+        policy's network is unknown.
+      states: uniform states, in [64, 1,000,000]; fewer are used if a state is large.
+      episodes: in [8, 10,000]; fewer are used if a state is large.
       seed: of everything random here, at least 0.
-      progress: told what is being done.
+      progress: called with a description of each step.
 
     Raises:
-      OptionError: an argument out of range.
-      PolicyError: the policy's actions cannot be used.
-      MissingDependencyError: PyTorch is needed for the probe and not installed.
-      ResourceLimitError: a task would not fit in memory.
+      OptionError: an argument is out of range.
+      PolicyError: the policy's actions are invalid.
+      MissingDependencyError: the probe needs PyTorch, which is not installed.
+      ResourceLimitError: the task does not fit in memory.
     """
-    _within("states", states, 64, 1_000_000)
-    _within("episodes", episodes, 8, 10_000)
-    _within("seed", seed, 0, 2**53 - 1)
-    say = progress or (lambda what: None)
-
-    def numbers_of(one: Subject, probed: bool) -> Numbers:
-        return _measure(one, probed, states, episodes, seed, say)
-
-    numbers = numbers_of(subject, probe_capacity)
-    comparison = None
+    measurer = _Measurer(
+        integer_in("states", states, 64, 1_000_000),
+        integer_in("episodes", episodes, 8, 10_000),
+        integer_in("seed", seed, 0, 2**53 - 1),
+        progress or (lambda description: None),
+    )
+    measurements = measurer.measurements(subject, probe_capacity)
+    judged, comparison = verdicts.judge(measurements, subject.spec), None
     if against is not None:
-        other = numbers_of(against, False)
-        comparison = rules.compare(subject, numbers, against, other)
-        there = {f.question: f.answer for f in rules.findings(other, against.spec)}
-        here = rules.findings(numbers, subject.spec)
-        answers = {
-            f.question: (f.answer, there[f.question]) for f in here if f.answer != there[f.question]
-        }
-        comparison = comparison.model_copy(update={"answers": answers})
-    found = rules.findings(numbers, subject.spec, comparison)
+        other = measurer.measurements(against, False)
+        comparison = compare(
+            subject, measurements, judged, against, other, verdicts.judge(other, against.spec)
+        )
+        judged = verdicts.judge(measurements, subject.spec, comparison)
     return Diagnosis(
         name=subject.name,
         spec=subject.spec,
         spec_digest=subject.spec.digest,
         plan=subject.plan,
-        note=subject.note,
-        headline=rules.headline(numbers, found),
-        findings=found,
+        checkpoint_step=subject.checkpoint_step,
+        level=verdicts.level(measurements),
+        verdicts=judged,
         comparison=comparison,
-        thresholds=rules.THRESHOLDS,
-        numbers=numbers,
-        versions=_versions(),
+        thresholds=THRESHOLDS,
+        measurements=measurements,
+        versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
     )
 
 
-def _measure(
-    subject: Subject,
-    probe_capacity: bool,
-    states: int,
-    episodes: int,
-    seed: int,
-    say: Callable[[str], None],
-) -> Numbers:
-    task, policy = materialize(subject.spec), subject.policy
-    say(f"{subject.name}: uniform states")
-    count = measure.affordable(task, states)
-    fitted = measure.fitted_references(task, states, seed)
-    protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-    found = measure.sample(policy, task, fitted, protocol, 0)
-    uniform = measure.scores(task, found)
-    clock, moved = measure.clock(policy, task, found)
-    form = measure.form(policy, task, found, moved, seed)
-    say(f"{subject.name}: shells")
-    shells = measure.shells(policy, task, fitted, seed, uniform)
-    say(f"{subject.name}: episodes")
-    on_policy = measure.on_policy(policy, task, fitted, episodes, seed)
-    training = spread = None
-    if subject.log is not None:
-        constant = min(on_policy.scores[name].regret for name in measure.CONSTANTS)
-        training = measure.training(subject.log, constant)
-    if subject.explore is not None:
-        from sme_registry.diagnosis.networks import spread as spread_of
+@dataclass(frozen=True)
+class _Measurer:
+    """The amount and seed of the measurements, and where progress is reported."""
 
-        spread = tuple(
-            spread_of(subject.explore, found.observation[:_SPREAD_STATES], seed).tolist()
+    states: int
+    episodes: int
+    seed: int
+    report: Callable[[str], None]
+
+    def measurements(self, subject: Subject, probe_capacity: bool) -> Measurements:
+        task, policy, seed = materialize(subject.spec), subject.policy, self.seed
+        self.report(f"{subject.name}: uniform states")
+        references = measure.fit_references(task, self.states, seed)
+        count = measure.affordable(task, self.states)
+        protocol = EvaluationProtocol(states_per_region=count, seed=seed)
+        states = measure.sample(policy, task, references, protocol, 0)
+        uniform = measure.scores(task, states)
+        time_dependence, time_variance = measure.time_dependence(policy, task, states)
+        squared_error = measure.squared_error(policy, task, states, time_variance)
+        response = measure.response(policy, task, states, seed)
+        self.report(f"{subject.name}: shells")
+        shells = measure.shells(policy, task, references, seed, uniform)
+        self.report(f"{subject.name}: episodes")
+        on_policy = rollouts.on_policy(policy, task, references, self.episodes, seed)
+        training = None
+        if subject.log is not None:
+            constant = min(on_policy.scores[name].regret for name in rollouts.CONSTANTS)
+            training = rollouts.training(subject.log, constant)
+        return Measurements(
+            uniform=uniform,
+            channels=measure.channels(task, states),
+            partitions=measure.partitions(task, states),
+            shells=shells,
+            squared_error=squared_error,
+            response=response,
+            time_dependence=time_dependence,
+            on_policy=on_policy,
+            training=training,
+            exploration_sd=self._exploration_sd(subject, states),
+            capacity=self._probe(subject, task) if probe_capacity else None,
         )
-    return Numbers(
-        uniform=uniform,
-        channels=measure.channels(task, found),
-        partitions=measure.partitions(task, found),
-        shells=shells,
-        form=form,
-        clock=clock,
-        on_policy=on_policy,
-        training=training,
-        exploration_sd=spread,
-        capacity=_probe(subject, task, seed, say) if probe_capacity else None,
-    )
 
+    def _exploration_sd(self, subject: Subject, states: measure.Sample) -> tuple[float, ...] | None:
+        if subject.explore is None:
+            return None
+        from sme_registry.diagnosis.networks import exploration_sd
 
-def _probe(subject: Subject, task: Task, seed: int, say: Callable[[str], None]) -> Capacity | None:
-    network = subject.policy.act
-    if not isinstance(network, Perceptron):
-        return None
-    from sme_registry.diagnosis import networks
+        observation = states.observation[:_EXPLORATION_STATES]
+        return tuple(exploration_sd(subject.explore, observation, self.seed).tolist())
 
-    steps = subject.plan.get("steps")
-    told = steps if isinstance(steps, int) and steps else networks.DEFAULT_STATES
+    def _probe(self, subject: Subject, task: Task) -> CapacityProbe | None:
+        network = subject.policy.act
+        if not isinstance(network, Perceptron):
+            return None
+        from sme_registry.diagnosis import networks
 
-    def tell(done: int) -> None:
-        if done % 1000 == 0:
-            say(f"{subject.name}: capacity, {done:,} of {networks.GRADIENT_STEPS:,} gradient steps")
+        def progress(done: int) -> None:
+            if done % 1000 == 0:
+                total = networks.GRADIENT_STEPS
+                self.report(f"{subject.name}: capacity, {done:,} of {total:,} gradient steps")
 
-    return networks.capacity(network, task, told, seed, tell)
-
-
-def _within(name: str, value: int, low: int, high: int) -> None:
-    number = plain_number(value)
-    if type(number) is not int or not low <= number <= high:
-        raise OptionError(f"{name}={value!r:.40}: must be an integer in [{low:,}, {high:,}].")
-
-
-def _versions() -> dict[str, str]:
-    from sme_registry import __version__
-
-    names = ["numpy", "scipy"]
-    names += [name for name in ("torch", "stable_baselines3") if name in sys.modules]
-    found = {name: metadata.version(name) for name in names}
-    return {"sme_registry": __version__, "python": platform.python_version(), **found}
+        steps = subject.plan.get("steps")
+        count = steps if isinstance(steps, int) and steps else networks.DEFAULT_STATES
+        return networks.probe_capacity(network, task, count, self.seed, progress)

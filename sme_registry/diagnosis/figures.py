@@ -1,4 +1,4 @@
-"""The figures of a diagnosis: by channel, by state, by shell, by time, and the training."""
+"""The figures of a diagnosis: by action channel, by state, by shell, by time; and training."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sme_registry.diagnosis.report import Diagnosis
+from sme_registry.diagnosis.document import POLICY, Diagnosis
+from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.subject import Log
-from sme_registry.diagnosis.words import title
 from sme_registry.evaluation.report import LABELS
 from sme_registry.io import write_atomically
 from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _REFERENCES = ("linear_least_squares", "best_constant", "constant_half", "uniform_random")
-_CHANNELS_DRAWN = 32
+_MAX_CHANNELS = 32
 _CLOUD: dict[str, Any] = {"s": 8, "color": GREY, "alpha": 0.4, "linewidths": 0}
 
 
@@ -35,7 +35,7 @@ def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Pa
         "where_channels": ((8.2, 3.4), lambda figure: _channels(figure, diagnosis)),
         "where_states": ((8.2, 3.4), lambda figure: _states(figure, diagnosis)),
         "where_time": ((8.2, 3.4), lambda figure: _time(figure, diagnosis)),
-        "what_the_error_is": ((8.2, 2.9), lambda figure: _form(figure, diagnosis)),
+        "what_the_error_is": ((8.2, 2.9), lambda figure: _squared_error(figure, diagnosis)),
     }
     if log is not None:
         figures["training"] = ((8.2, 3.4), lambda figure: _training(figure, diagnosis, log))
@@ -66,72 +66,81 @@ def _from_zero(axes: Axes) -> None:
 
 
 def _channels(figure: Figure, diagnosis: Diagnosis) -> None:
-    channels = diagnosis.numbers.channels[:_CHANNELS_DRAWN]
+    channels = diagnosis.measurements.channels[:_MAX_CHANNELS]
     left, right = figure.subplots(1, 2)
     x = np.array([c.channel for c in channels])
-    left.bar(x - 0.2, [c.normalised for c in channels], 0.4, color=COLOURS[0], label="this policy")
     left.bar(
-        x + 0.2, [c.linear for c in channels], 0.4, color="white", edgecolor=GREY, hatch="////",
-        label=LABELS["linear_least_squares"],
+        x - 0.2, [c.normalised_regret for c in channels], 0.4, color=COLOURS[0], label="this policy"
+    )
+    left.bar(
+        x + 0.2, [c.linear_normalised_regret for c in channels], 0.4, color="white", edgecolor=GREY,
+        hatch="////", label=LABELS["linear_least_squares"],
     )  # fmt: skip
     _reference(left, 1.0, "constant_half")
-    left.set_ylabel("normalised error ν  (0 = optimal)")
+    left.set_ylabel("normalised regret  (0 = optimal)")
     slopes = [c.slope for c in channels]
     saturated = [c.at_zero + c.at_one for c in channels]
-    _line(right, x, slopes, 0, "slope of a on a*  (1 = right)")
-    _line(right, x, [c.offset for c in channels], 1, "offset, mean of a − a*  (0 = right)")
+    _line(right, x, slopes, 0, "slope of a on a*  (1 = optimal)")
+    _line(right, x, [c.offset for c in channels], 1, "offset, mean of a − a*  (0 = optimal)")
     _line(right, x, saturated, 2, "share of states at 0 or 1")
     for value in (0.0, 1.0):
         right.axhline(value, color=GREY, linewidth=0.9)
+    cut = len(diagnosis.measurements.channels) > _MAX_CHANNELS
     for axes in (left, right):
-        axes.set_xlabel("action channel" + (f" (the first {len(x)})" * (len(x) < _all(diagnosis))))
+        axes.set_xlabel("action channel" + (f" (the first {_MAX_CHANNELS})" if cut else ""))
         axes.set_xticks(x[:: max(1, len(x) // 8)])
         axes.set_ylim(top=axes.get_ylim()[1] * 1.3)
         axes.legend(loc="upper left", fontsize=8)
 
 
-def _all(diagnosis: Diagnosis) -> int:
-    return len(diagnosis.numbers.channels)
-
-
 def _states(figure: Figure, diagnosis: Diagnosis) -> None:
-    numbers = diagnosis.numbers
+    measured = diagnosis.measurements
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 1.2, 1.2))
-    centre, *channels = numbers.partitions
-    shown = sorted(channels, key=lambda p: -p.explained)[:2]
-    drawn = [(centre, "distance from the centre"), *((p, f"state channel {p.by}") for p in shown)]
-    explained = [p.explained for p, _ in drawn]
-    names = ["distance", *(f"s{p.by}" for p in shown)]
-    bars = left.bar(range(len(names)), explained, 0.6, color=COLOURS[: len(names)])
+    centre, *channels = measured.partitions
+    best = sorted(channels, key=lambda p: -p.explained_variance)[:2]
+    names = {None: "distance from the centre"} | {
+        p.state_channel: f"state channel {p.state_channel}" for p in best
+    }
+    drawn = [centre, *best]
+    explained = [p.explained_variance for p in drawn]
+    short_names = ["distance", *(f"s{p.state_channel}" for p in best)]
+    bars = left.bar(range(len(drawn)), explained, 0.6, color=COLOURS[: len(drawn)])
     for bar, hatch in zip(bars, ("", "////", "...."), strict=False):
         bar.set_hatch(hatch)
         bar.set_edgecolor("white")
-    left.set_xticks(range(len(names)), names)
+    left.set_xticks(range(len(drawn)), short_names)
     left.set_ylim(0.0, max(0.12, 1.1 * max(explained)))
-    left.axhline(diagnosis.thresholds["explained_by_state"], color=GREY, linewidth=1.1)
+    left.axhline(diagnosis.thresholds["explained_variance"], color=GREY, linewidth=1.1)
     left.set_ylabel("share of the error's\nvariance explained")
-    left.set_xlabel("line: counts from here")
-    for index, (part, name) in enumerate(drawn):
-        _line(middle, 1 + np.arange(len(part.error)), part.error, index, name)
+    left.set_xlabel("line: threshold")
+    for index, part in enumerate(drawn):
+        x = 1 + np.arange(len(part.mae))
+        _line(middle, x, part.mae, index, names[part.state_channel])
     middle.axhline(
-        numbers.uniform["linear_least_squares"].error,
+        measured.uniform["linear_least_squares"].mae,
         color=GREY, linewidth=1.1, linestyle=REFERENCE_DASHES["linear_least_squares"],
         label=LABELS["linear_least_squares"],
     )  # fmt: skip
-    middle.set_xticks(1 + np.arange(len(centre.error)))
-    middle.set_xlabel("fifth of the states, by each quantity")
+    middle.set_xticks(1 + np.arange(len(centre.mae)))
+    middle.set_xlabel("fifth of the states, by quantity")
     middle.set_ylabel("error, mean |a − a*|")
-    levels = [shell.epsilon for shell in numbers.shells]
-    _line(right, levels, [s.policies[""].normalised for s in numbers.shells], 0, "this policy")
+    levels = [shell.epsilon for shell in measured.shells]
+    _line(
+        right,
+        levels,
+        [s.scores[POLICY].normalised_regret for s in measured.shells],
+        0,
+        "this policy",
+    )
     for who in _REFERENCES:
-        values = [shell.policies[who].normalised for shell in numbers.shells]
+        values = [shell.scores[who].normalised_regret for shell in measured.shells]
         right.plot(
             levels, values, color=GREY, linewidth=1.1, linestyle=REFERENCE_DASHES[who],
             label=LABELS[who],
         )  # fmt: skip
     right.set_xticks(levels, ["WD", *(f"{level:g}" for level in levels[1:])])
     right.set_xlabel("expansion level ε of the shell")
-    right.set_ylabel("normalised error ν")
+    right.set_ylabel("normalised regret")
     for axes in (middle, right):
         _from_zero(axes)
         axes.set_ylim(top=axes.get_ylim()[1] * 1.45)
@@ -139,50 +148,52 @@ def _states(figure: Figure, diagnosis: Diagnosis) -> None:
 
 
 def _time(figure: Figure, diagnosis: Diagnosis) -> None:
-    episodes, clock = diagnosis.numbers.on_policy, diagnosis.numbers.clock
+    episodes, time = diagnosis.measurements.on_policy, diagnosis.measurements.time_dependence
     left, right = figure.subplots(1, 2)
     middles = (np.array(episodes.edges[:-1]) + np.array(episodes.edges[1:])) / 2
     _line(left, middles, episodes.regret, 0, "regret, 1 − r")
-    _line(left, middles, episodes.error, 1, "error, mean |a − a*|")
+    _line(left, middles, episodes.mae, 1, "error, mean |a − a*|")
     if min(episodes.alive) < 1.0:
-        _line(left, middles, episodes.alive, 2, "share still running")
+        _line(left, middles, episodes.alive, 2, "share of episodes running")
     for who in _REFERENCES[:3]:
         _reference(left, episodes.scores[who].regret, who)
     left.set_xlabel("step of the episode")
     left.set_ylabel(f"mean over {episodes.episodes} episodes\n(grey: regret of references)")
-    _line(right, clock.inputs, clock.normalised, 0, "ν in the same states")
-    _line(right, clock.inputs, clock.moved, 1, "change of a")
+    _line(right, time.inputs, time.normalised_regret, 0, "in the same states")
+    _line(right, time.inputs, time.action_change, 1, "change of a")
     right.axhline(
-        diagnosis.numbers.uniform["linear_least_squares"].normalised,
+        diagnosis.measurements.uniform["linear_least_squares"].normalised_regret,
         color=GREY, linewidth=1.1, linestyle=REFERENCE_DASHES["linear_least_squares"],
         label=LABELS["linear_least_squares"],
     )  # fmt: skip
-    right.set_xlabel("input t/T, the states held fixed")
-    right.set_ylabel("normalised error ν; mean |change of a|")
+    right.set_xlabel("input t/T, in fixed states")
+    right.set_ylabel("normalised regret; mean |change of a|")
     for axes in (left, right):
         _from_zero(axes)
         axes.set_ylim(top=axes.get_ylim()[1] * 1.4)
         axes.legend(loc="upper left", fontsize=8, ncols=2, columnspacing=1.2, handlelength=1.8)
 
 
-def _form(figure: Figure, diagnosis: Diagnosis) -> None:
-    form, episodes = diagnosis.numbers.form, diagnosis.numbers.on_policy
+def _squared_error(figure: Figure, diagnosis: Diagnosis) -> None:
+    error, episodes = diagnosis.measurements.squared_error, diagnosis.measurements.on_policy
     left, right = figure.subplots(1, 2)
     rows = {
-        "constant offset": form.offset,
-        "slope not 1": form.scale,
-        "the rest": form.residual,
-        "· noise": form.noise,
-        "· clock t/T": form.clock,
-        "· r_cum/k": form.accumulated,
+        "offset": error.offset,
+        "scale": error.scale,
+        "residual": error.residual,
+        "· noise": error.noise,
+        "· input t/T": error.time,
+        "· input r_cum/k": error.accumulated_reward,
     }
     _bars(left, rows, "share of the squared error")
-    signal, random = episodes.signal, episodes.signal_random
-    parts = {"paid, r > 0": COLOURS[2], "hidden by r_min": COLOURS[4], "flat, r̂ = 0": "#cccccc"}
-    for y, found in enumerate((signal, random)):
+    parts = {"r > 0": COLOURS[2], "0 by r_min": COLOURS[4], "r̂ = 0": "#cccccc"}
+    for y, signal in enumerate((episodes.signal, episodes.random_signal)):
         start = 0.0
         for (name, colour), share, hatch in zip(
-            parts.items(), (found.paid, found.hidden, found.flat), ("", "////", ""), strict=True
+            parts.items(),
+            (signal.rewarded, signal.gated, signal.flat),
+            ("", "////", ""),
+            strict=True,
         ):
             right.barh(
                 y, share, 0.55, left=start, color=colour, hatch=hatch, edgecolor="black",
@@ -192,7 +203,7 @@ def _form(figure: Figure, diagnosis: Diagnosis) -> None:
     right.set_yticks((0, 1), ("this policy", "random\nactions"))
     right.set_xlim(0.0, 1.0)
     right.set_ylim(2.4, -0.6)
-    right.set_xlabel("share of steps on policy")
+    right.set_xlabel("share of steps")
     right.legend(loc="lower center", ncols=3, fontsize=7, columnspacing=1.0, handlelength=1.4)
     right.grid(visible=False, axis="y")
 
@@ -213,26 +224,27 @@ def _bars(axes: Axes, rows: dict[str, float], label: str) -> None:
 
 def _training(figure: Figure, diagnosis: Diagnosis, log: Log) -> None:
     axes = figure.add_subplot()
-    found = diagnosis.numbers.training
-    assert found is not None  # there is a log
+    training = diagnosis.measurements.training
+    assert training is not None  # there is a log
     axes.scatter(log.step, log.regret, **_CLOUD, label=f"one of the {log.source}")
-    window = found.window
-    smooth = [np.median(log.regret[i : i + window]) for i in range(found.rows - window + 1)]
+    window = training.window
+    median = [np.median(log.regret[i : i + window]) for i in range(training.rows - window + 1)]
     axes.plot(
-        log.step[window - 1 :], smooth, color=COLOURS[0], linewidth=2.2, label=f"median of {window}"
+        log.step[window - 1 :], median, color=COLOURS[0], linewidth=2.2, label=f"median of {window}"
     )
-    episodes = diagnosis.numbers.on_policy
+    episodes = diagnosis.measurements.on_policy
     for who in _REFERENCES[:3]:
         _reference(axes, episodes.scores[who].regret, who)
     axes.axhline(
-        episodes.scores[""].regret, color=COLOURS[1], linewidth=1.6, label="this policy, at the end"
+        episodes.scores[POLICY].regret, color=COLOURS[1], linewidth=1.6, label="this policy"
     )
-    if found.escaped_at is not None:
-        axes.axvline(found.escaped_at, color="black", linewidth=0.9, linestyle=":")
-        late = found.escaped_at > found.steps / 2
+    if training.improvement_step is not None:
+        axes.axvline(training.improvement_step, color="black", linewidth=0.9, linestyle=":")
+        late = training.improvement_step > training.steps / 2
         axes.annotate(
-            "better than a constant", (found.escaped_at, 0.02), xytext=(-4 if late else 4, 0),
-            textcoords="offset points", fontsize=8, ha="right" if late else "left",
+            "better than a constant", (training.improvement_step, 0.02),
+            xytext=(-4 if late else 4, 0), textcoords="offset points", fontsize=8,
+            ha="right" if late else "left",
         )  # fmt: skip
     axes.set_ylim(-0.04, 1.04)
     axes.set_xlim(left=0)

@@ -1,79 +1,93 @@
-"""What is measured of a policy: over uniform states, over shells, over episodes, over its log.
+"""Measurements of a policy in fixed states: uniform in the cube, and in the shells around it.
 
-`N` states, `S` state_dim, `A` action_dim, `T` horizon, `n` episodes side by side. Everything random
-is a named stream of one seed, so the same policy gets the same numbers.
+`N` states, `S` state_dim, `A` action_dim, `T` horizon. Every random number belongs to a named
+stream of one seed, so the same policy gets the same measurements.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.report import (
+from sme_registry.diagnosis.document import (
+    POLICY,
     Channel,
-    Clock,
-    Form,
-    OnPolicy,
     Partition,
+    Response,
     Score,
     Shell,
-    Signal,
-    Training,
+    SquaredError,
+    TimeDependence,
 )
-from sme_registry.diagnosis.subject import Log
-from sme_registry.envs.batch import Batch, Mask, Observation
+from sme_registry.envs.shared import Observation
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.regions import expansion, observations, region_name
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
-Act = Callable[[Observation], Array]
+__all__ = [
+    "MAX_NUMBERS",
+    "Sample",
+    "affordable",
+    "channels",
+    "clipped_actions",
+    "fit_references",
+    "partitions",
+    "response",
+    "sample",
+    "scores",
+    "shells",
+    "squared_error",
+    "time_dependence",
+]
 
-OWN = ""  # the key of the policy in question among the references' names
-AT_BOUND = 0.01
-CONSTANTS = ("best_constant", "constant_half")
-BINS, TIME_BINS = 5, 10
+MAX_NUMBERS = 2**23  # of states and actions held at once: 64 MiB as float64
+_BOUND = 0.01  # an action this close to 0 or 1 is saturated
+_BINS = 5
 _SHELL_STATES = 2000
-_CLOCK_STATES, _CLOCK_INPUTS = 512, 11
-_STEP = 0.01  # of a state, to see how far actions move
-_HALVES = 20  # bins of a state channel that an episode may enter
-_NUMBERS = 2**23  # of states and actions held at once, 64 MiB as float64
+_FIXED_STATES, _TIME_INPUTS, _ACCUMULATED_INPUTS = 512, 11, 5
+_STEP = 0.01  # length of a state's step, for the sensitivity
 _TINY = 1e-12
 
 
 class Sample(NamedTuple):
-    """States, what was done in them, and what was optimal: `[N, S + 2]`, `[N, S]`, `[N, A]`."""
+    """States, the actions in them, and the optimal actions.
+
+    Attributes:
+      observation: `[N, S + 2]`.
+      s: `[N, S]` states.
+      a: `[N, A]` actions of the policy, in [0, 1].
+      optimal: `[N, A]` optimal actions.
+      references: `[N, A]` actions of each reference.
+    """
 
     observation: Observation
     s: Array
-    optimal: Array
     a: Array
-    others: dict[str, Array]
+    optimal: Array
+    references: dict[str, Array]
 
     @property
-    def missed(self) -> Array:
+    def absolute_error(self) -> Array:
         """`[N, A]` |a − a*|."""
         return np.abs(self.a - self.optimal)
 
 
-def affordable(task: Task, wanted: int) -> int:
-    """How many states are held at once: fewer where a state is large."""
-    return max(64, min(wanted, _NUMBERS // (task.spec.state_dim + task.spec.action_dim)))
+def affordable(task: Task, states: int) -> int:
+    """How many of some states fit in memory at once; fewer if states are large, at least 64."""
+    return max(64, min(states, MAX_NUMBERS // (task.spec.state_dim + task.spec.action_dim)))
 
 
-def acted(policy: Policy, observation: Observation) -> Array:
-    """The policy's actions as the environment uses them; it may write into what it is given."""
+def clipped_actions(policy: Policy, observation: Observation) -> Array:
+    """`[B, A]` actions as the environment uses them. The policy may modify its argument."""
     return np.clip(policy(observation.copy()), 0.0, 1.0)
 
 
-def fitted_references(task: Task, states: int, seed: int) -> references.References:
-    """The references, fitted on uniform states that nothing else here uses."""
+def fit_references(task: Task, states: int, seed: int) -> references.References:
+    """Fit the references on uniform states that no measurement uses."""
     count = min(4 * affordable(task, states), references.fit_states(task.spec))
     s = streams.uniform(seed, "diagnosis/fit", count * task.spec.state_dim).reshape(count, -1)
     return references.fit(s, engine(task).optimal_action(s))
@@ -91,84 +105,82 @@ def sample(
     s = observation[:, : task.spec.state_dim].astype(np.float64)
     optimal = engine(task).optimal_action(s)
     random = streams.uniform(protocol.seed, f"diagnosis/{region}/random", optimal.size)
-    others = fitted.actions(s, optimal, random.reshape(optimal.shape))
-    return Sample(observation, s, optimal, acted(policy, observation), others)
+    actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
+    return Sample(observation, s, clipped_actions(policy, observation), optimal, actions)
 
 
-def scores(task: Task, found: Sample) -> dict[str, Score]:
+def scores(task: Task, states: Sample) -> dict[str, Score]:
     """The policy and each reference in the same states."""
-    half = float(np.abs(0.5 - found.optimal).mean())
-    return {who: _score(task, a, found.optimal, half) for who, a in _all(found).items()}
+    constant_mae = max(float(np.abs(0.5 - states.optimal).mean()), _TINY)
+
+    def score(a: Array) -> Score:
+        mae = float(np.abs(a - states.optimal).mean())
+        regret = float(_regret(task, a, states.optimal).mean())
+        return Score(regret=regret, mae=mae, normalised_regret=mae / constant_mae)
+
+    return {name: score(a) for name, a in {POLICY: states.a, **states.references}.items()}
 
 
-def _all(found: Sample) -> dict[str, Array]:
-    return {OWN: found.a, **found.others}
+def _regret(task: Task, a: Array, optimal: Array) -> Array:
+    """`[N]` 1 − r."""
+    return np.asarray(1.0 - task.reward_of(task.similarity_of(a, optimal)))
 
 
-def _score(task: Task, a: Array, optimal: Array, half: float) -> Score:
-    regret = 1.0 - task.reward_of(task.similarity_of(a, optimal))
-    error = float(np.abs(a - optimal).mean())
-    return Score(regret=float(regret.mean()), error=error, normalised=error / max(half, _TINY))
-
-
-def channels(task: Task, found: Sample) -> tuple[Channel, ...]:
+def channels(task: Task, states: Sample) -> tuple[Channel, ...]:
     """Each action channel."""
-    missed, half = found.missed, np.abs(0.5 - found.optimal).mean(axis=0)
-    linear = np.abs(found.others["linear_least_squares"] - found.optimal).mean(axis=0)
-    total = missed.sum(axis=1)
-    regret = 1.0 - task.reward_of(task.similarity_of(found.a, found.optimal))
-    # Where nothing was missed nothing is regretted.
-    charged = (missed * (regret / np.maximum(total, _TINY))[:, None]).mean(axis=0)
-    slopes = _slopes(found)
-    at_zero, at_one = found.a <= AT_BOUND, found.a >= 1.0 - AT_BOUND
+    a, optimal, error = states.a, states.optimal, states.absolute_error
+    linear_error = np.abs(states.references["linear_least_squares"] - optimal)
+    # A state without error has no regret to distribute.
+    per_error = _regret(task, a, optimal) / np.maximum(error.sum(axis=1), _TINY)
+    mae, constant_mae = error.mean(axis=0), np.maximum(np.abs(0.5 - optimal).mean(axis=0), _TINY)
+    columns: dict[str, Array] = {
+        "mae": mae,
+        "normalised_regret": mae / constant_mae,
+        "linear_normalised_regret": linear_error.mean(axis=0) / constant_mae,
+        "regret": (error * per_error[:, None]).mean(axis=0),
+        "offset": (a - optimal).mean(axis=0),
+        "slope": _slopes(states),
+        "at_zero": (a <= _BOUND).mean(axis=0),
+        "at_one": (a >= 1.0 - _BOUND).mean(axis=0),
+        "optimal_at_bounds": _at_bound(optimal).mean(axis=0),
+    }
     return tuple(
-        Channel(
-            channel=i + 1,
-            error=float(missed[:, i].mean()),
-            normalised=float(missed[:, i].mean() / max(half[i], _TINY)),
-            linear=float(linear[i] / max(half[i], _TINY)),
-            regret=float(charged[i]),
-            offset=float((found.a - found.optimal)[:, i].mean()),
-            slope=float(slopes[i]),
-            at_zero=float(at_zero[:, i].mean()),
-            at_one=float(at_one[:, i].mean()),
-            optimal_at_bounds=float(_at_bounds(found.optimal[:, i])),
-        )
+        Channel(channel=i + 1, **{name: float(column[i]) for name, column in columns.items()})
         for i in range(task.spec.action_dim)
     )
 
 
-def _slopes(found: Sample) -> Array:
+def _slopes(states: Sample) -> Array:
     """`[A]` slope of a on a* in each channel."""
-    a, optimal = found.a - found.a.mean(axis=0), found.optimal - found.optimal.mean(axis=0)
+    a, optimal = (x - x.mean(axis=0) for x in (states.a, states.optimal))
     return np.asarray((a * optimal).sum(axis=0) / np.maximum((optimal**2).sum(axis=0), _TINY))
 
 
-def _at_bounds(a: Array) -> float:
-    return float(((a <= AT_BOUND) | (a >= 1.0 - AT_BOUND)).mean())
+def _at_bound(a: Array) -> Array:
+    return np.asarray((a <= _BOUND) | (a >= 1.0 - _BOUND))
 
 
-def partitions(task: Task, found: Sample) -> tuple[Partition, ...]:
-    """Cut by the distance from the centre first, then by each state channel."""
-    error = found.missed.mean(axis=1)
-    regret = 1.0 - task.reward_of(1.0 - error)
-    by = [expansion(found.s), *found.s.T]
-    return tuple(_partition(i, values, error, regret) for i, values in enumerate(by))
+def partitions(task: Task, states: Sample) -> tuple[Partition, ...]:
+    """Bins of the distance from the centre first, then of each state channel."""
+    mae = states.absolute_error.mean(axis=1)
+    regret = 1.0 - task.reward_of(1.0 - mae)
+    by_channel = (_partition(j + 1, s, mae, regret) for j, s in enumerate(states.s.T))
+    return (_partition(None, expansion(states.s), mae, regret), *by_channel)
 
 
-def _partition(by: int, values: Array, error: Array, regret: Array) -> Partition:
-    edges = np.quantile(values, np.linspace(0.0, 1.0, BINS + 1))
-    where = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, BINS - 1)
-    counts = np.maximum(np.bincount(where, minlength=BINS), 1)
-    means = np.bincount(where, error, BINS) / counts
-    between = float((counts * (means - error.mean()) ** 2).sum() / len(error))
-    variance = float(error.var())
+def _partition(state_channel: int | None, values: Array, mae: Array, regret: Array) -> Partition:
+    edges = np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1))
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, _BINS - 1)
+    counts = np.maximum(np.bincount(bins, minlength=_BINS), 1)
+    means = np.bincount(bins, mae, _BINS) / counts
+    between = float((counts * (means - mae.mean()) ** 2).sum() / len(mae))
+    variance = float(mae.var())
     return Partition(
-        by=by,
+        state_channel=state_channel,
         edges=tuple(edges.tolist()),
-        error=tuple(means.tolist()),
-        regret=tuple((np.bincount(where, regret, BINS) / counts).tolist()),
-        explained=between / variance if variance > _TINY else 0.0,
+        mae=tuple(means.tolist()),
+        regret=tuple((np.bincount(bins, regret, _BINS) / counts).tolist()),
+        explained_variance=between / variance if variance > _TINY else 0.0,
     )
 
 
@@ -177,290 +189,118 @@ def shells(
     task: Task,
     fitted: references.References,
     seed: int,
-    within: dict[str, Score],
+    wd_scores: dict[str, Score],
 ) -> tuple[Shell, ...]:
-    """WD, whose scores are known, and the five shells around it."""
+    """WD, whose scores are given, and the five shells around it."""
     protocol = EvaluationProtocol(states_per_region=affordable(task, _SHELL_STATES), seed=seed)
     around = [
         Shell(
-            name=region_name(region),
+            region=region_name(region),
             epsilon=protocol.edges[region][1],
-            policies=scores(task, sample(policy, task, fitted, protocol, region)),
+            scores=scores(task, sample(policy, task, fitted, protocol, region)),
         )
         for region in range(1, len(protocol.edges))
     ]
-    return (Shell(name=region_name(0), epsilon=0.0, policies=within), *around)
+    return (Shell(region=region_name(0), epsilon=0.0, scores=wd_scores), *around)
 
 
-def form(policy: Policy, task: Task, found: Sample, moved_by_clock: float, seed: int) -> Form:
-    """What the squared error consists of, and how the policy follows the state.
+def squared_error(policy: Policy, task: Task, states: Sample, time_variance: float) -> SquaredError:
+    """Decompose the squared error.
 
     Args:
-      moved_by_clock: mean over states and channels of the variance of a over t/T.
+      policy: acts again in the same states, for the noise.
+      task: the task.
+      states: uniform.
+      time_variance: mean over states and channels of the variance of a over t/T.
     """
-    difference = found.a - found.optimal
-    squared = max(float((difference**2).mean()), _TINY)
-    exact = squared <= _TINY  # nothing to divide up
+    difference = states.a - states.optimal
+    total = float((difference**2).mean())
+    exact, total = total <= _TINY, max(total, _TINY)
     offset = float((difference.mean(axis=0) ** 2).mean())
-    scale = float(((_slopes(found) - 1.0) ** 2 * found.optimal.var(axis=0)).mean())
-    again = acted(policy, found.observation)
-    noise = 0.5 * float(((again - found.a) ** 2).mean())
-    linear, rest = _parts(found.s, found.a)
-    linear_of_optimal, rest_of_optimal = _parts(found.s, found.optimal)
-    variance = max(float(found.optimal.var(axis=0).sum()), _TINY)
-    beyond = float((rest_of_optimal**2).mean(axis=0).sum()) / variance
-    return Form(
-        offset=0.0 if exact else offset / squared,
-        scale=0.0 if exact else scale / squared,
-        residual=0.0 if exact else max(0.0, 1.0 - (offset + scale) / squared),
-        noise=noise / squared,
-        clock=max(0.0, moved_by_clock - noise) / squared,
-        accumulated=max(0.0, _moved_by_accumulated(policy, task, found) - noise) / squared,
-        beyond_linear=beyond,
-        learnt_linear=_follows(linear, linear_of_optimal) if beyond < 0.99 else None,
-        learnt_rest=_follows(rest, rest_of_optimal) if beyond > 0.01 else None,
-        gain=_gain(policy, task, found, seed),
-        saturated=_at_bounds(found.a),
-        optimal_saturated=_at_bounds(found.optimal),
+    scale = float(((_slopes(states) - 1.0) ** 2 * states.optimal.var(axis=0)).mean())
+    again = clipped_actions(policy, states.observation)
+    noise = 0.5 * float(((again - states.a) ** 2).mean())
+    reward_variance = _accumulated_reward_variance(policy, task, states)
+    return SquaredError(
+        offset=0.0 if exact else offset / total,
+        scale=0.0 if exact else scale / total,
+        residual=0.0 if exact else max(0.0, 1.0 - (offset + scale) / total),
+        noise=noise / total,
+        time=max(0.0, time_variance - noise) / total,
+        accumulated_reward=max(0.0, reward_variance - noise) / total,
     )
 
 
-def _parts(s: Array, a: Array) -> tuple[Array, Array]:
-    """Actions as an affine map of the state, about their mean, and what is left: `[N, A]` each."""
+def _accumulated_reward_variance(policy: Policy, task: Task, states: Sample) -> float:
+    """Mean variance of a over r_cum/k in its range, [0, (k − 1)/k]."""
+    k = task.spec.k
+    if k == 1:
+        return 0.0
+    inputs = np.linspace(0.0, (k - 1) / k, _ACCUMULATED_INPUTS)
+    return float(np.var(_vary(policy, states, -1, inputs), axis=0).mean())
+
+
+def _vary(policy: Policy, states: Sample, column: int, inputs: Array) -> Array:
+    """`[len(inputs), N, A]` actions in a few fixed states, with one input set to each value."""
+    observation = states.observation[:_FIXED_STATES].copy()
+    actions = []
+    for value in inputs:
+        observation[:, column] = value
+        actions.append(clipped_actions(policy, observation))
+    return np.array(actions)
+
+
+def response(policy: Policy, task: Task, states: Sample, seed: int) -> Response:
+    """How actions follow the state, compared with π*."""
+    linear, nonlinear = _affine_parts(states.s, states.a)
+    optimal_linear, optimal_nonlinear = _affine_parts(states.s, states.optimal)
+    variance = max(float(states.optimal.var(axis=0).sum()), _TINY)
+    share = float((optimal_nonlinear**2).mean(axis=0).sum()) / variance
+    return Response(
+        nonlinear_variance=share,
+        linear_slope=_slope(linear, optimal_linear) if share < 0.99 else None,
+        nonlinear_slope=_slope(nonlinear, optimal_nonlinear) if share > 0.01 else None,
+        sensitivity=_sensitivity(policy, task, states, seed),
+        saturation=float(_at_bound(states.a).mean()),
+        optimal_saturation=float(_at_bound(states.optimal).mean()),
+    )
+
+
+def _affine_parts(s: Array, a: Array) -> tuple[Array, Array]:
+    """`[N, A]` each: the affine map of the state closest to a, about its mean; and the rest."""
     design = np.concatenate([s - 0.5, np.ones((len(s), 1))], axis=1)
     affine = design @ np.linalg.lstsq(design, a)[0]
     return affine - affine.mean(axis=0), a - affine
 
 
-def _follows(part: Array, optimal: Array) -> float:
+def _slope(part: Array, optimal: Array) -> float:
     return float((part * optimal).sum() / max(float((optimal**2).sum()), _TINY))
 
 
-def _moved_by_accumulated(policy: Policy, task: Task, found: Sample) -> float:
-    """Variance of a over r_cum/k in [0, (k − 1)/k], which is all that it can be."""
-    k, few = task.spec.k, found.observation[:_CLOCK_STATES].copy()
-    if k == 1:
-        return 0.0
-    actions = []
-    for value in np.linspace(0.0, (k - 1) / k, 5):
-        few[:, -1] = value
-        actions.append(acted(policy, few))
-    return float(np.var(actions, axis=0).mean())
-
-
-def _gain(policy: Policy, task: Task, found: Sample, seed: int) -> float:
-    """RMS change of a over RMS change of a*, over small steps of the state."""
+def _sensitivity(policy: Policy, task: Task, states: Sample, seed: int) -> float:
+    """RMS change of a over RMS change of a*, for small steps of the state."""
     few = affordable(task, 2048)
-    observation, s = found.observation[:few].copy(), found.s[:few]
+    observation, s = states.observation[:few].copy(), states.s[:few]
     directions = streams.gaussian(seed, "diagnosis/directions", s.size).reshape(s.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     observation[:, : s.shape[1]] = s + _STEP * directions
     moved = observation[:, : s.shape[1]].astype(np.float64)
-    of_optimal = engine(task).optimal_action(moved) - found.optimal[:few]
-    own = acted(policy, observation) - found.a[:few]
-    return float(np.sqrt((own**2).mean() / max(float((of_optimal**2).mean()), _TINY)))
+    optimal_change = engine(task).optimal_action(moved) - states.optimal[:few]
+    change = clipped_actions(policy, observation) - states.a[:few]
+    return float(np.sqrt((change**2).mean() / max(float((optimal_change**2).mean()), _TINY)))
 
 
-def clock(policy: Policy, task: Task, found: Sample) -> tuple[Clock, float]:
-    """The same states at other times; and the mean variance of an action over them."""
-    few = found.observation[:_CLOCK_STATES].copy()
-    optimal = found.optimal[:_CLOCK_STATES]
-    T = task.spec.horizon
-    inputs = np.unique(np.floor(np.linspace(0, T - 1, _CLOCK_INPUTS))) / T
-    actions = []
-    for value in inputs:
-        few[:, -2] = value
-        actions.append(acted(policy, few))
-    all_actions = np.array(actions)
-    half = max(float(np.abs(0.5 - optimal).mean()), _TINY)
-    middle = all_actions.mean(axis=0)
-    return (
-        Clock(
-            inputs=tuple(inputs.tolist()),
-            normalised=tuple(float(np.abs(a - optimal).mean()) / half for a in actions),
-            moved=tuple(float(np.abs(a - middle).mean()) for a in actions),
-        ),
-        float(all_actions.var(axis=0).mean()),
+def time_dependence(policy: Policy, task: Task, states: Sample) -> tuple[TimeDependence, float]:
+    """The same states at other times; and the mean variance of a over them."""
+    T, optimal = task.spec.horizon, states.optimal[:_FIXED_STATES]
+    inputs = np.unique(np.floor(np.linspace(0, T - 1, _TIME_INPUTS))) / T
+    actions = _vary(policy, states, -2, inputs)
+    constant_mae = max(float(np.abs(0.5 - optimal).mean()), _TINY)
+    mae = np.abs(actions - optimal).mean(axis=(1, 2))
+    change = np.abs(actions - actions.mean(axis=0)).mean(axis=(1, 2))
+    dependence = TimeDependence(
+        inputs=tuple(inputs.tolist()),
+        normalised_regret=tuple((mae / constant_mae).tolist()),
+        action_change=tuple(change.tolist()),
     )
-
-
-class Trace(NamedTuple):
-    """Episodes side by side, to the end of the last one.
-
-    Attributes:
-      s: `[T, n, S]` states acted in.
-      error: `[T, n]` mean |a − a*| over channels.
-      half: `[T, n]` the same of the constant ½.
-      reward: `[T, n]` the step reward r.
-      payout: `[T, n]` what was paid, R.
-      alive: `[T, n]` whether the episode still ran.
-      paid: `[T, n]` whether a payout was due after the step.
-      terminated: `[n]` whether D ended it.
-    """
-
-    s: Array
-    error: Array
-    half: Array
-    reward: Array
-    payout: Array
-    alive: Mask
-    paid: Mask
-    terminated: Mask
-
-    def mean(self, values: Array | Mask) -> float:
-        """Over all steps of all episodes."""
-        return float(values[self.alive].mean())
-
-
-def trace(act: Act, task: Task, starts: Array) -> Trace:
-    """Whole episodes of a policy.
-
-    Args:
-      act: from observations `[n, S + 2]` float32 to actions `[n, A]` of the unit range.
-      starts: `[n, S]`.
-    """
-    n = len(starts)
-    batch = Batch(task, n)
-    observation = batch.observe()
-    batch.begin(np.arange(n), observation, starts)
-    alive, terminated = np.ones(n, bool), np.zeros(n, bool)
-    rows: list[tuple[npt.NDArray[Any], ...]] = []
-    while alive.any():
-        s, a = batch.state, np.clip(act(observation.copy()), 0.0, 1.0)
-        done = batch.advance(np.ascontiguousarray(a, np.float64))
-        t = len(rows) + 1
-        due = (t % task.spec.k == 0) | done.truncated
-        missed, half = np.abs(a - done.optimal), np.abs(0.5 - done.optimal)
-        reward, payout = done.values[1, 0], done.values[3, 0]
-        rows.append(
-            (s, missed.mean(1), half.mean(1), reward.copy(), payout.copy(), alive.copy(), due)
-        )
-        terminated |= alive & done.terminated
-        alive &= ~(done.terminated | done.truncated)
-        observation = done.observation
-    s, error, half, reward, payout, still, due = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
-    return Trace(s, error, half, reward, payout, still, due, terminated)
-
-
-def on_policy(
-    policy: Policy, task: Task, fitted: references.References, episodes: int, seed: int
-) -> OnPolicy:
-    """Whole episodes of the policy and of references, from the same starts."""
-    spec = task.spec
-    S, A, T = spec.state_dim, spec.action_dim, spec.horizon
-    n = max(8, min(episodes, _NUMBERS // (T * (S + 8))))
-    starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
-    bits = streams.bit_generator(seed, "diagnosis/random_action")
-
-    def uniform(observation: Observation) -> Array:
-        return streams.to_uniform(bits.random_raw(n * A)).reshape(n, A)
-
-    def linear(observation: Observation) -> Array:
-        return (observation[:, :S] - 0.5) @ fitted.slope + fitted.intercept
-
-    def constant(action: Array) -> Act:
-        return lambda observation: np.tile(action, (n, 1))
-
-    own = trace(policy, task, starts)
-    random = trace(uniform, task, starts)
-    others = {
-        "linear_least_squares": trace(linear, task, starts),
-        "best_constant": trace(constant(fitted.constant), task, starts),
-        "constant_half": trace(constant(np.full(A, 0.5)), task, starts),
-        "uniform_random": random,
-    }
-    found = {who: _score_of(episodes) for who, episodes in {OWN: own, **others}.items()}
-    bins = min(TIME_BINS, len(own.s))
-    cuts = np.linspace(0, len(own.s), bins + 1).round().astype(int)
-    spans = [slice(low, high) for low, high in itertools.pairwise(cuts.tolist())]
-    met = np.sort(own.s[own.alive], axis=0)
-    return OnPolicy(
-        episodes=n,
-        scores=found,
-        edges=tuple(cuts.astype(float).tolist()),
-        regret=tuple(1.0 - float(own.reward[b][own.alive[b]].mean()) for b in spans),
-        error=tuple(float(own.error[b][own.alive[b]].mean()) for b in spans),
-        alive=tuple(float(own.alive[b].mean()) for b in spans),
-        mean_length=float(own.alive.sum(axis=0).mean()),
-        terminated=float(own.terminated.mean()),
-        signal=_signal(task, own),
-        signal_random=_signal(task, random),
-        credit=_credit(own),
-        credit_random=_credit(random),
-        drift=tuple(_distance_from_uniform(met[:, j]) for j in range(S)),
-        covered=min(_covered(met[:, j]) for j in range(S)),
-    )
-
-
-def _score_of(found: Trace) -> Score:
-    return Score(
-        regret=1.0 - found.mean(found.reward),
-        error=found.mean(found.error),
-        normalised=found.mean(found.error) / max(found.mean(found.half), _TINY),
-    )
-
-
-def _signal(task: Task, found: Trace) -> Signal:
-    similarity = 1.0 - found.error
-    paid = found.reward > 0.0
-    graded = similarity > 0.75
-    begins = 0.75 + task.spec.r_min / 4.0
-    return Signal(
-        paid=found.mean(paid),
-        hidden=found.mean(graded & ~paid),
-        flat=found.mean(~graded & ~paid),
-        short=found.mean(np.maximum(0.0, begins - similarity)),
-    )
-
-
-def _credit(found: Trace) -> float | None:
-    """Squared correlation of step rewards with the payouts that they are part of."""
-    credited = np.full(found.reward.shape, np.nan)
-    following = np.full(found.reward.shape[1], np.nan)
-    for t in range(len(credited) - 1, -1, -1):
-        following = np.where(found.alive[t] & found.paid[t], found.payout[t], following)
-        credited[t] = following
-    known = found.alive & np.isfinite(credited)
-    reward, payout = found.reward[known], credited[known]
-    if len(reward) < 2 or reward.std() < 1e-9 or payout.std() < 1e-9:
-        return None
-    return float(np.corrcoef(reward, payout)[0, 1] ** 2)
-
-
-def _distance_from_uniform(values: Array) -> float:
-    """Kolmogorov-Smirnov distance of sorted values from the uniform distribution."""
-    n = len(values)
-    ranks = np.arange(n + 1) / n
-    return float(max((ranks[1:] - values).max(), (values - ranks[:-1]).max()))
-
-
-def _covered(values: Array) -> float:
-    return float(len(np.unique(np.minimum(values * _HALVES, _HALVES - 1).astype(int))) / _HALVES)
-
-
-def training(log: Log, constant: float) -> Training:
-    """What a log says, beside the regret of the better constant policy."""
-    rows = len(log.regret)
-    window = max(1, min(50, rows // 10))
-    smooth = np.array([np.median(log.regret[i : i + window]) for i in range(rows - window + 1)])
-    ends = log.step[window - 1 :]
-    below = np.flatnonzero(smooth < constant - 0.02)
-    recent = smooth[-max(1, len(smooth) // 3) :]
-    best = int(np.argmin(smooth))
-    return Training(
-        source=log.source,
-        rows=rows,
-        steps=int(log.step[-1]),
-        first=float(smooth[0]),
-        best=float(smooth[best]),
-        best_step=int(ends[best]),
-        last=float(smooth[-1]),
-        window=window,
-        constant=constant,
-        escaped_at=int(ends[below[0]]) if len(below) else None,
-        recent_gain=float(recent[0] - recent[-1]),
-        unpaid=None if log.unpaid is None else float(log.unpaid.mean()),
-        terminated=None if log.terminated is None else float(log.terminated.mean()),
-    )
+    return dependence, float(actions.var(axis=0).mean())

@@ -1,10 +1,10 @@
-"""What needs PyTorch: the capacity probe, and what an algorithm would still try.
+"""Measurements that need PyTorch: the capacity probe, and how an algorithm explores.
 
-The probe asks whether the network could be the optimal policy at all. A network of the same layers
-and the same functions is given a* in uniform states, as many as the training had steps, and fitted
-by least squares. It cheats, as no agent can: so where it does well and the agent does not, it is
-not the network that fails; where it does badly in the very states that it was told, it is (or the
-budget of the probe); where it does well in those and badly in others, the states were too few.
+The probe asks whether the network could represent the optimal policy. It fits a network of the same
+layers and activations by regression to a* in uniform states, as many as the training had steps. No
+agent sees a*, so if the probe does well and the agent does not, the network is not the limit. If
+the probe fails in its own training states, the network or the probe's budget is too small. If it
+does well in those and badly in others, there were too few states.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.report import Capacity
+from sme_registry.diagnosis.document import CapacityProbe
 from sme_registry.envs import actions
 from sme_registry.envs.shared import Observation
 from sme_registry.errors import MissingDependencyError
@@ -26,19 +26,22 @@ from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 from sme_registry.training.numpy_policy import Perceptron
 
+__all__ = ["DEFAULT_STATES", "GRADIENT_STEPS", "exploration", "exploration_sd", "probe_capacity"]
+
 GRADIENT_STEPS = 3000
-MOST_STATES, DEFAULT_STATES = 50_000, 20_000
-_FEWEST_STATES = 256
-_HELD_OUT = 4096
-_BATCH, _RATE = 256, 3e-3  # falls to 0 along a cosine
-_TRIES = 16  # random actions in a state, to see their spread
+DEFAULT_STATES = 20_000
+_MIN_STATES, _MAX_STATES = 256, 50_000
+_TEST_STATES = 4096
+_BATCH, _LEARNING_RATE = 256, 3e-3  # the rate decays to 0 along a cosine
+_EXPLORATION_SAMPLES = 16  # of the action in a state
 
 
-def explorer(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
-    """What a model of Stable-Baselines3 would try while it learns, in the unit range.
+def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
+    """The stochastic actions of a Stable-Baselines3 model during training, in the unit range.
 
     Returns:
-      From observations `[B, S + 2]` to actions `[B, A]`, clipped, new ones at each call.
+      From observations `[B, S + 2]` to clipped actions `[B, A]`, sampled at each call; None if the
+      model is no Stable-Baselines3 model.
     """
     if not hasattr(model, "policy") or not hasattr(model.policy, "squash_output"):
         return None
@@ -48,31 +51,33 @@ def explorer(model: Any, policy: Policy) -> Callable[[Observation], Array] | Non
         predicted: tuple[Any, Any] = model.predict(observation, deterministic=False)
         shape = (len(observation), policy.action_dim)
         a = actions.checked(predicted[0], shape, policy.action_range == "symmetric")
-        if noise is not None:  # it is added to actions in [−1, 1], one environment after another
+        if noise is not None:  # added to actions in [−1, 1], one environment after another
             a += 0.5 * np.array([np.ravel(noise())[: shape[1]] for _ in range(shape[0])], float)
         return np.asarray(np.clip(a, 0.0, 1.0))
 
     return explore
 
 
-def spread(explore: Callable[[Observation], Any], observation: Observation, seed: int) -> Array:
-    """`[A]` standard deviation of what is tried in a state, over many states."""
-    with _own_randomness(seed):
-        tried = np.array([explore(observation.copy()) for _ in range(_TRIES)])
-    return np.asarray(np.sqrt(tried.var(axis=0, ddof=1).mean(axis=0)))
+def exploration_sd(
+    explore: Callable[[Observation], Any], observation: Observation, seed: int
+) -> Array:
+    """`[A]` standard deviation of exploration in a state, over many states."""
+    with _torch_seed(seed):
+        sampled = np.array([explore(observation.copy()) for _ in range(_EXPLORATION_SAMPLES)])
+    return np.asarray(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)))
 
 
-def capacity(
+def probe_capacity(
     network: Perceptron, task: Task, states: int, seed: int, progress: Callable[[int], None]
-) -> Capacity:
-    """Fit a network of the same kind to the optimal actions.
+) -> CapacityProbe:
+    """Fit a network of the same layers to the optimal actions.
 
     Args:
-      network: whose layers to take; its weights are not used.
+      network: its layers are used, its weights are not.
       task: the task.
-      states: that it is told; at most 50,000.
-      seed: of the states and of the first weights.
-      progress: told the gradient steps done.
+      states: in the training set; at most 50,000.
+      seed: of the states and of the initial weights.
+      progress: called with the number of gradient steps done.
 
     Raises:
       MissingDependencyError: PyTorch is not installed.
@@ -84,40 +89,53 @@ def capacity(
             "probe_capacity: PyTorch is not installed. Run `pip install 'sme-registry[train]'`."
         ) from None
     begun = time.monotonic()
-    count = max(_FEWEST_STATES, min(states, MOST_STATES))
-    told, told_actions = _pairs(task, count, seed, "diagnosis/told")
-    other, other_actions = _pairs(task, _HELD_OUT, seed, "diagnosis/held_out")
-    half = float(np.abs(0.5 - other_actions).mean())
-    with _own_randomness(seed):
-        fitted = _like(network)
-        optimiser = torch.optim.Adam(fitted.parameters(), lr=_RATE)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, GRADIENT_STEPS)
-        inputs, targets = torch.from_numpy(told), torch.from_numpy(told_actions)
-        order = np.random.default_rng(seed)
-        for step in range(GRADIENT_STEPS):
-            batch = torch.from_numpy(order.integers(0, count, _BATCH))
-            loss = torch.nn.functional.mse_loss(fitted(inputs[batch]), targets[batch])
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
-            schedule.step()
-            if step % 100 == 99:
-                progress(step + 1)
+    count = max(_MIN_STATES, min(states, _MAX_STATES))
+    train = _pairs(task, count, seed, "diagnosis/told")
+    test = _pairs(task, _TEST_STATES, seed, "diagnosis/held_out")
+    constant_mae = float(np.abs(0.5 - test[1]).mean())
+    with _torch_seed(seed):
+        module = _module(network)
+        _fit(module, *train, seed, progress)
 
-        def error(observation: Observation, optimal: Observation) -> float:
+        def normalised_regret(observation: Observation, optimal: Observation) -> float:
             with torch.no_grad():
-                a = fitted(torch.from_numpy(observation)).numpy()
-            return float(np.abs(np.clip(a, 0.0, 1.0) - optimal).mean()) / half
+                a = module(torch.from_numpy(observation)).numpy()
+            return float(np.abs(np.clip(a, 0.0, 1.0) - optimal).mean()) / constant_mae
 
         widths = [len(network.layers[0][0]), *(W.shape[1] for W, _, _ in network.layers)]
-        return Capacity(
+        return CapacityProbe(
             layers=tuple(widths),
             states=count,
             gradient_steps=GRADIENT_STEPS,
-            fitted=error(told[:_HELD_OUT], told_actions[:_HELD_OUT]),
-            held_out=error(other, other_actions),
+            train_normalised_regret=normalised_regret(*(x[:_TEST_STATES] for x in train)),
+            test_normalised_regret=normalised_regret(*test),
             seconds=round(time.monotonic() - begun, 2),
         )
+
+
+def _fit(
+    module: Any,
+    observation: Observation,
+    optimal: Observation,
+    seed: int,
+    progress: Callable[[int], None],
+) -> None:
+    """Minimise the squared error by Adam."""
+    import torch
+
+    optimiser = torch.optim.Adam(module.parameters(), lr=_LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, GRADIENT_STEPS)
+    inputs, targets = torch.from_numpy(observation), torch.from_numpy(optimal)
+    order = np.random.default_rng(seed)
+    for step in range(GRADIENT_STEPS):
+        batch = torch.from_numpy(order.integers(0, len(inputs), _BATCH))
+        loss = torch.nn.functional.mse_loss(module(inputs[batch]), targets[batch])
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if step % 100 == 99:
+            progress(step + 1)
 
 
 def _pairs(task: Task, count: int, seed: int, stream: str) -> tuple[Observation, Observation]:
@@ -131,24 +149,24 @@ def _pairs(task: Task, count: int, seed: int, stream: str) -> tuple[Observation,
     return observation, optimal.astype(np.float32)
 
 
-def _like(network: Perceptron) -> Any:
-    """A new network of the same layers, whose outputs are actions of the unit range."""
+def _module(network: Perceptron) -> Any:
+    """A new network of the same layers, whose outputs are actions in the unit range."""
     from torch import nn
 
-    functions: dict[Any, type[nn.Module]] = {np.tanh: nn.Tanh}
+    activations: dict[Any, type[nn.Module]] = {np.tanh: nn.Tanh}
     modules: list[nn.Module] = []
     for index, (W, _, activation) in enumerate(network.layers):
         modules.append(nn.Linear(*W.shape))
         if activation is not None and index < len(network.layers) - 1:
-            modules.append(functions.get(activation, nn.ReLU)())
-    if network.low is not None:  # squashed by tanh, and spread over the range: a sigmoid of 2 x
+            modules.append(activations.get(activation, nn.ReLU)())
+    if network.low is not None:  # squashed by tanh and scaled to the range: a sigmoid of 2 x
         modules.append(nn.Sigmoid())
     return nn.Sequential(*modules)
 
 
 @contextlib.contextmanager
-def _own_randomness(seed: int) -> Iterator[None]:
-    """PyTorch's random numbers from a seed, on one thread; both are put back afterwards."""
+def _torch_seed(seed: int) -> Iterator[None]:
+    """Seed PyTorch and use one thread; both are restored afterwards."""
     import torch
 
     from sme_registry.training.algorithms import one_thread, quiet

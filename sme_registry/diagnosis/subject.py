@@ -1,7 +1,7 @@
-"""`Subject`: what is diagnosed, read from where it lies: a run's folder, or a study's cell.
+"""`Subject`: a policy to diagnose, loaded from a run's folder or from a cell of a study.
 
-A run is a folder that `sme train` wrote. A study's cell is STUDY and the key of the cell (its
-digest, or as many of its first digits as only one cell has), whose model was kept.
+A run is a folder of `sme train`. A cell is named by the study's folder and by its key: its digest,
+or as many of the first digits as only one cell has. The study must have kept the cell's model.
 """
 
 from __future__ import annotations
@@ -26,40 +26,42 @@ from sme_registry.training import episodes as episode_files
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.run import MODEL
 
-_FEWEST_DIGITS = 6
+__all__ = ["Log", "Subject", "load_cell", "load_policy", "load_run"]
+
+_MIN_DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A training's regret over its steps, `[N]` each.
+    """The regret of a training over its steps, `[N]` each.
 
     Attributes:
       source: "episodes" or "evaluations".
       step: environment steps.
       regret: mean regret of an episode, or of an evaluation.
-      unpaid: which episodes had no reward at all; None where rows are evaluations.
-      terminated: which episodes D ended; None likewise.
+      unrewarded: which episodes had no reward at all; None for evaluations.
+      terminated: which episodes D terminated; None for evaluations.
     """
 
     source: Literal["episodes", "evaluations"]
     step: Array
     regret: Array
-    unpaid: Array | None = None
+    unrewarded: Array | None = None
     terminated: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A policy and what is known of how it came to be.
+    """A policy and what is known about its training.
 
     Attributes:
-      name: what it is called.
-      spec: the task, of a single agent.
+      name: of the run or policy.
+      spec: the task, for a single agent.
       policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, unclipped.
-      plan: algorithm, seed, steps and so on; empty for a bare policy.
-      log: of its training; None where there is none.
-      explore: what the algorithm would try at observations, at random; None where not known.
-      note: what is special about it.
+      plan: algorithm, seed, steps and so on; empty for a policy without a run.
+      log: of its training; None if there is none.
+      explore: the algorithm's stochastic actions at observations; None if unknown.
+      checkpoint_step: of an unfinished run, the steps done at its checkpoint; None otherwise.
     """
 
     name: str
@@ -68,54 +70,44 @@ class Subject:
     plan: dict[str, JsonValue]
     log: Log | None = None
     explore: Callable[[Observation], Any] | None = None
-    note: str = ""
+    checkpoint_step: int | None = None
 
 
-def of_policy(
+def load_policy(
     policy: Any, spec: SMESpec, *, action_range: str | None = None, name: str | None = None
 ) -> Subject:
-    """A policy in any form that `evaluate` takes, and the task it is for.
+    """A policy in any form that `evaluate` accepts, and its task.
 
     Raises:
-      SpecError: the task is a team's.
+      SpecError: the task is for a team.
       PolicyError, OptionError, MissingDependencyError: see `as_policy`.
     """
-    _refuse_teams(spec)
-    model = policy
+    _require_single_agent(spec)
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
-        model, name = load_sb3(policy), name or Path(policy).stem
-    found = numpy_policy(model, spec, action_range=action_range)
-    name = name or found.name
-    return Subject(name, spec, found, {}, explore=_explorer(model, found))
+        policy, name = load_sb3(policy), name or Path(policy).stem
+    act = numpy_policy(policy, spec, action_range=action_range)
+    return Subject(name or act.name, spec, act, {}, explore=_exploration(policy, act))
 
 
-def of_run(folder: str | Path) -> Subject:
-    """A run that `sme train` wrote, finished or not.
+def load_run(folder: str | Path) -> Subject:
+    """A run of `sme train`, finished or not.
 
     Raises:
-      OptionError: no run is there, or it has neither a model nor a checkpoint yet.
-      MalformedDocumentError, SpecError: run.json is damaged; or the task is a team's.
+      OptionError: the folder holds no run, or the run has neither a model nor a checkpoint yet.
+      MalformedDocumentError, SpecError: run.json is damaged, or the task is for a team.
       PolicyError, MissingDependencyError: its model cannot be loaded.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise OptionError(f"run={str(folder)!r}: there is no such folder. Give one of `sme train`.")
-    record = RunRecord.read(folder)
-    if record is None:
-        hint = "Give the folder that `sme train` wrote."
-        if (folder / "cells").is_dir():
-            hint = f"It is a study's: say which cell, as in --cell {_example(folder)}."
-        raise OptionError(f"run={str(folder)!r}: holds no run.json. {hint}")
-    _refuse_teams(record.spec)
-    path, note = folder / MODEL, ""
+    record = _run_record(folder)
+    _require_single_agent(record.spec)
+    path, checkpoint_step = folder / MODEL, None
     if not path.exists():
-        path = folder / checkpoint.FILE
-        if not path.exists():
-            raise OptionError(
-                f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Let it train "
-                "up to its first checkpoint, or go on with `sme train … --resume`."
-            )
-        note = f"The run is not finished: this is its checkpoint after {record.steps_done:,} steps."
+        path, checkpoint_step = folder / checkpoint.FILE, record.steps_done
+    if not path.exists():
+        raise OptionError(
+            f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Wait for its "
+            "first checkpoint, or continue it with `sme train … --resume`."
+        )
     model = load_sb3(path)
     policy = numpy_policy(model, record.spec, action_range=record.action_range)
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
@@ -124,49 +116,44 @@ def of_run(folder: str | Path) -> Subject:
         record.spec,
         policy,
         {field: getattr(record, field) for field in fields},
-        _episodes(folder / episode_files.FILE),
-        _explorer(model, policy),
-        note,
+        _episode_log(folder / episode_files.FILE),
+        _exploration(model, policy),
+        checkpoint_step,
     )
 
 
-def of_cell(study: str | Path, key: str) -> Subject:
-    """A finished cell of a study, whose model was kept.
+def _run_record(folder: Path) -> RunRecord:
+    if not folder.is_dir():
+        raise OptionError(f"run={str(folder)!r}: no such folder. Give a folder of `sme train`.")
+    record = RunRecord.read(folder)
+    if record is None:
+        advice = "Give a folder of `sme train`."
+        if (folder / "cells").is_dir():
+            advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
+        raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
+    return record
+
+
+def load_cell(study: str | Path, key: str) -> Subject:
+    """A finished cell of a study that kept its model.
 
     Args:
       study: the study's folder.
       key: the cell's digest, with or without `sha256:`, or its first digits.
 
     Raises:
-      OptionError: no study is there, or the cell's model was not kept.
+      OptionError: the folder holds no study, or the cell's model was not kept.
       UnknownNameError: no finished cell, or more than one, has such a key.
       MalformedDocumentError, SpecError: its result is damaged.
       PolicyError, MissingDependencyError: its model cannot be loaded.
     """
-    study, digits = Path(study), key.removeprefix("sha256:").lower()
-    results = sorted((study / "cells").glob("*.json"))
-    if not results:
-        raise OptionError(
-            f"run={str(study)!r}: is no study with finished cells. Give the folder of "
-            "`sme study run`, or a run's without --cell."
-        )
-    found = [path for path in results if path.stem.startswith(digits)]
-    if len(found) != 1 or len(digits) < _FEWEST_DIGITS:
-        raise UnknownNameError(
-            f"cell={key!r}: {len(found)} of {len(results)} finished cells have such a key. Give "
-            f"{_FEWEST_DIGITS} or more digits that only one has, as in {_example(study)}."
-        )
-    data = read_json(found[0])
-    try:
-        cell, curve = Cell.from_dict(data["cell"], str(found[0])), data["curve"]
-        step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, SpecError):
-            raise
-        raise OptionError(
-            f"{found[0]}: is no result of a cell ({type(error).__name__}: {error}). Remove it and "
-            "run the study again."
-        ) from None
+    study = Path(study)
+    path = _cell_path(study, key)
+    cell, log = _read_cell(path)
+    model = _cell_model(study, path.stem, cell)
+    policy = numpy_policy(
+        model, cell.spec, action_range=None if callable(model) else cell.action_range
+    )
     plan: dict[str, JsonValue] = {
         "algorithm": cell.uses,
         "hyperparameters": cell.hyperparameters,
@@ -174,40 +161,70 @@ def of_cell(study: str | Path, key: str) -> Subject:
         "action_range": cell.action_range,
         "steps": cell.steps,
     }
-    name = f"{cell.uses}, cell {found[0].stem[:12]}"
+    name = f"{cell.uses}, cell {path.stem[:12]}"
+    return Subject(name, cell.spec, policy, plan, log, _exploration(model, policy))
+
+
+def _cell_path(study: Path, key: str) -> Path:
+    results = sorted((study / "cells").glob("*.json"))
+    if not results:
+        raise OptionError(
+            f"run={str(study)!r}: no study with finished cells. Give a folder of `sme study run`, "
+            "or omit --cell for a run."
+        )
+    digits = key.removeprefix("sha256:").lower()
+    matches = [path for path in results if path.stem.startswith(digits)]
+    if len(matches) != 1 or len(digits) < _MIN_DIGITS:
+        raise UnknownNameError(
+            f"cell={key!r}: matches {len(matches)} of {len(results)} finished cells. Give "
+            f"{_MIN_DIGITS} or more digits that match only one, such as {_example_key(study)}."
+        )
+    return matches[0]
+
+
+def _read_cell(path: Path) -> tuple[Cell, Log | None]:
+    data = read_json(path)
+    try:
+        cell, curve = Cell.from_dict(data["cell"], str(path)), data["curve"]
+        step, regret = np.array(curve["steps"], float), np.array(curve["regret"], float)
+    except SpecError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise OptionError(
+            f"{path}: not the result of a cell ({type(error).__name__}: {error}). Delete it and "
+            "run the study again."
+        ) from None
+    return cell, Log("evaluations", step, regret) if len(step) else None
+
+
+def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
     if cell.uses.startswith("reference:"):
         from sme_registry.evaluation.references import reference_policy
 
-        model = reference_policy(cell.uses.partition(":")[2], cell.spec)
-    else:
-        path = study / "models" / f"{found[0].stem}.zip"
-        if not path.exists():
-            raise OptionError(
-                f"cell={key!r}: its model was not kept. What has finished is not run again: run "
-                "the study in a new folder, with --keep-models."
-            )
-        model = load_sb3(path)
-    policy = numpy_policy(
-        model, cell.spec, action_range=None if callable(model) else cell.action_range
-    )
-    log = Log("evaluations", step, regret) if len(step) else None
-    return Subject(name, cell.spec, policy, plan, log, _explorer(model, policy))
+        return reference_policy(cell.uses.partition(":")[2], cell.spec)
+    path = study / "models" / f"{stem}.zip"
+    if not path.exists():
+        raise OptionError(
+            f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "
+            "the study in a new folder, with --keep-models."
+        )
+    return load_sb3(path)
 
 
-def _refuse_teams(spec: SMESpec) -> None:
+def _require_single_agent(spec: SMESpec) -> None:
     if spec.team is not None:
         raise SpecError(
-            f"team: a diagnosis is of one agent, and this task is for {len(spec.team.agents)}. "
-            "`sme evaluate` judges each agent of a team."
+            f"team: diagnosis supports one agent, and this task has {len(spec.team.agents)}. Use "
+            "`sme evaluate`, which reports each agent of a team."
         )
 
 
-def _example(study: Path) -> str:
+def _example_key(study: Path) -> str:
     path = next(iter(sorted((study / "cells").glob("*.json"))), None)
     return path.stem[:12] if path else "KEY"
 
 
-def _episodes(path: Path) -> Log | None:
+def _episode_log(path: Path) -> Log | None:
     rows = episode_files.read_episodes(path) if path.exists() else []
     if not rows:
         return None
@@ -215,9 +232,9 @@ def _episodes(path: Path) -> Log | None:
     return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
 
 
-def _explorer(model: Any, policy: Policy) -> Callable[[Observation], Any] | None:
+def _exploration(model: Any, policy: Policy) -> Callable[[Observation], Any] | None:
     if not hasattr(model, "predict") or not hasattr(model, "get_env"):
         return None
-    from sme_registry.diagnosis.networks import explorer
+    from sme_registry.diagnosis.networks import exploration
 
-    return explorer(model, policy)
+    return exploration(model, policy)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from sme_registry.diagnosis.rules import THRESHOLDS
+from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.studies.report.analysis import ALL, AXES, learnt_from
 from sme_registry.studies.report.tables import ENOUGH_RUNS, Aggregate, Analysis, Contrast
 

@@ -1,0 +1,87 @@
+"""What a question is: a rule, and the answer that each of its reasons gives; all thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from sme_registry.diagnosis.document import Answer, Comparison, Kind, Measurements
+from sme_registry.spec import SMESpec
+
+__all__ = ["THRESHOLDS", "Case", "Outcome", "Question", "Rule", "add_to"]
+
+THRESHOLDS = {
+    "solved": 0.1,  # normalised regret at most: nothing is left to explain
+    "constant_level": 0.95,  # normalised regret at least: no better than the constant ½
+    "unlearnt": 0.9,  # normalised regret of a channel or of another run, at least
+    "channel_learnt": 0.6,  # normalised regret of a channel, at most
+    "excess_saturation": 0.2,  # share of entries at a bound beyond the optimum's
+    "dominant_share": 0.5,  # of the squared error, for an offset or a scale
+    "noise_or_time_share": 0.25,  # of the squared error
+    "explained_variance": 0.1,  # share of the errors' variance between bins
+    "bin_ratio": 1.5,  # of the worst bin's error to the best bin's
+    "slope_learnt": 0.7,  # slope on a part of π*, at least
+    "slope_unlearnt": 0.3,  # at most
+    "nonlinear_variance": 0.1,  # share of π*'s variance, at least
+    "similarity_loss": 0.1,  # from WD to the outermost shell
+    "on_policy_ratio": 1.25,  # of normalised regret on policy and in uniform states
+    "on_policy_difference": 0.05,  # between the two
+    "time_ratio": 1.25,  # of the error late and early in episodes
+    "time_difference": 0.02,  # between the two
+    "gated_share": 0.25,  # of steps whose reward r_min sets to 0
+    "gated_rewarded_share": 0.5,  # of steps that are rewarded nevertheless, at most
+    "rarely_unrewarded": 0.05,  # share of steps without reward, below
+    "rarely_rewarded": 0.02,  # share of steps rewarded under random actions, below
+    "termination_rate": 0.5,  # share of episodes that D terminates
+    "short_episode": 0.5,  # mean length over the horizon, at most
+    "constant_margin": 0.02,  # of regret below the constant action's
+    "exploration_cost": 0.1,  # regret of training beyond the policy's, to be reported
+    "log_rows": 10.0,  # for a trend, at least
+    "still_improving": 0.02,  # fall of the running median of regret over the last third
+    "regressed": 0.1,  # its rise from its best
+    "probe_better": 0.5,  # the probe's normalised regret over the agent's, at most
+    "probe_no_better": 0.8,  # at least
+    "difference": 0.1,  # of normalised regret between two runs
+}
+
+
+class Case(NamedTuple):
+    """What the rules read."""
+
+    measurements: Measurements
+    spec: SMESpec
+    comparison: Comparison | None = None
+
+    @property
+    def solved(self) -> bool:
+        """Whether nothing is left to explain."""
+        return self.measurements.policy.normalised_regret <= THRESHOLDS["solved"]
+
+
+class Outcome(NamedTuple):
+    """A rule's branch, its evidence, and the thresholds that it used."""
+
+    reason: str
+    evidence: dict[str, Any]
+    thresholds: tuple[str, ...] = ()
+
+
+class Question(NamedTuple):
+    """A question: its kind, its rule, and the answer that each reason gives."""
+
+    kind: Kind
+    rule: Callable[[Case], Outcome]
+    reasons: dict[str, Answer]
+
+
+Rule = Callable[[Case], Outcome]
+
+
+def add_to(questions: dict[str, Question], kind: Kind, **reasons: Answer) -> Callable[[Rule], Rule]:
+    """Decorate a rule: add the question of its name, with the answer that each reason gives."""
+
+    def add(rule: Rule) -> Rule:
+        questions[rule.__name__.removeprefix("_")] = Question(kind, rule, reasons)
+        return rule
+
+    return add

@@ -1,0 +1,213 @@
+"""Measurements over whole episodes of a policy, and of its training log.
+
+`n` episodes side by side, `S` state_dim, `A` action_dim, `T` steps of the longest episode.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.diagnosis.document import POLICY, OnPolicy, RewardSignal, Score, Training
+from sme_registry.diagnosis.measure import MAX_NUMBERS
+from sme_registry.diagnosis.subject import Log
+from sme_registry.envs.batch import Batch, Mask, Observation
+from sme_registry.evaluation import Policy, references
+from sme_registry.task import Task, streams
+from sme_registry.task.draw import Array
+
+__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "training"]
+
+CONSTANTS = ("best_constant", "constant_half")
+_TIME_BINS, _COVERAGE_BINS = 10, 20
+_MARGIN = 0.02  # of regret below the constant action's
+_TINY = 1e-12
+
+
+class Trajectories(NamedTuple):
+    """Episodes side by side, up to the end of the longest.
+
+    Attributes:
+      s: `[T, n, S]` states.
+      mae: `[T, n]` mean |a − a*| over channels.
+      constant_mae: `[T, n]` the same of the constant ½.
+      reward: `[T, n]` step reward r.
+      payout: `[T, n]` payout R.
+      alive: `[T, n]` whether the episode was still running.
+      payout_due: `[T, n]` whether a payout was due after the step.
+      terminated: `[n]` whether D terminated the episode.
+    """
+
+    s: Array
+    mae: Array
+    constant_mae: Array
+    reward: Array
+    payout: Array
+    alive: Mask
+    payout_due: Mask
+    terminated: Mask
+
+    def mean(self, values: Array | Mask) -> float:
+        """Over all steps of all episodes."""
+        return float(values[self.alive].mean())
+
+    @property
+    def score(self) -> Score:
+        """Over all steps of all episodes."""
+        mae = self.mean(self.mae)
+        return Score(
+            regret=1.0 - self.mean(self.reward),
+            mae=mae,
+            normalised_regret=mae / max(self.mean(self.constant_mae), _TINY),
+        )
+
+
+def rollout(act: Callable[[Observation], Array], task: Task, initial_states: Array) -> Trajectories:
+    """Whole episodes of a policy.
+
+    Args:
+      act: from observations `[n, S + 2]` float32 to actions `[n, A]` of the unit range.
+      task: the task.
+      initial_states: `[n, S]`.
+    """
+    n = len(initial_states)
+    batch = Batch(task, n)
+    observation = batch.observe()
+    batch.begin(np.arange(n), observation, initial_states)
+    alive, terminated = np.ones(n, bool), np.zeros(n, bool)
+    rows: list[tuple[npt.NDArray[Any], ...]] = []
+    while alive.any():
+        s, a = batch.state, np.clip(act(observation.copy()), 0.0, 1.0)
+        step = batch.advance(np.ascontiguousarray(a, np.float64))
+        due = ((len(rows) + 1) % task.spec.k == 0) | step.truncated
+        mae, constant_mae = (np.abs(x - step.optimal).mean(axis=1) for x in (a, 0.5))
+        reward, payout = step.values[1, 0].copy(), step.values[3, 0].copy()
+        rows.append((s, mae, constant_mae, reward, payout, alive.copy(), due))
+        terminated |= alive & step.terminated
+        alive &= ~(step.terminated | step.truncated)
+        observation = step.observation
+    s, mae, constant_mae, reward, payout, running, due = map(np.array, zip(*rows, strict=True))
+    return Trajectories(s, mae, constant_mae, reward, payout, running, due, terminated)
+
+
+def on_policy(
+    policy: Policy, task: Task, fitted: references.References, episodes: int, seed: int
+) -> OnPolicy:
+    """Whole episodes of the policy and of references, from the same initial states."""
+    S, T = task.spec.state_dim, task.spec.horizon
+    n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
+    starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
+    runs = {POLICY: rollout(policy, task, starts)}
+    for name, act in _reference_actions(task, fitted, n, seed).items():
+        runs[name] = rollout(act, task, starts)
+    run, random = runs[POLICY], runs["uniform_random"]
+    edges = np.linspace(0, len(run.s), min(_TIME_BINS, len(run.s)) + 1).round().astype(int)
+    bins = [slice(low, high) for low, high in itertools.pairwise(edges.tolist())]
+    visited = np.sort(run.s[run.alive], axis=0)
+    return OnPolicy(
+        episodes=n,
+        scores={name: trajectories.score for name, trajectories in runs.items()},
+        edges=tuple(edges.astype(float).tolist()),
+        regret=tuple(1.0 - float(run.reward[b][run.alive[b]].mean()) for b in bins),
+        mae=tuple(float(run.mae[b][run.alive[b]].mean()) for b in bins),
+        alive=tuple(float(run.alive[b].mean()) for b in bins),
+        mean_length=float(run.alive.sum(axis=0).mean()),
+        termination_rate=float(run.terminated.mean()),
+        signal=_reward_signal(task, run),
+        random_signal=_reward_signal(task, random),
+        credit=_credit(run),
+        random_credit=_credit(random),
+        state_shift=tuple(_distance_from_uniform(visited[:, j]) for j in range(S)),
+        coverage=min(_coverage(visited[:, j]) for j in range(S)),
+    )
+
+
+def _reference_actions(
+    task: Task, fitted: references.References, n: int, seed: int
+) -> dict[str, Callable[[Observation], Array]]:
+    """The references as functions of observations `[n, S + 2]`."""
+    S, A = task.spec.state_dim, task.spec.action_dim
+    bits = streams.bit_generator(seed, "diagnosis/random_action")
+    return {
+        "linear_least_squares": lambda observation: (
+            (observation[:, :S] - 0.5) @ fitted.slope + fitted.intercept
+        ),
+        "best_constant": lambda observation: np.tile(fitted.constant, (n, 1)),
+        "constant_half": lambda observation: np.full((n, A), 0.5),
+        "uniform_random": lambda observation: streams.to_uniform(bits.random_raw(n * A)).reshape(
+            n, A
+        ),
+    }
+
+
+def _reward_signal(task: Task, run: Trajectories) -> RewardSignal:
+    similarity = 1.0 - run.mae
+    rewarded, graded = run.reward > 0.0, similarity > 0.75
+    shortfall = np.maximum(0.0, 0.75 + task.spec.r_min / 4.0 - similarity)
+    return RewardSignal(
+        rewarded=run.mean(rewarded),
+        gated=run.mean(graded & ~rewarded),
+        flat=run.mean(~graded & ~rewarded),
+        shortfall=run.mean(shortfall),
+    )
+
+
+def _credit(run: Trajectories) -> float | None:
+    """Squared correlation of step rewards with the payouts that include them."""
+    credited = np.full(run.reward.shape, np.nan)
+    next_payout = np.full(run.reward.shape[1], np.nan)
+    for t in range(len(credited) - 1, -1, -1):
+        next_payout = np.where(run.alive[t] & run.payout_due[t], run.payout[t], next_payout)
+        credited[t] = next_payout
+    known = run.alive & np.isfinite(credited)
+    reward, payout = run.reward[known], credited[known]
+    if len(reward) < 2 or reward.std() < 1e-9 or payout.std() < 1e-9:
+        return None
+    return float(np.corrcoef(reward, payout)[0, 1] ** 2)
+
+
+def _distance_from_uniform(values: Array) -> float:
+    """Kolmogorov-Smirnov distance of sorted values from the uniform distribution."""
+    n = len(values)
+    ranks = np.arange(n + 1) / n
+    return float(max((ranks[1:] - values).max(), (values - ranks[:-1]).max()))
+
+
+def _coverage(values: Array) -> float:
+    bins = np.minimum(values * _COVERAGE_BINS, _COVERAGE_BINS - 1).astype(int)
+    return float(len(np.unique(bins)) / _COVERAGE_BINS)
+
+
+def training(log: Log, constant_regret: float) -> Training:
+    """Summarise a training log.
+
+    Args:
+      log: at least one row.
+      constant_regret: of the better constant policy.
+    """
+    rows = len(log.regret)
+    window = max(1, min(50, rows // 10))
+    median = np.array([np.median(log.regret[i : i + window]) for i in range(rows - window + 1)])
+    steps = log.step[window - 1 :]
+    improved = np.flatnonzero(median < constant_regret - _MARGIN)
+    recent = median[-max(1, len(median) // 3) :]
+    best = int(np.argmin(median))
+    return Training(
+        source=log.source,
+        rows=rows,
+        steps=int(log.step[-1]),
+        window=window,
+        first_regret=float(median[0]),
+        best_regret=float(median[best]),
+        best_step=int(steps[best]),
+        last_regret=float(median[-1]),
+        constant_regret=constant_regret,
+        improvement_step=int(steps[improved[0]]) if len(improved) else None,
+        recent_improvement=float(recent[0] - recent[-1]),
+        unrewarded=None if log.unrewarded is None else float(log.unrewarded.mean()),
+        termination_rate=None if log.terminated is None else float(log.terminated.mean()),
+    )

@@ -1,0 +1,197 @@
+"""Why the error is there: questions about training, of which a policy shows only traces.
+
+The answer is "cannot tell" unless a number separates the causes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sme_registry.diagnosis.document import POLICY
+from sme_registry.diagnosis.questions import THRESHOLDS as _T
+from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
+
+__all__ = ["WHY"]
+
+WHY: dict[str, Question] = {}
+"""Questions about training, in order."""
+
+_DETERMINISTIC_SD = 1e-6
+
+
+@add_to(
+    WHY,
+    "why",
+    no_training_log="cannot tell",
+    beat_constant_in_training="no",
+    policy_beats_constant="no",
+    rewards_too_rare="yes",
+    rewards_found="cannot tell",
+)
+def _exploration(case: Case) -> Outcome:
+    log, episodes = case.measurements.training, case.measurements.on_policy
+    rewarded = episodes.random_signal.rewarded
+    regret = episodes.scores[POLICY].regret
+    evidence: dict[str, Any] = {"random_rewarded": rewarded, **_exploration_sd(case)}
+    if log is None:
+        return Outcome("no_training_log", evidence)
+    cost = log.last_regret - regret
+    reported = log.source == "episodes" and cost >= _T["exploration_cost"]
+    evidence |= {
+        "regret": regret,
+        "exploration_cost": cost if reported else None,
+        **log.model_dump(include={"steps", "improvement_step", "constant_regret", "best_regret"}),
+    }
+    if log.improvement_step is not None:
+        return Outcome("beat_constant_in_training", evidence)
+    if regret < log.constant_regret - _T["constant_margin"]:
+        return Outcome("policy_beats_constant", evidence, ("constant_margin",))
+    rare = rewarded < _T["rarely_rewarded"]
+    return Outcome("rewards_too_rare" if rare else "rewards_found", evidence, ("rarely_rewarded",))
+
+
+def _exploration_sd(case: Case) -> dict[str, Any]:
+    sd = case.measurements.exploration_sd
+    if sd is None:
+        return {"exploration_sd": None}
+    return {"exploration_sd": [min(sd), max(sd)], "explores": max(sd) >= _DETERMINISTIC_SD}
+
+
+@add_to(WHY, "why", paid_every_step="no", delayed_payout="cannot tell")
+def _credit_assignment(case: Case) -> Outcome:
+    k, episodes = case.spec.k, case.measurements.on_policy
+    if k == 1:
+        return Outcome("paid_every_step", {"k": k})
+    evidence = {"k": k, "credit": episodes.credit, "random_credit": episodes.random_credit}
+    return Outcome("delayed_payout", evidence)
+
+
+@add_to(
+    WHY,
+    "why",
+    no_reward_threshold="no",
+    rewards_gated="yes",
+    rewards_frequent="no",
+    effect_unknown="cannot tell",
+)
+def _sparsity(case: Case) -> Outcome:
+    r_min, episodes, log = case.spec.r_min, case.measurements.on_policy, case.measurements.training
+    signal, random = episodes.signal, episodes.random_signal
+    evidence = {
+        "r_min": r_min,
+        **signal.model_dump(),
+        **{f"random_{name}": value for name, value in random.model_dump().items()},
+        "unrewarded_episodes": None if log is None else log.unrewarded,
+    }
+    if r_min == 0:
+        return Outcome("no_reward_threshold", evidence)
+    gated = signal.gated >= _T["gated_share"]
+    if gated and signal.rewarded <= _T["gated_rewarded_share"]:
+        return Outcome("rewards_gated", evidence, ("gated_share", "gated_rewarded_share"))
+    if signal.gated + signal.flat < _T["rarely_unrewarded"]:
+        return Outcome("rewards_frequent", evidence, ("rarely_unrewarded",))
+    return Outcome("effect_unknown", evidence, ("gated_share", "gated_rewarded_share"))
+
+
+@add_to(
+    WHY,
+    "why",
+    not_probed="cannot tell",
+    network_does_better="no",
+    network_cannot_fit="yes",
+    network_fits_training_states_only="no",
+    probe_inconclusive="cannot tell",
+)
+def _capacity(case: Case) -> Outcome:
+    probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
+    evidence: dict[str, Any] = {
+        "complexity": case.spec.complexity,
+        "nonlinear_variance": case.measurements.response.nonlinear_variance,
+        "normalised_regret": regret,
+    }
+    if probe is None:
+        return Outcome("not_probed", evidence)
+    evidence |= probe.model_dump(mode="json", exclude={"seconds"})
+    better, no_better = _T["probe_better"] * regret, _T["probe_no_better"] * regret
+    if probe.test_normalised_regret <= better:
+        reason = "network_does_better"
+    elif probe.train_normalised_regret >= no_better:
+        reason = "network_cannot_fit"
+    elif probe.train_normalised_regret <= better:
+        reason = "network_fits_training_states_only"
+    else:
+        reason = "probe_inconclusive"
+    return Outcome(reason, evidence, ("probe_better", "probe_no_better"))
+
+
+@add_to(WHY, "why", too_few_states="yes", states_sufficient="no", not_separated="cannot tell")
+def _dimension(case: Case) -> Outcome:
+    probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
+    channels = case.measurements.channels
+    evidence: dict[str, Any] = {
+        "state_dim": case.spec.state_dim,
+        "action_dim": case.spec.action_dim,
+        "normalised_regret": regret,
+        "unlearnt_channels": sum(c.normalised_regret >= _T["unlearnt"] for c in channels),
+        "random_rewarded": case.measurements.on_policy.random_signal.rewarded,
+    }
+    better, no_better = _T["probe_better"] * regret, _T["probe_no_better"] * regret
+    if probe is not None and probe.train_normalised_regret <= better:
+        evidence |= probe.model_dump(include={"states", "test_normalised_regret"})
+        if probe.test_normalised_regret >= no_better:
+            return Outcome("too_few_states", evidence, ("probe_better", "probe_no_better"))
+        if probe.test_normalised_regret <= better:
+            return Outcome("states_sufficient", evidence, ("probe_better",))
+    return Outcome("not_separated", evidence, ("unlearnt",))
+
+
+@add_to(WHY, "why", no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
+def _survival(case: Case) -> Outcome:
+    spec, episodes, log = case.spec, case.measurements.on_policy, case.measurements.training
+    if spec.D == 0:
+        return Outcome("no_survival_threshold", {"D": spec.D})
+    rate, length = episodes.termination_rate, episodes.mean_length
+    short = length <= _T["short_episode"] * spec.horizon
+    return Outcome(
+        "episodes_cut_short"
+        if rate >= _T["termination_rate"] and short
+        else "episodes_long_enough",
+        {
+            "D": spec.D,
+            "effective_D": max(spec.D, spec.r_min),
+            "horizon": spec.horizon,
+            "termination_rate": rate,
+            "mean_length": length,
+            "coverage": episodes.coverage,
+            "training_termination_rate": None if log is None else log.termination_rate,
+        },
+        ("termination_rate", "short_episode"),
+    )
+
+
+@add_to(
+    WHY,
+    "why",
+    no_training_log="cannot tell",
+    log_too_short="cannot tell",
+    regressed="no",
+    still_improving="yes",
+    never_improved="cannot tell",
+    plateaued="no",
+)
+def _budget(case: Case) -> Outcome:
+    log = case.measurements.training
+    if log is None:
+        return Outcome("no_training_log", {})
+    evidence = log.model_dump(
+        include={"rows", "steps", "best_regret", "best_step", "last_regret", "recent_improvement"}
+    )
+    if log.rows < _T["log_rows"]:
+        return Outcome("log_too_short", evidence, ("log_rows",))
+    if log.last_regret - log.best_regret >= _T["regressed"]:
+        return Outcome("regressed", evidence, ("regressed",))
+    if log.recent_improvement >= _T["still_improving"]:
+        reason = "still_improving"
+    else:
+        reason = "never_improved" if log.improvement_step is None else "plateaued"
+    return Outcome(reason, evidence, ("still_improving",))

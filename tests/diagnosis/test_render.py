@@ -1,0 +1,131 @@
+"""Every verdict that the rules can give has a sentence, and no sentence lacks a number."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from jinja2 import UndefinedError
+
+from sme_registry import SMESpec
+from sme_registry.diagnosis import Verdict, render, verdicts
+from sme_registry.diagnosis.document import (
+    CapacityProbe,
+    Comparison,
+    Difference,
+    Measurements,
+    Training,
+)
+from tests.diagnosis.policies import SPEC, diagnosis_of, shrunk
+
+DECLARED = {
+    (question, reason)
+    for question, rule in verdicts.QUESTIONS.items()
+    for reason in (*rule.reasons, *(verdicts.SOLVED if rule.kind == "why" else ()))
+} | {
+    (question, reason)
+    for question in ("credit_assignment", "sparsity", "capacity", "dimension", "survival")
+    for reason in verdicts.COMPARISON_REASONS
+    if (question, reason) != ("survival", "other_run_unlearnt")  # its rule always decides
+}
+FIELDS = {"k": (5, 1), "r_min": (0.5, 0.0), "complexity": (10, 1), "state_dim": (16, 8),
+          "action_dim": (8, 4), "D": (0.5, 0.0)}  # fmt: skip
+
+
+def scrambled(value: Any, generator: random.Random) -> Any:
+    """The same document with other numbers in [−0.1, 1.1], some of them equal to 0."""
+    if isinstance(value, dict):
+        return {name: scrambled(part, generator) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        scale = generator.choice((0.1, 1.0))  # even lists, and lists below a threshold, too
+        return [scrambled(part, generator) if not isinstance(part, float)
+                else scale * scrambled(part, generator) for part in value]  # fmt: skip
+    if isinstance(value, float):
+        return generator.choice((0.0, generator.uniform(-0.1, 1.1), generator.uniform(0, 0.1)))
+    return value
+
+
+def optional(model: type[Any], generator: random.Random) -> Any:
+    """A document with random numbers, or None."""
+    if generator.random() < 0.3:
+        return None
+    number = generator.random
+    values = {name: generator.choice((0.0, number(), 0.1 * number())) for name in model.model_fields}
+    values |= {"rows": generator.choice((5, 100)), "steps": 20_000, "best_step": 10_000}
+    values |= {"improvement_step": generator.choice((None, 9_000)), "window": 2}
+    values |= {"layers": (10, 64, 4), "states": 20_000, "gradient_steps": 3_000}
+    values |= {"source": "episodes"}
+    if generator.random() < 0.5:
+        values |= {"unrewarded": None, "termination_rate": None}
+    return model(**{name: values[name] for name in model.model_fields})
+
+
+def random_verdicts(count: int) -> Iterator[Verdict]:
+    """The verdicts on random measurements, on tasks with every axis on or off."""
+    generator = random.Random(0)
+    plain = diagnosis_of(shrunk, states=64).measurements.to_dict()
+    for _ in range(count):
+        measured = Measurements.from_dict(scrambled(plain, generator), "random")
+        channels = measured.channels
+        if generator.random() < 0.5:  # one channel learnt and one not
+            low, high = ({"normalised_regret": x, "slope": 3.0} for x in (0.1, 1.0))
+            channels = (channels[0].model_copy(update=low), channels[1].model_copy(update=high))
+        measured = measured.model_copy(
+            update={
+                "channels": channels,
+                "training": optional(Training, generator),
+                "capacity": optional(CapacityProbe, generator),
+                "exploration_sd": generator.choice((None, (0.0, 0.0), (0.1, 0.3))),
+            }
+        )
+        spec = generator.choice((SPEC, SPEC.derive(k=5, r_min=0.5, D=0.3)))
+        comparison = None
+        if generator.random() < 0.5:
+            field = generator.choice(list(FIELDS))
+            regret = Difference(
+                quantity="normalised_regret",
+                value=generator.choice((0.5, 0.95)),
+                other=generator.choice((0.5, 0.95)),
+            )
+            comparison = Comparison(
+                name="the other", spec_fields={field: FIELDS[field]}, plan_fields={},
+                differences=(regret,), answers={},
+            )  # fmt: skip
+        yield from verdicts.judge(measured, spec, comparison)
+
+
+def test_every_question_and_reason_is_reached_and_has_a_sentence() -> None:
+    reached = set()
+    for verdict in random_verdicts(1500):
+        reached.add((verdict.question, verdict.reason))
+        text = render.sentence(verdict)
+        assert text.endswith(".")
+        assert "None" not in text
+        assert " ," not in text
+        assert " ." not in text
+    assert reached == DECLARED
+
+
+def test_a_verdict_without_its_evidence_has_no_sentence() -> None:
+    verdict = diagnosis_of(shrunk, states=64).verdict("response_scale")
+    with pytest.raises((UndefinedError, TypeError)):
+        render.sentence(verdict.model_copy(update={"evidence": {}}))
+
+
+def test_markdown_holds_every_sentence_the_headline_and_the_figures() -> None:
+    from sme_registry.diagnosis import diagnose, load_policy
+
+    other = load_policy(shrunk, SMESpec(horizon=20, k=5), name="other")
+    diagnosis = diagnose(load_policy(shrunk, SPEC), against=other, states=64, episodes=8)
+    page = render.markdown(diagnosis.model_copy(update={"checkpoint_step": 1234}), ["a_b.png"])
+    for verdict in diagnosis.verdicts:
+        assert render.sentence(verdict).replace("|", r"\|") in page
+    assert render.headline(diagnosis) in page
+    assert "1,234" in page
+    assert "![a b](a_b.png)" in page
+    tables = [line for line in page.splitlines() if line.startswith("|")]
+    rules = [line for line in tables if set(line) <= {"|", "-"}]
+    assert len(rules) == 6 if diagnosis.comparison and diagnosis.comparison.answers else 5
+    assert all(line.endswith("|") for line in tables)

@@ -1,0 +1,206 @@
+"""Subjects, the command, and the files that it writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from sme_registry import SMESpec
+from sme_registry.cli import app
+from sme_registry.diagnosis import (
+    Diagnosis,
+    diagnose,
+    load_cell,
+    load_policy,
+    load_run,
+    render,
+)
+from sme_registry.errors import (
+    DigestMismatchError,
+    OptionError,
+    PolicyError,
+    SpecError,
+    UnknownNameError,
+)
+from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
+
+
+def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
+    team = SMESpec(team={"agents": [{"action_dim": 2}, {"action_dim": 2}], "reward": "team"})
+    with pytest.raises(SpecError, match="one agent"):
+        load_policy(shrunk, team)
+    with pytest.raises(OptionError, match="no such folder"):
+        load_run(tmp_path / "absent")
+    with pytest.raises(OptionError, match=r"run\.json"):
+        load_run(tmp_path)
+    with pytest.raises(OptionError, match="sme study run"):
+        load_cell(tmp_path, "abcdef")
+    with pytest.raises(OptionError, match="states=63"):
+        diagnosis_of(shrunk, states=63)
+    with pytest.raises(OptionError, match="episodes=True"):
+        diagnosis_of(shrunk, episodes=True)
+    with pytest.raises(PolicyError, match="NaN"):
+        diagnosis_of(lambda observation: np.full((len(observation), 4), np.nan))
+
+
+# --- runs, cells and the command ----------------------------------------------------------------
+
+
+def sme(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def refused(*arguments: str | Path) -> str:
+    result = sme(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short training of PPO, as `sme train` leaves it."""
+    pytest.importorskip("stable_baselines3")
+    from sme_registry.training import train
+
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    protocol = {"states_per_region": 100}
+    train(SPEC, algorithm="PPO", steps=100, folder=folder, protocol=protocol, progress=False)
+    return folder
+
+
+def test_a_run_is_diagnosed_with_its_log_and_its_exploration(run: Path) -> None:
+    found = diagnose(load_run(run), states=256, episodes=8)
+    assert found.plan["algorithm"] == "PPO"
+    assert found.checkpoint_step is None
+    log, spread = found.measurements.training, found.measurements.exploration_sd
+    assert log is not None
+    assert log.rows == 102  # 2,048 steps of 20
+    assert spread is not None
+    assert all(0.2 < sd < 0.5 for sd in spread)  # SD 1 in [−1, 1], clipped
+
+
+def test_an_unfinished_run_is_diagnosed_from_its_checkpoint(run: Path, tmp_path: Path) -> None:
+    stopped = tmp_path / "stopped"
+    shutil.copytree(run, stopped)
+    if not (stopped / "checkpoint.zip").exists():
+        (stopped / "model.zip").rename(stopped / "checkpoint.zip")
+    else:
+        (stopped / "model.zip").unlink()
+    assert load_run(stopped).checkpoint_step == 2048
+    (stopped / "checkpoint.zip").unlink()
+    assert "checkpoint.zip" in refused("diagnose", stopped)
+
+
+def test_the_command_writes_a_page_its_data_and_its_figures(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    from sme_registry.diagnosis import networks
+
+    monkeypatch.setattr(networks, "GRADIENT_STEPS", 100)
+    options = ("--states", "256", "--episodes", "8")
+    result = sme("diagnose", run, "--out", tmp_path / "d", "--probe-capacity", *options)
+    assert result.exit_code == 0, result.output
+    assert "Why" in result.stdout
+    page = (tmp_path / "d" / "diagnosis.md").read_text()
+    figures = sorted(path.name for path in (tmp_path / "d").glob("*.png"))
+    assert len(figures) == 5
+    assert all(f"]({name})" in page for name in figures)
+    read = Diagnosis.read(tmp_path / "d" / "diagnosis.json")
+    assert read.measurements.capacity is not None
+    assert read.measurements.capacity.layers == (10, 64, 64, 4)
+    assert all(render.sentence(verdict) in page for verdict in read.verdicts)
+    assert "--force" in refused("diagnose", run, "--out", tmp_path / "d")
+    again = sme("diagnose", run, "--out", tmp_path / "d", "--force", "--json", *options)
+    assert json.loads(again.stdout)["name"] == "short"
+
+
+def test_an_edited_diagnosis_is_rejected(tmp_path: Path) -> None:
+    plain = diagnosis_of(shrunk, states=256).to_dict()
+    plain["spec"]["seed"] = 7
+    (tmp_path / "diagnosis.json").write_text(json.dumps(plain))
+    with pytest.raises(DigestMismatchError, match="spec_digest"):
+        Diagnosis.read(tmp_path / "diagnosis.json")
+
+
+def test_the_command_accepts_any_policy_with_its_task(tmp_path: Path) -> None:
+    options = ("--states", "256", "--episodes", "8", "--json")
+    result = sme("diagnose", "linear", "--task", "Default", "--set", "complexity=10", *options)
+    assert result.exit_code == 0, result.output
+    found = Diagnosis.from_dict(json.loads(result.stdout))
+    assert found.spec.complexity == 10
+    assert "linear_only" in faults(found)
+    against = sme("diagnose", "linear", "-t", "Default", "--against", "constant", *options)
+    assert json.loads(against.stdout)["comparison"]["spec_fields"] == {}
+    assert "--task Default" in refused("diagnose", "linear")
+    assert "needs --task" in refused("diagnose", tmp_path, "--set", "k=1")
+    assert "Give one of them" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
+
+
+def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Path) -> None:
+    from sme_registry.spec.study import Cell
+    from sme_registry.studies.engine.cell import run_cell
+
+    cells = [
+        Cell(
+            spec=SPEC, uses=uses, hyperparameters={}, action_range="symmetric", seed=0, steps=40,
+            evaluations=2, evaluation_episodes=1, protocol={"states_per_region": 100},
+        )
+        for uses in ("reference:linear", "reference:constant", "TD3")
+    ]  # fmt: skip
+    keys = [cell.digest.removeprefix("sha256:") for cell in cells]
+    (tmp_path / "cells").mkdir()
+    for cell, key in zip(cells, keys, strict=True):
+        result = run_cell(cell, model_path=tmp_path / "models" / f"{key}.zip")
+        (tmp_path / "cells" / f"{key}.json").write_text(json.dumps(result.to_dict()))
+    linear = load_cell(tmp_path, keys[0][:12])
+    assert linear.log is not None
+    assert linear.log.source == "evaluations"
+    assert linear.plan["algorithm"] == "reference:linear"
+    options = ("--states", "256", "--episodes", "8", "--json")
+    trained = sme("diagnose", tmp_path, "--cell", keys[2], "--against", keys[1][:9], *options)
+    assert trained.exit_code == 0, trained.output
+    comparison = json.loads(trained.stdout)["comparison"]
+    assert comparison["plan_fields"] == {"algorithm": ["TD3", "reference:constant"]}
+    assert "0 of 3" in refused("diagnose", tmp_path, "--cell", "0123456789")
+    with pytest.raises(UnknownNameError, match="6 or more digits"):
+        load_cell(tmp_path, "")
+    assert "--cell" in refused("diagnose", tmp_path)
+    (tmp_path / "models" / f"{keys[2]}.zip").unlink()
+    without = refused("diagnose", tmp_path, "--cell", keys[2])
+    assert "--keep-models" in without
+    (tmp_path / "cells" / f"{keys[1]}.json").write_text("{}")
+    assert "not the result of a cell" in refused("diagnose", tmp_path, "--cell", keys[1])
+
+
+def test_without_matplotlib_there_is_a_page_without_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find_spec(name)
+    )
+    options = ("--states", "256", "--episodes", "8", "--out", str(tmp_path))
+    result = sme("diagnose", "constant", "--task", "Default", *options)
+    assert result.exit_code == 0, result.output
+    assert "pip install" in result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "diagnosis.md"]
+
+
+def test_importing_the_diagnosis_imports_neither_torch_nor_matplotlib() -> None:
+    code = (
+        "import sys, sme_registry.diagnosis.figures; "
+        "print([m for m in ('torch', 'matplotlib', 'stable_baselines3') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
