@@ -51,15 +51,15 @@ def optional(model: type[Any], generator: random.Random) -> Any:
     """A document with random numbers, or None."""
     if generator.random() < 0.3:
         return None
-    number = generator.random
-    values = {name: generator.choice((0.0, number(), 0.1 * number())) for name in model.model_fields}
+    number, fields = generator.random, model.model_fields
+    values = {name: generator.choice((0.0, number(), 0.1 * number())) for name in fields}
     values |= {"rows": generator.choice((5, 100)), "steps": 20_000, "best_step": 10_000}
     values |= {"improvement_step": generator.choice((None, 9_000)), "window": 2}
     values |= {"layers": (10, 64, 4), "states": 20_000, "gradient_steps": 3_000}
     values |= {"source": "episodes"}
     if generator.random() < 0.5:
         values |= {"unrewarded": None, "termination_rate": None}
-    return model(**{name: values[name] for name in model.model_fields})
+    return model(**{name: values[name] for name in fields})
 
 
 def random_verdicts(count: int) -> Iterator[Verdict]:

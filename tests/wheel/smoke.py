@@ -81,6 +81,9 @@ def main(backend: str) -> None:
     json.loads(listed.stdout)
     shown = sme("show", "SME/Default-v1")
     expect(shown.returncode == 0 and "sha256:66e9b7a9a266" in shown.stdout, "`sme show`")
+    options = ("--task", "Default", "--states", "64", "--episodes", "8")
+    diagnosed = sme("diagnose", "constant", *options)
+    expect(diagnosed.returncode == 0, "`sme diagnose` finds its templates")
     unknown = sme("show", "SME/Defualt-v1")
     expect(
         unknown.returncode == 2 and "Traceback" not in unknown.stderr + unknown.stdout,
