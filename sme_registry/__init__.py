@@ -3,7 +3,8 @@
     import gymnasium, sme_registry
     env = gymnasium.make("SME/Default-v1")            # exact regret in info, at every step
 
-Importing this package registers the catalogue. What costs time to import is loaded on first use.
+Importing this package registers the catalogue. Its submodules, such as `sme_registry.datasets`, and
+everything else that is slow to import are loaded on first use.
 """
 
 from __future__ import annotations
@@ -26,9 +27,22 @@ from sme_registry.registration import (
 from sme_registry.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from sme_registry.envs.team import env, parallel_env
-    from sme_registry.evaluation.evaluate import evaluate
-    from sme_registry.evaluation.report import EvaluationReport
+    from sme_registry import datasets as datasets
+    from sme_registry import diagnosis as diagnosis
+    from sme_registry import envs as envs
+    from sme_registry import errors as errors
+    from sme_registry import evaluation as evaluation
+    from sme_registry import offline as offline
+    from sme_registry import plots as plots
+    from sme_registry import sb3 as sb3
+    from sme_registry import spec as spec
+    from sme_registry import statistics as statistics
+    from sme_registry import studies as studies
+    from sme_registry import task as task
+    from sme_registry import teams as teams
+    from sme_registry import testing as testing
+    from sme_registry import training as training
+    from sme_registry.evaluation import EvaluationReport, evaluate
     from sme_registry.spec import EvaluationProtocol, SMESpec
     from sme_registry.task import Task, materialize
 
@@ -38,7 +52,6 @@ __all__ = [
     "SMEError",
     "SMESpec",
     "Task",
-    "env",
     "env_spec",
     "evaluate",
     "load",
@@ -47,7 +60,6 @@ __all__ = [
     "make_parallel",
     "make_vec",
     "materialize",
-    "parallel_env",
     "register",
     "save",
 ]
@@ -57,21 +69,40 @@ _LAZY = {
     "EvaluationReport": "sme_registry.evaluation",
     "SMESpec": "sme_registry.spec",
     "Task": "sme_registry.task",
-    "env": "sme_registry.envs.team",
     "evaluate": "sme_registry.evaluation",
     "materialize": "sme_registry.task",
-    "parallel_env": "sme_registry.envs.team",
 }
+
+# Not in `__all__`: a star import would load all of them, and with them optional dependencies.
+_SUBMODULES = (
+    "datasets",
+    "diagnosis",
+    "envs",
+    "errors",
+    "evaluation",
+    "offline",
+    "plots",
+    "sb3",
+    "spec",
+    "statistics",
+    "studies",
+    "task",
+    "teams",
+    "testing",
+    "training",
+)
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(importlib.import_module(_LAZY[name]), name)
+    if name in _SUBMODULES:
+        return importlib.import_module(f"sme_registry.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_SUBMODULES})
 
 
 register_catalogue()

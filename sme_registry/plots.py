@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+__all__ = ["decay_curve", "similarity_map", "training_curve"]
+
 Measure = Literal["similarity", "normalised_regret"]
 
 # What keeps a format's date out of the file: the same figure is the same file.

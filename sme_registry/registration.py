@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 _ENTRY_POINT = "sme_registry.envs:SMEEnv"
 _VECTOR_ENTRY_POINT = "sme_registry.envs:SMEVectorEnv"
 _TEAM_ENTRY_POINTS = {
-    "parallel": "sme_registry.envs.team:parallel_env",
-    "aec": "sme_registry.envs.team:env",
+    "parallel": "sme_registry.teams:parallel_env",
+    "aec": "sme_registry.teams:env",
 }
 
 
@@ -249,7 +249,7 @@ def make_parallel(
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
     """
-    from sme_registry.envs.team import parallel_env
+    from sme_registry.teams import parallel_env
 
     return parallel_env(spec_or_id, **kwargs)
 
@@ -266,6 +266,6 @@ def make_aec(
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
     """
-    from sme_registry.envs.team import env
+    from sme_registry.teams import env
 
     return env(spec_or_id, **kwargs)

@@ -43,6 +43,8 @@ except ImportError:
         "Run `pip install 'sme-registry[train]'`."
     ) from None
 
+__all__ = ["LanesVecEnv", "SMETeamVecEnv", "SMEVecEnv"]
+
 _Stepped = tuple[Observation, npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]
 
 

@@ -33,6 +33,20 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Statistic = Callable[[npt.ArrayLike], Array]  # of [n, …] over the first axis: […]
 
+__all__ = [
+    "DRAWS",
+    "LEVEL",
+    "Estimate",
+    "aggregate",
+    "iqm",
+    "mean",
+    "median",
+    "optimality_gap",
+    "performance_profile",
+    "probability_of_improvement",
+    "stratified_bootstrap",
+]
+
 LEVEL = 0.95
 DRAWS = 2000
 _HELD = 2**21  # numbers held at once while drawing, 16 MiB

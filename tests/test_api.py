@@ -2,6 +2,10 @@
 
 import importlib
 import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium
 import pytest
@@ -11,10 +15,10 @@ from sme_registry import errors
 from sme_registry.errors import NameTakenError, OptionError, SMEError, SpecError
 from sme_registry.spec import SMESpec
 
+ROOT_SOURCE = Path(sme_registry.__file__).read_text(encoding="utf-8")
 CONTRACT = {
     "SMEError", "SMESpec", "Task", "EvaluationProtocol", "EvaluationReport", "env_spec", "evaluate",
     "load", "make", "make_aec", "make_parallel", "make_vec", "materialize", "register", "save",
-    "env", "parallel_env",
 }  # fmt: skip
 
 
@@ -35,6 +39,41 @@ def test_star_import_gives_the_public_names():
     namespace: dict[str, object] = {}
     exec("from sme_registry import *", namespace)
     assert set(sme_registry.__all__) <= namespace.keys()
+
+
+SUBMODULES = [
+    "datasets", "diagnosis", "envs", "errors", "evaluation", "offline", "plots", "sb3", "spec",
+    "statistics", "studies", "task", "teams", "testing", "training",
+]  # fmt: skip
+
+
+def test_submodules_are_attributes_after_one_import():
+    script = (
+        "import sys, sme_registry\n"
+        "assert 'sme_registry.datasets' not in sys.modules\n"
+        f"for name in {SUBMODULES}:\n"
+        "    assert name in dir(sme_registry), name\n"
+        "    assert getattr(sme_registry, name) is sys.modules[f'sme_registry.{name}'], name\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_type_checker_sees_every_name_that_is_loaded_on_first_use():
+    imported = ROOT_SOURCE[ROOT_SOURCE.index("if TYPE_CHECKING") : ROOT_SOURCE.index("__all__")]
+    for name in SUBMODULES:
+        assert f"from sme_registry import {name} as {name}\n" in imported
+    for name, module in sme_registry._LAZY.items():
+        assert re.search(rf"from {module} import .*\b{name}\b", imported), name
+
+
+@pytest.mark.parametrize("name", [name for name in SUBMODULES if name not in ("errors", "studies")])
+def test_a_public_module_lists_its_names_in_order(name):
+    module = importlib.import_module(f"sme_registry.{name}")
+    capitals_first = sorted(module.__all__, key=lambda text: (not text.isupper(), text))
+    assert module.__all__ == capitals_first
+    for public in module.__all__:
+        assert hasattr(module, public)
 
 
 def test_an_unknown_attribute_is_an_attribute_error():

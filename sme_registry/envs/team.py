@@ -16,9 +16,7 @@ from typing import Any, ClassVar, Literal, cast
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec_wrapper
-from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+from pettingzoo import ParallelEnv
 
 from sme_registry.envs import actions as action_ranges
 from sme_registry.envs.batch import Advanced, Array, Batch, Observation
@@ -355,33 +353,3 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         return f"SMETeamEnv({self.sme_spec.content_name}, {len(self.possible_agents)} agents)"
 
     __str__ = __repr__
-
-
-class _Turns(OrderEnforcingWrapper):  # type: ignore[misc]
-    """A team in turns that refuses a bad action in its agent's own turn, where it can be mended."""
-
-    def step(self, action: npt.NDArray[Any] | None) -> None:
-        if not self._has_reset:
-            raise EpisodeError("step: the episode has not begun. Call reset() first.")
-        if not self.agents:
-            raise EpisodeError("step: the episode has ended. Call reset() first.")
-        name = self.agent_selection
-        if not (self.terminations[name] or self.truncations[name]):
-            self.unwrapped.check_action(name, action)
-        elif action is not None:
-            raise EpisodeError(f"{name}: the episode has ended. Give None, or call reset().")
-        super().step(action)
-
-
-def parallel_env(
-    spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Team2-v1", **kwargs: Any
-) -> SMETeamEnv:
-    """The team of a spec as a PettingZoo parallel environment; see `SMETeamEnv`."""
-    return SMETeamEnv(spec, **kwargs)
-
-
-def env(
-    spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Team2-v1", **kwargs: Any
-) -> AECEnv[str, Observation, npt.NDArray[Any]]:
-    """The team of a spec as a PettingZoo AEC environment: agents act in turn, the step is joint."""
-    return _Turns(parallel_to_aec_wrapper(SMETeamEnv(spec, **kwargs)))

@@ -100,7 +100,7 @@ class RunRecord(StrictModel):
 
 def installed_versions() -> dict[str, str]:
     """Versions of Python and of what the numbers depend on, where installed."""
-    from sme_registry import __version__
+    from sme_registry.version import __version__
 
     versions = {"sme_registry": __version__, "python": platform.python_version()}
     for name in _PACKAGES:

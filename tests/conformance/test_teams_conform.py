@@ -12,7 +12,7 @@ import pytest
 from pettingzoo.utils.conversions import aec_to_parallel, parallel_to_aec
 
 import sme_registry
-from sme_registry import SMESpec, testing
+from sme_registry import SMESpec, teams, testing
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile
 
@@ -65,7 +65,7 @@ def test_the_horizon_is_what_pettingzoos_max_cycles_test_asks_for() -> None:
         return lambda max_cycles: make("Team4", horizon=max_cycles)
 
     module = SimpleNamespace(
-        parallel_env=with_horizon(sme_registry.parallel_env), env=with_horizon(sme_registry.env)
+        parallel_env=with_horizon(teams.parallel_env), env=with_horizon(teams.env)
     )
     max_cycles_test(module)
 

@@ -343,7 +343,7 @@ def test_runs_on_other_specs_are_named(tmp_path, table):
         ([{**row(A0, None), "spec": "absent.json"}], SpecError, "run 0: .*absent.json"),
         ([row(A0, "a0.pt")], SpecError, "policy='a0.pt': must be the path of an .onnx"),
         ([row(A0, "absent.onnx"), row(A1, None), row(B0, None)], OptionError, "cannot be read"),
-        ([row(A0, "absent.zip"), row(A1, None), row(B0, None)], PolicyError, "no such file"),
+        ([row(A0, "absent.zip"), row(A1, None), row(B0, None)], PolicyError, "does not exist"),
         (
             [row(A0, None), row(A1, None), row(B0, "a0.onnx")],
             Rejection,

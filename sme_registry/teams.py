@@ -1,0 +1,61 @@
+"""Teams as PettingZoo environments, by the names that PettingZoo's own modules use.
+
+    from sme_registry import teams
+    env = teams.parallel_env("SME/Team4-v1")
+
+In a parallel environment all agents act at once. In an AEC environment they act in turn, and the
+step happens when the last one has acted. `sme_registry.make_parallel` and `make_aec` are the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pettingzoo import AECEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from sme_registry.envs.shared import Observation
+from sme_registry.envs.team import SMETeamEnv
+from sme_registry.errors import EpisodeError
+from sme_registry.spec import SpecLike
+
+__all__ = ["SMETeamEnv", "env", "parallel_env"]
+
+
+def parallel_env(spec: SpecLike = "Team2-v1", **kwargs: Any) -> SMETeamEnv:
+    """A team's task as a PettingZoo parallel environment.
+
+    Args:
+      spec: the task; one without a team is a team of one, `agent_0`.
+      **kwargs: spec fields to override, `action_range`, `render_mode`.
+
+    Raises:
+      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    """
+    return SMETeamEnv(spec, **kwargs)
+
+
+def env(
+    spec: SpecLike = "Team2-v1", **kwargs: Any
+) -> AECEnv[str, Observation, npt.NDArray[np.float64]]:
+    """A team's task as a PettingZoo AEC environment; arguments and errors as in `parallel_env`."""
+    return _TurnBasedTeam(parallel_to_aec_wrapper(SMETeamEnv(spec, **kwargs)))
+
+
+class _TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
+    """Rejects an invalid action in its agent's own turn, when it can still be corrected."""
+
+    def step(self, action: npt.NDArray[Any] | None) -> None:
+        if not self._has_reset:
+            raise EpisodeError("step: the episode has not begun. Call reset() first.")
+        if not self.agents:
+            raise EpisodeError("step: the episode has ended. Call reset() first.")
+        name = self.agent_selection
+        if not (self.terminations[name] or self.truncations[name]):
+            self.unwrapped.check_action(name, action)
+        elif action is not None:
+            raise EpisodeError(f"{name}: the episode has ended. Pass None, or call reset().")
+        super().step(action)
