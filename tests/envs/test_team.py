@@ -242,7 +242,7 @@ def test_in_turns_a_bad_action_is_refused_in_its_own_turn_and_can_be_mended() ->
     for _ in range(4):
         env.step(np.zeros(2))
     assert env.truncations == {"agent_0": True, "agent_1": True}
-    with pytest.raises(EpisodeError, match=r"agent_0: the episode has ended\. Give None"):
+    with pytest.raises(EpisodeError, match=r"agent_0: the episode has ended\. Pass None"):
         env.step(np.zeros(2))
     env.step(None)
     env.step(None)
