@@ -1,23 +1,21 @@
-"""The sandbox's inside: a script that runs one model, within limits that it sets for itself.
+"""The child process of the sandbox: a script that runs one model under limits that it sets itself.
 
-It is started by its path in a process of its own and imports nothing of this package. The limits
-come after the libraries are loaded and before a byte of the model is read: from then on no file can
-be opened or grown and no process started, and memory is limited to so much above what the libraries
-took. What arrives and leaves, little-endian:
+The parent starts it by its path; it imports nothing of this package. It sets the limits after it
+has loaded the libraries and before it reads a byte of the model. From then on it cannot open or
+grow a file or start a process, and its memory is limited. Messages, little-endian:
 
-    in     uint32 length, the model;  then again and again  uint32 rows, float32 [rows, S + 2]
-    out    uint8 status, uint32 length, payload             one answer to the start, one to the
-                                                            model, one to each batch
+    in     uint32 length, the model;  then for each batch  uint32 rows, float32 [rows, S + 2]
+    out    uint8 status, uint32 length, payload            one answer to the start, one to the
+                                                           model, one to each batch
 
-An answer of status `OK` has no payload but after a batch: float32 [rows, A]. Any other has a short
-text. Arguments: memory in bytes and processor time in seconds above what is used at the start, S +
-2, A, then the folders that hold the libraries.
+The payload of an `OK` answer to a batch is float32 [rows, A], and empty otherwise. Every other
+status has a short text. Arguments: memory in bytes and processor time in seconds, both in addition
+to what the libraries use; S + 2; A; then the folders of the libraries.
 """
 
 from __future__ import annotations
 
 import os
-import resource
 import struct
 import sys
 
@@ -34,7 +32,7 @@ def main() -> None:
     sys.path += sys.argv[5:]
     answers = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)  # whatever a library prints must not be taken for an answer
+    os.dup2(nowhere, 1)  # output of a library must not be read as an answer
     os.dup2(nowhere, 2)
 
     import numpy as np
@@ -46,7 +44,7 @@ def main() -> None:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    # As it was submitted: what an optimiser makes of it would change with its version.
+    # Run the model as submitted: the result of an optimiser depends on its version.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     try:
         session = onnxruntime.InferenceSession(
@@ -54,7 +52,7 @@ def main() -> None:
         )
         name = session.get_inputs()[0].name
     except Exception as error:
-        _answer(answers, *_told(error, REFUSED))
+        _answer(answers, *_error_answer(error, REFUSED))
         return
     _answer(answers, OK)
 
@@ -63,39 +61,37 @@ def main() -> None:
             batch = np.frombuffer(_read(rows * observation_dim * 4), np.float32)
             a = session.run(None, {name: batch.reshape(rows, observation_dim)})[0]
             if getattr(a, "dtype", None) != np.float32 or a.shape != (rows, action_dim):
-                found = f"{getattr(a, 'dtype', type(a).__name__)} {list(np.shape(a)[:8])}"
-                answer = OUTPUT, found.encode()
+                output = f"{getattr(a, 'dtype', type(a).__name__)} {list(np.shape(a)[:8])}"
+                answer = OUTPUT, output.encode()
             else:
                 answer = OK, a.tobytes()
         except Exception as error:
-            answer = _told(error, FAILED)
+            answer = _error_answer(error, FAILED)
         _answer(answers, *answer)
 
 
 def _set_limits(memory: int, seconds: int) -> None:
+    import ctypes
+    import resource
+
     used = resource.getrusage(resource.RUSAGE_SELF)
     spent = int(used.ru_utime + used.ru_stime) + 1
-    # The soft limit ends the process by SIGXCPU, which tells the parent why.
+    # The soft limit ends the process with SIGXCPU, which tells the parent why.
     resource.setrlimit(resource.RLIMIT_CPU, (spent + seconds, spent + seconds + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    if sys.platform == "linux":
-        import ctypes
-
-        prctl = ctypes.CDLL(None).prctl
-        prctl(_PR_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
-        prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-        with open("/proc/self/statm") as statm:
-            taken = int(statm.read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (taken + memory, taken + memory))
-        resource.setrlimit(resource.RLIMIT_NPROC, (0, 0))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    prctl = ctypes.CDLL(None).prctl
+    prctl(_PR_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
+    prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    with open("/proc/self/statm") as statm:
+        mapped = int(statm.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + memory, mapped + memory))
+    for kind in ("CORE", "FSIZE", "NPROC", "NOFILE"):
+        resource.setrlimit(getattr(resource, f"RLIMIT_{kind}"), (0, 0))
 
 
-def _told(error: Exception, status: int) -> tuple[int, bytes]:
-    """The status and text of a failure."""
+def _error_answer(error: Exception, status: int) -> tuple[int, bytes]:
+    """The status and text of an error."""
     text = str(error)
-    # Runtime errors are all of one kind; which one ran out of memory only their texts say.
+    # ONNX Runtime's errors have one type; only the text says that memory ran out.
     if isinstance(error, MemoryError) or any(
         mark in text for mark in ("bad_alloc", "bad allocation", "allocate memory")
     ):
@@ -111,13 +107,13 @@ def _answer(stream: int, status: int, payload: bytes = b"") -> None:
 
 
 def _length() -> int | None:
-    """A frame's first number, or None at the end of the input."""
+    """The first number of a message, or None at the end of the input."""
     head = _read(4)
     return struct.unpack("<I", head)[0] if len(head) == 4 else None
 
 
 def _read(size: int) -> bytes:
-    """So many bytes, or fewer where the input ends."""
+    """`size` bytes, or fewer at the end of the input."""
     read = bytearray()
     while len(read) < size:
         part = os.read(0, min(size - len(read), 2**20))

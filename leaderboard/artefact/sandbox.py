@@ -1,11 +1,13 @@
-"""`Sandbox`: a model of a stranger as a function of observations, in a process of its own.
+"""`Sandbox`: an untrusted model as a function of observations, run in a confined process.
 
-    bytes → gate → child process: bwrap where it works, its own limits, onnxruntime → actions
+    bytes → gate → child process (bwrap if it works, resource limits, onnxruntime) → actions
 
-The child (`child.py`) gets no environment, no open file and no network where there is bwrap; it is
-given processor time, memory and wall time, and cannot open files or start processes. Whatever it
-does (die, hang, answer nonsense), this side raises a `Rejection` with a stable code, and holds no
-more than one batch. `B` batch, `S` state_dim, `A` action_dim.
+The child (`child.py`) gets no environment and no open file, and no network under bwrap. Its
+processor time, memory and wall time are limited, and it cannot open files or start processes.
+If it dies, hangs or sends garbage, the parent raises a `Rejection` with a stable code. The parent
+never holds more than one batch. Linux only: other systems lack the limits.
+
+`B` batch, `S` state_dim, `A` action_dim.
 """
 
 from __future__ import annotations
@@ -38,13 +40,13 @@ from sme_registry.errors import MissingDependencyError, StateError
 Observations = npt.NDArray[np.float32]
 Actions = npt.NDArray[np.float32]
 
-ROWS = 8192  # of one frame: what a network of the largest size needs for it fits in the memory
+ROWS = 8192  # of one message: the largest allowed network fits into the memory limit with it
 TOLERANCE = 1e-4
-"""By how much an action may depend on its batch, in the unit range.
+"""How much an action may depend on its batch, in the unit range.
 
-A matrix product adds up in another order where it has another number of rows. In float32 that
-moves a sum of some hundreds of terms by about 1e-6 of its size, and more where weights are large.
-An action off by 1e-4 moves no normalised regret by more than about 4e-4, which ranks nobody.
+A matrix product with another number of rows sums in another order. In float32 this changes a sum of
+some hundreds of terms by about 1e-6 of its size, and more if weights are large. An error of 1e-4 in
+an action changes a normalised regret by at most about 4e-4, which changes no rank.
 """
 
 _CODES = {
@@ -53,8 +55,8 @@ _CODES = {
     child.OUTPUT: ("run_output", "must be one float32 action a row", "Export it for this task"),
     child.MEMORY: ("run_memory", "must run within {memory:,} MiB", "Submit a smaller network"),
 }
-# Sent by an operator or by a system that is short of memory: no fault of the model.
-_FROM_OUTSIDE = {signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+# Sent by an operator or by a system that is short of memory, not caused by the model.
+_EXTERNAL_SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
 _SYSTEM_FOLDERS = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache")
 _ANSWER = struct.Struct("<BI")
 _ENDING_SECONDS = 2.0  # between closing its pipe and being gone
@@ -62,13 +64,13 @@ _ENDING_SECONDS = 2.0  # between closing its pipe and being gone
 
 @dataclass(frozen=True)
 class SandboxLimits:
-    """What one model may take.
+    """Limits of one model.
 
     Attributes:
-      memory_bytes: of address space, above what the libraries take.
-      cpu_seconds: of processor time, in all.
-      call_seconds: of wall time, for loading the model and for each batch.
-      start_seconds: of wall time, for starting the process; beyond it the machine is at fault.
+      memory_bytes: address space, in addition to that of the libraries.
+      cpu_seconds: total processor time.
+      call_seconds: wall time of loading the model, and of each batch.
+      start_seconds: wall time of starting the process; exceeding it is the machine's fault.
     """
 
     memory_bytes: int = 2 * 2**30
@@ -78,25 +80,26 @@ class SandboxLimits:
 
 
 class Sandbox:
-    """A model, loaded and ready to be asked; ends its process on leaving the `with` block.
+    """A loaded model, ready to call. Leaving the `with` block ends its process.
 
-    It is to be used by the thread that made it, whose end also ends the process.
+    Use it in the thread that created it: the process ends with that thread.
 
     Args:
-      data: the ONNX file's bytes.
+      data: the bytes of the ONNX file.
       observation_dim: S + 2.
       action_dim: A.
-      limits: what it may take.
+      limits: of time and memory.
 
     Raises:
-      Rejection: a code of `gate.inspect`, or `onnx_refused`, `run_failed`, `run_time`,
-        `run_memory` while it is loaded.
-      BoardError: the process cannot be started, or was ended from outside: the model is not judged.
+      Rejection: a code of `gate.inspect`, or `onnx_refused`, `run_failed`, `run_time` or
+        `run_memory` while the model loads.
+      BoardError: this system is not Linux, or the process cannot be started or was ended from
+        outside. The model is not judged.
       MissingDependencyError: onnxruntime is not installed.
 
     Attributes:
-      facts: what the file holds.
-      isolation: "bwrap", or "process" where bwrap is missing or does not work.
+      facts: contents of the file.
+      isolation: "bwrap", or "process" if bwrap is missing or does not work.
     """
 
     facts: ModelFacts
@@ -110,6 +113,7 @@ class Sandbox:
         limits: SandboxLimits = SandboxLimits(),
     ) -> None:
         self.facts = inspect(data, observation_dim, action_dim)
+        _require_linux()
         self._observation_dim, self._action_dim = observation_dim, action_dim
         self._limits = limits
         prefix = _bwrap()
@@ -134,10 +138,10 @@ class Sandbox:
           `[B, A]` float32.
 
         Raises:
-          Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`; the
-            sandbox is closed then.
-          BoardError: it is closed, or its process was ended from outside.
-          StateError: observations of another shape.
+          Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`; this
+            closes the sandbox.
+          BoardError: the sandbox is closed, or its process was ended from outside.
+          StateError: the observations have another shape.
         """
         observations = np.ascontiguousarray(observations, dtype="<f4")
         if observations.ndim != 2 or observations.shape[1] != self._observation_dim:
@@ -162,18 +166,18 @@ class Sandbox:
         return a
 
     def check_rows(self, observations: Observations, rows: int = 16) -> None:
-        """Refuse a model whose action in a state depends on what else is in the batch.
+        """Reject a model whose action in a state depends on the other rows of the batch.
 
-        Some rows are asked one at a time, and the whole batch in reverse; both must give what the
-        batch gave. Actions are compared as they are scored, clipped to [0, 1].
+        The batch in reverse, and some rows one at a time, must give the same actions as the batch.
+        Actions are compared as they are scored, clipped to [0, 1].
 
         Args:
-          observations: `[B, S + 2]` float32, B ≥ 1: a batch, best as it is scored.
-          rows: how many are asked one at a time, spread evenly.
+          observations: `[B, S + 2]` float32, B ≥ 1, preferably a batch that is scored.
+          rows: number of rows evaluated one at a time, spread evenly.
 
         Raises:
-          Rejection: `run_batch_dependent`, or as a call.
-          BoardError, StateError: as a call.
+          Rejection: `run_batch_dependent`, or the codes of a call.
+          BoardError, StateError: see a call.
         """
         batched = self(observations)
         reversed_ = self(observations[::-1])[::-1]
@@ -183,7 +187,7 @@ class Sandbox:
         self._refuse_difference("alone", observations[chosen], batched[chosen], single)
 
     def close(self) -> None:
-        """End the process and all that it started; does nothing a second time."""
+        """End the process and its descendants. Closing twice is allowed."""
         if self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -204,7 +208,7 @@ class Sandbox:
         self.close()
 
     def _refuse_difference(
-        self, asked: str, observations: Observations, batched: Actions, other: Actions
+        self, how: str, observations: Observations, batched: Actions, other: Actions
     ) -> None:
         difference = np.abs(np.clip(batched, 0.0, 1.0) - np.clip(other, 0.0, 1.0)).max(axis=1)
         row = int(difference.argmax())
@@ -212,15 +216,15 @@ class Sandbox:
             self.close()
             raise Rejection(
                 "run_batch_dependent",
-                f"action={batched[row].tolist()} in a batch, {other[row].tolist()} {asked}, on "
+                f"action={batched[row].tolist()} in a batch, {other[row].tolist()} {how}, on "
                 f"observation {observations[row].tolist()}: must be the same within {TOLERANCE:g}. "
                 "Let no operator work across rows.",
             )
 
     def _ask(self, seconds: float, *frame: bytes, size: int = 0) -> bytearray:
-        """Send a frame's parts; the payload of the answer, which must have this size."""
+        """Send the parts of a message; return the answer's payload of this size."""
         if self._process.returncode is not None:
-            raise BoardError("this sandbox is closed. Make another.")
+            raise BoardError("The sandbox is closed. Open another one.")
         deadline = time.monotonic() + seconds
         for part in frame:
             self._send(memoryview(part), deadline)
@@ -229,7 +233,7 @@ class Sandbox:
             return self._receive(size, deadline)
         if status not in _CODES or length > child.MAX_TEXT:
             raise Rejection(
-                "run_failed", f"answer={status}, {length} bytes: is none. Submit another model."
+                "run_failed", f"answer={status}, {length} bytes: invalid. Submit another model."
             )
         code, allowed, remedy = _CODES[status]
         text = _one_line(self._receive(length, deadline))
@@ -243,10 +247,10 @@ class Sandbox:
             self._await(stream.fileno(), select.POLLOUT, deadline)
             try:
                 left = left[os.write(stream.fileno(), left) :]
-            except BlockingIOError:  # room for less than the system writes at once
+            except BlockingIOError:  # less room than the smallest write
                 continue
             except BrokenPipeError:
-                # It may have said why before it ended; an answer is read before its end is seen.
+                # The process may have answered before it ended; `_receive` reads that first.
                 return
 
     def _receive(self, size: int, deadline: float) -> bytearray:
@@ -262,24 +266,24 @@ class Sandbox:
         return read
 
     def _await(self, stream: int, event: int, deadline: float) -> None:
-        """Wait until a pipe is ready, or its other end is closed."""
+        """Wait until a pipe is ready or its other end is closed."""
         poll = select.poll()
         poll.register(stream, event)
         if poll.poll(max(deadline - time.monotonic(), 0.0) * 1000.0):
             return
         if self._starting:
             raise BoardError(
-                f"the sandbox did not start within {self._limits.start_seconds:g} s. Try again "
-                "when the machine has less to do."
+                f"The sandbox did not start within {self._limits.start_seconds:g} s. Try again "
+                "when the machine is less busy."
             )
         raise Rejection(
             "run_time",
-            f"artefact: no answer within {self._limits.call_seconds:g} s: must load, and answer "
-            "each batch, sooner. Submit a smaller network.",
+            f"artefact: no answer within {self._limits.call_seconds:g} s, the limit for loading "
+            "and for each batch. Submit a smaller network.",
         )
 
     def _ended(self) -> NoReturn:
-        """Say why the process ended by itself."""
+        """Raise the reason why the process ended."""
         try:
             status = self._process.wait(timeout=_ENDING_SECONDS)
         except subprocess.TimeoutExpired:
@@ -288,18 +292,18 @@ class Sandbox:
         if number == signal.SIGXCPU:
             raise Rejection(
                 "run_time",
-                f"artefact: more than {self._limits.cpu_seconds} s of processor time: must take "
-                "less over all its batches. Submit a smaller network.",
+                f"artefact: more than {self._limits.cpu_seconds} s of processor time, the limit for "
+                "all batches. Submit a smaller network.",
             )
-        if self._starting or number in _FROM_OUTSIDE:
+        if self._starting or number in {getattr(signal, name) for name in _EXTERNAL_SIGNALS}:
             raise BoardError(
-                f"the sandbox's process ended with status {status} through no fault of the model. "
+                f"The sandbox's process ended with status {status}, not caused by the model. "
                 "Check that onnxruntime can be imported and that memory is free, and try again."
             )
         raise Rejection(
             "run_failed",
-            f"artefact: its process ended with status {status}: must run without a crash. "
-            "Run it at home with `sme-leaderboard check`.",
+            f"artefact: the model crashed its process, which ended with status {status}. Run it on "
+            "your machine with `sme-leaderboard check`.",
         )
 
     @contextlib.contextmanager
@@ -309,6 +313,14 @@ class Sandbox:
         except BaseException:
             self.close()
             raise
+
+
+def _require_linux() -> None:
+    if sys.platform != "linux":
+        raise BoardError(
+            f"sys.platform={sys.platform!r}: policies run in a sandbox, which needs Linux. Score "
+            "on a Linux machine or in a Linux container."
+        )
 
 
 def _start(
@@ -323,23 +335,23 @@ def _start(
         bufsize=0,
         cwd="/",
         env=_environment(),
-        start_new_session=True,  # a group of its own: Ctrl-C is for the parent alone
+        start_new_session=True,  # a separate process group, which Ctrl-C does not reach
     )
 
 
 def _script() -> list[str]:
-    """The command of the child: no user's settings, no site's hooks."""
+    """The command of the child, without user settings or site hooks."""
     return [sys.executable, "-I", "-S", "-B", str(Path(child.__file__).resolve())]
 
 
 def _environment() -> dict[str, str]:
-    """All that the child learns of its surroundings."""
+    """The environment variables of the child."""
     kept = {name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ}
     return {
         "LANG": "C.UTF-8",
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
-        # Without it onnxruntime keeps a database in the home and reports what it runs.
+        # Without it onnxruntime keeps a database in the home folder and sends usage data.
         "ORT_DISABLE_TELEMETRY": "1",
         **kept,
     }
@@ -347,30 +359,30 @@ def _environment() -> dict[str, str]:
 
 @functools.cache
 def _library_folders() -> tuple[str, ...]:
-    """The folders that hold NumPy and onnxruntime."""
+    """The folders of NumPy and onnxruntime."""
     folders = []
     for library in ("numpy", "onnxruntime"):
-        found = importlib.util.find_spec(library)
-        if found is None or not found.submodule_search_locations:
+        package = importlib.util.find_spec(library)
+        if package is None or not package.submodule_search_locations:
             raise MissingDependencyError(
-                f"{library}: not installed, and needed to run a policy's ONNX file. "
+                f"Running a policy's ONNX file needs {library}, which is not installed. "
                 "Run `pip install 'sme-registry[leaderboard]'`."
             )
-        folders.append(os.path.dirname(next(iter(found.submodule_search_locations))))
+        folders.append(os.path.dirname(next(iter(package.submodule_search_locations))))
     return tuple(dict.fromkeys(folders))
 
 
 @functools.cache
 def _bwrap() -> tuple[str, ...]:
-    """The command that a child is started through; empty where there is no bwrap that works.
+    """The bwrap command that starts a child; empty if bwrap is missing or does not work.
 
-    Containers often forbid what it needs, so that it is tried once, with a child without a model.
+    Containers often forbid what bwrap needs, so it is tried once, with a child without a model.
     """
     program = shutil.which("bwrap")
     if program is None:
         return ()
     interpreter = Path(sys.executable)
-    seen = [
+    readable = [
         *(folder for folder in _SYSTEM_FOLDERS if os.path.exists(folder)),
         *(sys.base_prefix, sys.prefix, str(interpreter.parent), str(interpreter.resolve().parent)),
         *_library_folders(),
@@ -378,7 +390,7 @@ def _bwrap() -> tuple[str, ...]:
     ]
     command = (
         *(program, "--unshare-all", "--die-with-parent", "--cap-drop", "ALL"),
-        *(word for path in dict.fromkeys(seen) for word in ("--ro-bind", path, path)),
+        *(word for path in dict.fromkeys(readable) for word in ("--ro-bind", path, path)),
         *("--proc", "/proc", "--dev", "/dev", "--chdir", "/", "--"),
     )
     limits = SandboxLimits()
@@ -392,6 +404,6 @@ def _bwrap() -> tuple[str, ...]:
 
 
 def _one_line(text: bytes | bytearray) -> str:
-    """A stranger's text as messages show it."""
+    """Untrusted text as messages show it: one line, printable."""
     words = text.decode("utf-8", "replace").split()
     return "".join(letter if letter.isprintable() else "�" for letter in " ".join(words))
