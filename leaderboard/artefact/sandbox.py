@@ -292,8 +292,8 @@ class Sandbox:
         if number == signal.SIGXCPU:
             raise Rejection(
                 "run_time",
-                f"artefact: more than {self._limits.cpu_seconds} s of processor time, the limit for "
-                "all batches. Submit a smaller network.",
+                f"artefact: more than {self._limits.cpu_seconds} s of processor time, the limit "
+                "for all batches. Submit a smaller network.",
             )
         if self._starting or number in {getattr(signal, name) for name in _EXTERNAL_SIGNALS}:
             raise BoardError(
