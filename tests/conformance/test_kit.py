@@ -138,7 +138,7 @@ class CopiesLate(SMEVectorEnv):
         (testing.check_definition, Swallows, "the reward"),
         (testing.check_definition, Drifts, "the next state"),
         (testing.check_optimum, Swallows, "the optimum's return"),
-        (testing.check_info, Reuses, "used again by a later step"),
+        (testing.check_info, Reuses, "later step reuses an array"),
         (testing.check_info, Leaks, "keys"),
         (testing.check_determinism, Unseeded, "two runs of one seed"),
         (testing.check_pickling, Forgets, "pickled copy of the single"),
@@ -172,8 +172,8 @@ def test_an_env_spec_that_names_another_task_is_seen(monkeypatch: pytest.MonkeyP
     def other(spec: SMESpec, **kwargs: Any) -> Any:
         return original(spec.derive(seed=99), **kwargs)
 
-    original = testing.env_spec
-    monkeypatch.setattr(testing, "env_spec", other)
+    original = testing.single.env_spec
+    monkeypatch.setattr(testing.single, "env_spec", other)
     with pytest.raises(ConformanceError, match="the digest after EnvSpec"):
         testing.check_env_spec(TASK)
 

@@ -123,9 +123,9 @@ class RewardsInTurn(SMETeamEnv):
         (testing.check_team_definition, EndsOneByOne, "agent_1: truncated"),
         (testing.check_team_optimum, NeedsToSeeMore, "agent_0: the optimum's regret"),
         (testing.check_team_pickling, Forgets, "a pickled copy"),
-        (testing.check_team_pickling, Shares, "once a copy is stepped"),
+        (testing.check_team_pickling, Shares, "after stepping a copy"),
         (testing.check_pettingzoo, NewSpaces, "PettingZoo's .*api_test"),
-        (testing.check_turns, RewardsInTurn, "in turns"),
+        (testing.check_turns, RewardsInTurn, "AEC"),
     ],
 )
 def test_a_faulty_team_is_seen(check: Any, faulty: type[SMETeamEnv], words: str) -> None:

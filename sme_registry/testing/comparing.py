@@ -1,0 +1,68 @@
+"""Comparisons that raise `ConformanceError` with the expected and the actual value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+TOLERANCE = 1e-12  # of optimal actions and rewards between back-ends; states are equal bit for bit
+
+
+class ConformanceError(AssertionError):
+    """An environment violates a guarantee of SME environments."""
+
+
+def expect_equal(what: str, got: Any, expected: Any) -> None:
+    """Check that two values are equal, arrays in every entry."""
+    same = np.array_equal(got, expected) if isinstance(got, np.ndarray) else got == expected
+    if not same:
+        raise ConformanceError(f"{what}: expected {expected!r:.200}, got {got!r:.200}.")
+
+
+def expect_near(what: str, got: Any, expected: Any, tolerance: float = TOLERANCE) -> None:
+    """Check that numbers differ by at most a tolerance."""
+    difference = float(np.max(np.abs(np.asarray(got) - np.asarray(expected))))
+    if not difference <= tolerance:
+        raise ConformanceError(
+            f"{what}: expected {expected!r:.200} to {tolerance:.0e}, got {got!r:.200}."
+        )
+
+
+def expect_same(what: str, got: Any, expected: Any) -> None:
+    """Check equality in every bit, type and key; ignores masked entries of a batched info."""
+    if isinstance(got, dict) and isinstance(expected, dict):
+        for key in got.keys() | expected.keys():
+            if not key.startswith("_"):
+                _expect_same_entries(f"{what}: {key}", key, got, expected)
+    elif isinstance(got, list | tuple) and isinstance(expected, list | tuple):
+        expect_equal(f"{what}: the number of values", len(got), len(expected))
+        for ours, theirs in zip(got, expected, strict=True):
+            expect_same(what, ours, theirs)
+    elif isinstance(got, np.ndarray) and got.dtype != object:
+        expect_equal(f"{what}: dtype", got.dtype, np.asarray(expected).dtype)
+        expect_equal(what, got, expected)
+    elif isinstance(got, np.ndarray):
+        expect_same(what, list(got), list(expected))
+    else:
+        expect_equal(what, got, expected)
+
+
+def _expect_same_entries(
+    what: str, key: str, got: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    """Compare one key of two infos, single or batched."""
+    mask, other = got.get(f"_{key}"), expected.get(f"_{key}")
+    if mask is None and other is None:
+        expect_same(what, got.get(key), expected.get(key))
+        return
+    # An absent key equals one whose mask is False in every lane.
+    lanes = len(mask if mask is not None else other)  # type: ignore[arg-type]
+    masks = [np.zeros(lanes, bool) if m is None else np.asarray(m) for m in (mask, other)]
+    expect_equal(f"{what}: mask", masks[0], masks[1])
+    if not masks[0].any():
+        return
+    if isinstance(got[key], dict):
+        expect_same(what, got[key], expected[key])
+    else:
+        expect_same(what, got[key][masks[0]], expected[key][masks[0]])
