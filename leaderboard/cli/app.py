@@ -1,6 +1,7 @@
-"""The application: its commands, and what becomes of errors.
+"""The application: its commands, and the exit codes of its errors.
 
-Exit codes: 0 done; 1 rejected, by a stable code; 2 bad usage; 3 tampered; 130 interrupted.
+Exit codes: 0 success, 1 rejected with a stable code, 2 invalid usage, 3 tampering detected, 130
+interrupted.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated
 
-from leaderboard.cli import demo, keeping, reading, submitting
+from leaderboard.cli import administration, demo, results, submissions
 from leaderboard.errors import Rejection, TamperedError
 from sme_registry.terminal import CommandGroup, application, version_option
 
@@ -27,9 +28,9 @@ app = application(_Commands)
 def _top(
     version: Annotated[bool, version_option(_Commands.program)] = False,
 ) -> None:
-    """A leaderboard of policies: every number is recomputed from the policy that was submitted.
+    """A leaderboard that recomputes every score from the submitted policy.
 
-    A board is a folder. Yours, here:
+    A board is a folder. Create one, score it and rank its entries:
 
       sme-leaderboard init board --suite smoke
 
@@ -37,40 +38,40 @@ def _top(
 
       sme-leaderboard rank board
 
-    A submission:  **keygen**  ·  **new**  ·  **check**  ·  **submit**
+    To submit a method, use keygen, new, check and submit, in this order.
 
-    Exit codes: 0 done, 1 rejected, 2 bad usage, 3 tampered with.
+    Exit codes: 0 success, 1 rejected, 2 invalid usage, 3 tampering detected.
     """
 
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "Submitting": {
-        "keygen": submitting.keygen,
-        "export-sb3": submitting.export_sb3,
-        "new": submitting.new,
-        "check": submitting.check,
-        "submit": submitting.submit,
-        "withdraw": submitting.withdraw,
+    "Submissions": {
+        "keygen": submissions.keygen,
+        "export-sb3": submissions.export_sb3,
+        "new": submissions.new,
+        "check": submissions.check,
+        "submit": submissions.submit,
+        "withdraw": submissions.withdraw,
     },
-    "Reading a board": {
-        "rank": reading.rank,
-        "show": reading.show,
-        "verify": reading.verify,
+    "Results": {
+        "rank": results.rank,
+        "show": results.show,
+        "verify": results.verify,
     },
-    "Keeping a board": {
-        "init": keeping.init,
-        "score": keeping.score,
-        "site": keeping.site,
-        "serve": keeping.serve,
-        "reindex": keeping.reindex,
-        "gc": keeping.gc,
+    "Administration": {
+        "init": administration.init,
+        "score": administration.score,
+        "site": administration.site,
+        "serve": administration.serve,
+        "reindex": administration.reindex,
+        "gc": administration.gc,
         "demo": demo.demo,
     },
 }
 for _panel, _commands in _COMMANDS.items():
     for _name, _command in _commands.items():
         app.command(_name, rich_help_panel=_panel)(_command)
-app.command("export", hidden=True)(submitting.export_sb3)  # its name before `new` made bundles
+app.command("export", hidden=True)(submissions.export_sb3)
 
 
 def main() -> None:

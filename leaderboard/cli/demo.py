@@ -1,4 +1,4 @@
-"""`sme-leaderboard demo`: one trained run through the whole pipeline, on a board of its task."""
+"""`sme-leaderboard demo`: one trained run through the whole pipeline, on a board for its task."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard.cli import keeping, reading
+from leaderboard.cli import administration, results
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
@@ -18,21 +18,21 @@ from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, Suite, SuiteFile
 from sme_registry.terminal import err, out
 
-_FOLDERS = ("bundle", "site", "board")  # removed in this order: all are known by the board
+_FOLDERS = ("bundle", "site", "board")  # removed in this order: the board identifies the others
 _TITLE, _SUITE = "Demonstration", "demo"
 
 
 def demo(
     run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A folder that `sme train` or `sme demo` wrote.")
+        Path, typer.Argument(metavar="RUN", help="A run folder of `sme train` or `sme demo`.")
     ] = Path("runs/demo"),
     out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help="By default RUN/leaderboard.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; RUN/leaderboard by default.")
     ] = None,
 ) -> None:
-    """Submit a trained run to a board of its own task, score it, and write the board's page.
+    """Submit a trained run to a board for its task, score it and write the board's pages.
 
-    An earlier demonstration in the same folder is replaced; anything else there is refused.
+    An earlier demonstration in the same folder is replaced; other files there are never touched.
 
     Examples:
 
@@ -47,11 +47,11 @@ def demo(
 
     record = RunRecord.read(run)
     if record is None or record.status != "finished":
-        raise OptionError(f"run={str(run)!r}: holds no finished run. `sme demo` makes one.")
+        raise OptionError(f"run={str(run)!r}: holds no finished run. Create one with `sme demo`.")
     folder = run / "leaderboard" if out_folder is None else out_folder
-    _refuse_others(folder)
+    _refuse_other_files(folder)
     for name in _FOLDERS:
-        shutil.rmtree(folder / name, ignore_errors=True)  # what resists is named by who writes next
+        shutil.rmtree(folder / name, ignore_errors=True)  # the next write reports what remains
 
     setting = record.spec.to_dict()
     seed = setting.pop("seed")
@@ -59,7 +59,7 @@ def demo(
     file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
     protocol: EvaluationProtocol = record.protocol
 
-    err().print("A board of this task alone, with the two reference rows; the agent is submitted.")
+    err().print("Creating a board with this task and two reference rows, and submitting the agent.")
     with Store.create(
         folder / "board",
         title=_TITLE,
@@ -81,42 +81,42 @@ def demo(
             submitter="Demonstration",
         )
         intake.submit_bundle(store, folder / "bundle")
-    keeping.score(folder / "board")
-    reading.rank(folder / "board")
+    administration.score(folder / "board")
+    results.rank(folder / "board")
     out().print(
-        "One run is listed and not ranked: a rank needs ten in each class of a suite.\n"
-        f"The board, to be opened in a browser ({escape(str(folder))}):"
+        "The run is listed without a rank, which needs ten runs in each class.\n"
+        f"Open the board in a browser ({escape(str(folder))}):"
     )
-    keeping.site(folder / "board", folder / "site")
+    administration.site(folder / "board", folder / "site")
 
 
-def _refuse_others(folder: Path) -> None:
-    """Refuse a folder where something stands that no demonstration has made.
+def _refuse_other_files(folder: Path) -> None:
+    """Refuse a folder with files that no demonstration created.
 
     Raises:
-      OptionError: with what it is.
+      OptionError: names them.
     """
-    there = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
-    if there and not _is_demonstration(folder / "board"):
+    existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
+    if existing and not _is_demonstration(folder / "board"):
         raise OptionError(
-            f"out={str(folder)!r}: {', '.join(map(str, there))}: there already, and not made by a "
-            "demonstration. Nothing was removed: give another --out, or move them elsewhere."
+            f"out={str(folder)!r}: {', '.join(map(str, existing))}: already exists and is not "
+            "from a demonstration. Nothing was removed: use another --out, or move the files."
         )
 
 
 def _is_demonstration(path: Path) -> bool:
-    """Whether a demonstration made this board; a link may lead to one that is meant to stay."""
+    """Whether a demonstration created this board; a link may lead to a board worth keeping."""
     try:
         document = Folder(path).read()
     except BoardError:
         return False
-    made = (_TITLE, f"{_SUITE}-v1", [_SUITE])
+    expected = (_TITLE, f"{_SUITE}-v1", [_SUITE])
     classes = [member.name for member in document.suite.classes]
-    return not path.is_symlink() and (document.title, document.suite_name, classes) == made
+    return not path.is_symlink() and (document.title, document.suite_name, classes) == expected
 
 
 def _name_of(protocol: EvaluationProtocol) -> str:
-    """The protocol's name in the catalogue; a word where it has none."""
+    """The protocol's name in the catalogue, or "custom"."""
     from sme_registry.spec import ProtocolFile, catalogue
 
     known = {file.digest: file.versioned_name for file in catalogue.entries(ProtocolFile)}

@@ -1,4 +1,4 @@
-"""Arguments that several commands take."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -8,48 +8,36 @@ from typing import Annotated
 
 import typer
 
-from sme_registry.spec import Suite, SuiteFile, catalogue
+from sme_registry.spec import SuiteFile, catalogue
 
 BoardFolder = Annotated[
     Path, typer.Argument(metavar="BOARD", help="The board's folder.", show_default=True)
 ]
-SuiteName = Annotated[str, typer.Option(help="A suite's name (`sme list`), or its file's path.")]
-ProtocolName = Annotated[
-    str, typer.Option(help="A protocol's name (`sme list`), or its file's path.")
+BoardOrUrl = Annotated[
+    str, typer.Argument(metavar="BOARD", help="A board's folder, or the URL of a served board.")
 ]
+BundleFolder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="The submission's folder.")]
+SuiteName = Annotated[str, typer.Option(help="A suite's name (see `sme list`) or file.")]
+ProtocolName = Annotated[str, typer.Option(help="A protocol's name (see `sme list`) or file.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 KEY_VARIABLE = "SME_LEADERBOARD_KEY"
+DEFAULT_KEY = Path(typer.get_app_dir("sme-leaderboard")) / "ed25519.key"
 KeyFile = Annotated[
     Path,
-    typer.Option(
-        "--key",
-        envvar=KEY_VARIABLE,
-        help="Your signing key; `keygen` makes one.",
-    ),
+    typer.Option("--key", envvar=KEY_VARIABLE, help="Your signing key, as `keygen` creates it."),
 ]
 
 
-def default_key() -> Path:
-    """Where a submitter's key lies, if nothing else is said."""
-    return Path(typer.get_app_dir("sme-leaderboard")) / "ed25519.key"
-
-
-def find_suite(name: str) -> tuple[str, Suite]:
-    """A suite's versioned name and the suite, by name or path.
+def find_suite(name: str) -> SuiteFile:
+    """A suite by its name in the catalogue or its file's path.
 
     Raises:
-      UnknownNameError, SpecError: there is none, or the file is not one.
+      UnknownNameError, SpecError: there is no such suite, or the file is invalid.
     """
-    is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
-    file = SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
-    return file.versioned_name, file.suite
-
-
-def find_suite_file(name: str) -> SuiteFile:
-    """As `find_suite`, with its envelope."""
     is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
     return SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
 
 
 def is_url(board: str) -> bool:
-    """Whether a board is one that is served."""
+    """Whether a board is given by its URL."""
     return board.startswith(("http://", "https://"))

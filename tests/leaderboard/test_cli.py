@@ -96,7 +96,7 @@ def test_from_a_key_to_a_page() -> None:
     assert good("submit", "bundle", "board").strip() == id
     assert good("submit", "bundle", "board").strip() == id  # twice is once
     assert good("score", "board").strip() == "3 scored."
-    assert good("score", "board").strip() == "Nothing waits to be scored."
+    assert good("score", "board").strip() == "No submission is waiting."
 
     ranking = json.loads(good("rank", "board", "--json"))
     text = json.dumps(ranking)
@@ -112,7 +112,7 @@ def test_from_a_key_to_a_page() -> None:
     assert shown["result"]["scores"]["wd_regret"]["value"] == pytest.approx((alone + 1.0) / 2)
     assert "A Lab" in good("show", "board", id.removeprefix("sha256:")[:8])
 
-    assert "Whole" in good("verify", "board", "--rescore", "1")
+    assert "Verified" in good("verify", "board", "--rescore", "1")
     page = Path(good("site", "board", "--out", "public").strip())
     assert page == Path("public/index.html").resolve()
     assert "Linear" in page.read_text()
@@ -233,8 +233,8 @@ def test_the_digest_that_verify_prints_is_found_in_the_log_later() -> None:
     kept = json.loads(good("verify", "board", "--json"))["log_digest"]
     assert kept in good("verify", "board")
     good("score", "board")
-    assert "Whole" in good("verify", "board", "--contains", kept)
-    assert "cut or written anew" in " ".join(
+    assert "Verified" in good("verify", "board", "--contains", kept)
+    assert "cut or rewritten" in " ".join(
         fails(3, "verify", "board", "--contains", "sha256:" + "0" * 64).split()
     )
     assert "contains=" in fails(2, "verify", "board", "--contains", "3f2a")
@@ -256,7 +256,7 @@ def test_a_board_without_its_key_takes_nothing_in_and_says_so() -> None:
     Path("board/board.key").unlink()
     before = sorted(Path("board/objects").rglob("*"))
     said = fails(2, "submit", "bundle", "board")
-    assert "this board's key is not here" in " ".join(said.split())
+    assert "without the board's key" in " ".join(said.split())
     assert "keygen" not in said
     assert sorted(Path("board/objects").rglob("*")) == before
 
@@ -272,7 +272,7 @@ def test_the_index_comes_back_from_the_files(monkeypatch: pytest.MonkeyPatch) ->
     before = good("rank", "board", "--csv")
     for path in Path("board").glob("index.sqlite*"):
         path.unlink()
-    assert "3 entries" in good("reindex", "board")
+    assert "Indexed 3 entries" in good("reindex", "board")
     assert good("rank", "board", "--csv") == before
     with sqlite3.connect("board/index.sqlite") as index:
         assert index.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -293,7 +293,7 @@ def test_gc_removes_what_no_submission_names_and_only_says_so_before() -> None:
     with Store.open("board") as store:
         assert not store.objects.has(digest)
     good("score", "board")
-    assert "Whole" in good("verify", "board")
+    assert "Verified" in good("verify", "board")
 
 
 @pytest.fixture
@@ -331,6 +331,6 @@ def test_a_demonstration_replaces_an_earlier_one_and_nothing_else(trained: Path)
     ):
         before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
         said = fails(2, "demo", trained, "--out", folder)
-        assert f"{Path(folder) / name}: there already" in " ".join(said.split())
+        assert f"{Path(folder) / name}: already exists" in " ".join(said.split())
         assert "Nothing was removed" in said
         assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before

@@ -1,14 +1,16 @@
-"""`sme-leaderboard init · score · site · serve · reindex · gc`."""
+"""`sme-leaderboard init · score · site · serve · reindex · gc`: run a board."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, ProtocolName, SuiteName, find_suite
+from leaderboard.cli.options import BoardFolder, Json, ProtocolName, SuiteName, find_suite
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json
 
@@ -18,16 +20,16 @@ def init(
     suite: SuiteName = "smoke-v1",
     protocol: ProtocolName = "paper-v1",
     title: Annotated[
-        str | None, typer.Option(help="The page's header; by default it names the suite.")
+        str | None, typer.Option(help="Title of the pages; names the suite by default.")
     ] = None,
     runs_to_rank: Annotated[
-        int, typer.Option(help="Fewest runs in each class for an entry to be ranked.")
+        int, typer.Option(help="Runs that an entry needs in each class to be ranked.")
     ] = 10,
 ) -> None:
-    """Make a board, with its key and the two reference rows waiting to be scored.
+    """Create a board with its key and two reference rows, which wait to be scored.
 
-    The rows are the optimal policy and the constant ½, through the pipeline that every submission
-    takes. Where they leave 0 and 1, the board shows nothing.
+    The reference rows are the optimal policy and the constant ½. They pass through the same
+    pipeline as every submission; if they score other than 0 and 1, the board shows no scores.
 
     Examples:
 
@@ -39,30 +41,33 @@ def init(
     from leaderboard.store import Store
     from sme_registry.evaluation import resolve_protocol
 
-    name, document = find_suite(suite)
+    file = find_suite(suite)
+    name, protocol_name = file.versioned_name, Path(protocol).stem
     with Store.create(
         board,
         title=title or f"SME leaderboard: {name}",
         suite_name=name,
-        suite=document,
-        protocol_name=Path(protocol).stem,
+        suite=file.suite,
+        protocol_name=protocol_name,
         protocol=resolve_protocol(protocol),
         runs_to_rank=runs_to_rank,
     ) as store:
         ids = intake.submit_references(store)
-    out().print(f"Board {escape(str(board))}: {name}, {Path(protocol).stem}.")
-    out().print(f"{len(ids)} reference rows wait: sme-leaderboard score {escape(str(board))}")
+    folder = escape(str(board))
+    out().print(f"Created {folder} with suite {name} and protocol {protocol_name}.")
+    out().print(f"Next, score its {len(ids)} reference rows: sme-leaderboard score {folder}")
 
 
 def score(
     board: BoardFolder = Path("board"),
     workers: Annotated[
-        int, typer.Option("--workers", "-w", min=1, max=256, help="Processes at once.")
+        int, typer.Option("--workers", "-w", min=1, max=256, help="Number of processes.")
     ] = 1,
 ) -> None:
-    """Score what waits. May run several times at once, and may be killed at any point.
+    """Score all waiting submissions.
 
-    Each policy runs in a process of its own, without your files and with limits on time and memory.
+    Several of these commands may run at once, and each may be killed at any point. Every policy
+    runs in its own sandboxed process, without your files and with limits on time and memory.
 
     Examples:
 
@@ -76,24 +81,27 @@ def score(
     before = {entry.id for entry in entries if entry.status != "waiting"}
     waiting = len(entries) - len(before)
     if not waiting:
-        out().print("Nothing waits to be scored.")
+        out().print("No submission is waiting.")
         return
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
         run_scorers(board, workers, progress=progress.update_of)
     with Store.open(board, read_only=True) as store:
-        now = [entry.status for entry in store.entries() if entry.id not in before]
-    counts = {name: now.count(name) for name in ("scored", "rejected", "waiting", "withdrawn")}
-    said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    out().print(f"{said}." + (f" Done before: {len(before)}." if before else ""))
+        counts = Counter(entry.status for entry in store.entries() if entry.id not in before)
+    parts = [
+        f"{counts[status]} {status}"
+        for status in ("scored", "rejected", "waiting", "withdrawn")
+        if counts[status]
+    ]
+    out().print(f"{', '.join(parts)}." + (f" Done before: {len(before)}." if before else ""))
 
 
 def site(
     board: BoardFolder = Path("board"),
     out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help="By default BOARD/site.")
+        Path | None, typer.Option("--out", "-o", help="Folder of the pages; BOARD/site by default.")
     ] = None,
 ) -> None:
-    """Write the board as pages that need no server: open index.html, or put them on any host.
+    """Write the board as static pages: open index.html, or copy them to any web host.
 
     Examples:
 
@@ -112,17 +120,15 @@ def site(
 
 def serve(
     board: BoardFolder = Path("board"),
-    host: Annotated[str, typer.Option(help="Where to listen; this machine alone by default.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8000,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 for any free port.")] = 8000,
     workers: Annotated[
-        int, typer.Option("--workers", "-w", min=0, max=256, help="Scorers beside the server.")
+        int, typer.Option("--workers", "-w", min=0, max=256, help="Number of scorer processes.")
     ] = 1,
 ) -> None:
-    """Serve the board: the same pages, and an API that takes submissions.
+    """Serve the board: its pages, and an API that accepts submissions.
 
-    Put a server that speaks HTTPS before it where others are to reach it.
+    By default only this machine can reach it. Put an HTTPS proxy in front of it for others.
 
     Examples:
 
@@ -136,7 +142,7 @@ def serve(
 
 
 def reindex(board: BoardFolder = Path("board")) -> None:
-    """Make the index anew from the board's files, which are all that counts.
+    """Rebuild the index from the board's log and documents.
 
     Examples:
 
@@ -145,18 +151,18 @@ def reindex(board: BoardFolder = Path("board")) -> None:
     from leaderboard.store import Store
 
     with Store.open(board, reindex=True) as store:
-        out().print(f"{len(store.entries()):,} entries indexed.")
+        out().print(f"Indexed {len(store.entries()):,} entries.")
 
 
 def gc(
     board: BoardFolder = Path("board"),
     older_than_hours: Annotated[
-        float, typer.Option(min=0.0, help="Younger ones may belong to an upload under way.")
+        float, typer.Option(min=0.0, help="Keep younger artefacts: their submission may follow.")
     ] = 24.0,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="The counts as JSON.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count the files.")] = False,
+    json: Json = False,
 ) -> None:
-    """Remove artefacts that no submission names, and what killed processes left half-written.
+    """Remove artefacts without a submission and half-written files of killed processes.
 
     Examples:
 
@@ -164,14 +170,14 @@ def gc(
     """
     from leaderboard.store import Store, collect_garbage
 
-    if older_than_hours != older_than_hours:
+    if math.isnan(older_than_hours):
         raise BoardError("older_than_hours=nan: must be a number of hours, at least 0.")
     with Store.open(board) as store:
-        report = collect_garbage(
+        garbage = collect_garbage(
             store, objects_older_than=older_than_hours * 3600.0, dry_run=dry_run
         )
     if json:
-        print_json({"files": report.files, "bytes": report.bytes, "dry_run": dry_run})
+        print_json({"files": garbage.files, "bytes": garbage.bytes, "dry_run": dry_run})
         return
-    verb = "would be removed" if dry_run else "removed"
-    out().print(f"{report.files:,} files, {report.bytes / 2**20:,.1f} MiB {verb}.")
+    verb = "Would remove" if dry_run else "Removed"
+    out().print(f"{verb} {garbage.files:,} files, {garbage.bytes / 2**20:,.1f} MiB.")

@@ -1,0 +1,268 @@
+"""`sme-leaderboard rank · show · verify`: read a board."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from leaderboard.cli.options import BoardFolder, Json
+from leaderboard.errors import BoardError
+from sme_registry.errors import OptionError
+from sme_registry.terminal import Progress, err, fixed, out, print_json, print_pairs
+
+if TYPE_CHECKING:
+    from leaderboard.documents.result import Estimate, Result
+    from leaderboard.public_view import PublicView
+    from leaderboard.scoring.ranking import RankedRow
+    from leaderboard.store import EntryRow, Store
+
+Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
+SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
+LABELS = {
+    "wd_regret": "WD regret N₀",
+    "ood_regret": "OOD regret N̄",
+    "ood_decay": "OOD decay N̄ − N₀",
+    "regret_slope": "regret slope on ε",
+    "similarity_loss": "similarity loss, points",
+}
+_SHORTEST_ID = 4
+
+
+def rank(
+    board: BoardFolder = Path("board"),
+    metric: Annotated[
+        Metric,
+        typer.Option(
+            help="wd_regret: inside the training cube. ood_regret: outside it. ood_decay: their "
+            "difference."
+        ),
+    ] = "wd_regret",
+    json: Json = False,
+    csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    latex: Annotated[bool, typer.Option("--latex", help="Print a LaTeX table.")] = False,
+) -> None:
+    """Rank the entries by a metric, with the ranks that each entry's interval allows.
+
+    All metrics are normalised regret: 0 is the optimal policy and 1 the constant ½. Only entries
+    whose whole interval of WD regret is below 0.5 are ranked by decay, because a policy that has
+    learned nothing inside the cube has nothing to lose outside it.
+
+    Examples:
+
+      sme-leaderboard rank board --metric ood_regret
+
+      sme-leaderboard rank board --csv > ranking.csv
+    """
+    from leaderboard import exports
+    from leaderboard.scoring import ranking
+    from leaderboard.store import Store
+
+    if json + csv + latex > 1:
+        raise OptionError("--json, --csv, --latex: give at most one of them.")
+    with Store.open(board, read_only=True) as store:
+        entries = store.entries()
+        ranking.refuse_unpublishable(entries)
+        rows = ranking.ranking(entries, metric)
+        document, head = store.document, store.head[:2]
+    for wanted, export in (
+        (json, exports.to_json),
+        (csv, exports.to_csv),
+        (latex, exports.to_latex),
+    ):
+        if wanted:
+            sys.stdout.write(export(rows, metric, document, head))
+            return
+    out().print(_ranking_table(rows, metric, document.suite_name))
+
+
+def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
+    reasons = dict.fromkeys(row.reason for row in rows if row.reason)
+    notes = dict(zip(reasons, "*†‡§¶", strict=False))
+    table = Table(
+        title=f"{LABELS[metric]} on {suite} (0 optimal, 1 the constant ½; 95 % intervals)",
+        caption="\n".join(f"{mark} not ranked: {escape(reason)}" for reason, mark in notes.items())
+        or None,
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("rank", justify="right", no_wrap=True)
+    table.add_column("method")
+    table.add_column("submitter")
+    for name, symbol in SYMBOLS.items():
+        table.add_column(symbol, justify="right", no_wrap=True, style="bold" * (name == metric))
+    table.add_column("runs", justify="right")
+    for row in rows:
+        entry = row.entry
+        scores = {name: getattr(entry.scores, name) for name in SYMBOLS}
+        table.add_row(
+            notes.get(row.reason, "") if row.first is None else rank_range(row.first, row.last),
+            escape(f"{entry.method} {entry.version}".strip()),
+            escape(entry.submitter),
+            *(_interval(v) if name == metric else fixed(v.value) for name, v in scores.items()),
+            str(entry.runs),
+            style="dim" if row.first is None else None,
+        )
+    return table
+
+
+def rank_range(first: int, last: int | None) -> str:
+    """`3`, or `2–5` if the interval allows several ranks."""
+    return str(first) if last in (None, first) else f"{first}–{last}"
+
+
+def _interval(value: Estimate) -> str:
+    if value.low == value.high:  # one run in each class: the spread is unknown
+        return fixed(value.value)
+    return f"{fixed(value.value)} ({fixed(value.low)} to {fixed(value.high)})"
+
+
+def show(
+    board: BoardFolder,
+    id: Annotated[
+        str, typer.Argument(metavar="ID", help="A submission's id, or its first digits.")
+    ],
+    json: Json = False,
+) -> None:
+    """Show one submission: its method, submitter, runs and scores.
+
+    While the reference rows wait, or score other than 0 and 1, scores are withheld and the reason
+    is shown.
+
+    Examples:
+
+      sme-leaderboard show board 3f2a
+    """
+    from leaderboard.public_view import public_view
+    from leaderboard.store import Store
+
+    with Store.open(board, read_only=True) as store:
+        view = public_view(store, find_entry(store, id))
+    if json:
+        print_json(view.to_dict())
+        return
+    _print_submission(view)
+    result = view.result
+    if view.withheld:
+        out().print(f"[yellow]scores withheld[/]: {escape(view.withheld)}", soft_wrap=True)
+    if result is None:
+        return
+    if result.status == "rejected":
+        out().print(f"[red]{result.code}[/]: {escape(result.message)}", soft_wrap=True)
+        return
+    out().print(_scores_table(result))
+    out().print(_class_table(result))
+    if result.oracle_like:
+        out().print("[yellow]oracle-like[/]: so close to π* that the method's code is required.")
+
+
+def _print_submission(view: PublicView) -> None:
+    from leaderboard.exports import one_line
+
+    entry, submission = view.entry, view.signed.submission
+    pairs: dict[str, object] = {
+        "id": entry.id,
+        "received": entry.received,
+        "key": entry.key,
+        "family, knowledge": f"{entry.family}, {entry.knowledge}",
+        "code": entry.code_link or "none",
+        "runs": f"{entry.runs:,} with {entry.steps:,} steps in total",
+        "training": submission.training.library or "not stated",
+        "statement": submission.statement or "none",
+    }
+    if view.withdrawal is not None:
+        reason = one_line(view.withdrawal.withdrawal.reason)
+        pairs["reason for withdrawal"] = reason or "not stated"
+    print_pairs(
+        f"[bold]{escape(entry.method)} {escape(entry.version)}[/] by {escape(entry.submitter)}: "
+        f"{entry.status}",
+        pairs,
+    )
+
+
+def _scores_table(result: Result) -> Table:
+    assert result.scores is not None
+    table = Table(title="normalised regret (0 optimal, 1 the constant ½)", title_justify="left")
+    table.add_column("")
+    for name in ("θ", "low", "high"):
+        table.add_column(name, justify="right")
+    rows = {label: getattr(result.scores, name) for name, label in LABELS.items()}
+    for m, value in enumerate(result.scores.normalised_regret):
+        rows[f"N in OOD {m}" if m else "N in WD"] = value
+    for label, value in rows.items():
+        table.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
+    return table
+
+
+def _class_table(result: Result) -> Table:
+    table = Table(title="by class", title_justify="left")
+    for name in ("class", "runs", "N₀", "N̄"):
+        table.add_column(name, justify="left" if name == "class" else "right")
+    for member in result.classes:
+        scores = (fixed(member.wd_regret, 4), fixed(member.ood_regret, 4))
+        table.add_row(escape(member.name), str(member.runs), *scores)
+    return table
+
+
+def find_entry(store: Store, id: str) -> EntryRow:
+    """The entry with this id, or whose id starts with these digits.
+
+    Raises:
+      BoardError: there is no such entry, or there are several.
+    """
+    digits = id.removeprefix("sha256:").lower()
+    matches = [
+        entry for entry in store.entries() if entry.id.removeprefix("sha256:").startswith(digits)
+    ]
+    if len(digits) < _SHORTEST_ID or not matches:
+        raise BoardError(
+            f"id={id!r:.80}: no submission's id starts with this; give at least {_SHORTEST_ID} "
+            "digits. `sme-leaderboard rank --json` lists the ids."
+        )
+    if len(matches) > 1:
+        raise BoardError(f"id={id!r}: {len(matches)} submissions match. Give more digits.")
+    return matches[0]
+
+
+def verify(
+    board: BoardFolder = Path("board"),
+    rescore: Annotated[
+        int, typer.Option(min=0, help="Number of random submissions to score again.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of that random choice.")] = 0,
+    contains: Annotated[
+        str | None,
+        typer.Option(metavar="DIGEST", help="Digest that an earlier `verify` printed."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Check every signature, hash, log entry and score, and name the first altered row.
+
+    The exit code is 3 if a row was altered. Entries cut off the end of the log leave no trace in
+    it: keep the printed digest and pass it to --contains next time.
+
+    Examples:
+
+      sme-leaderboard verify board --rescore 3
+
+      sme-leaderboard verify board --contains sha256:3f2a…
+    """
+    from dataclasses import asdict
+
+    from leaderboard.scoring.verify import verify as verify_board
+
+    with Progress("verifying", 1, console=err(), unit="rows", shown=not json) as progress:
+        report = verify_board(
+            board, rescore=rescore, seed=seed, contains=contains, progress=progress.update_of
+        )
+    pairs = asdict(report)
+    if json:
+        print_json(pairs)
+        return
+    last, digest = pairs.pop("log_sequence"), pairs.pop("log_digest")
+    print_pairs("[green]Verified[/]: no row was altered.", pairs)
+    out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)

@@ -1,0 +1,288 @@
+"""`sme-leaderboard keygen · export-sb3 · new · check · submit · withdraw`: submit a method."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from leaderboard.cli.options import (
+    DEFAULT_KEY,
+    BoardOrUrl,
+    BundleFolder,
+    Json,
+    KeyFile,
+    ProtocolName,
+    SuiteName,
+    find_suite,
+    is_url,
+)
+from leaderboard.cli.results import LABELS, SYMBOLS, find_entry
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import Knowledge
+from leaderboard.errors import Rejection
+from sme_registry.errors import OptionError
+from sme_registry.terminal import Progress, err, out, print_json
+
+if TYPE_CHECKING:
+    from leaderboard.documents.result import Result
+
+
+def keygen(key: KeyFile = DEFAULT_KEY) -> None:
+    """Create your signing key. It proves who you are: keep it, and keep it secret.
+
+    Examples:
+
+      sme-leaderboard keygen
+
+      sme-leaderboard keygen --key lab.key
+    """
+    signing_key = SigningKey.generate()
+    path = signing_key.write(key)
+    out().print(f"{escape(str(path))}\npublic key {signing_key.public}", soft_wrap=True)
+
+
+def export_sb3(
+    model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="A model saved by SB3.")],
+    out_file: Annotated[
+        Path | None, typer.Option("--out", "-o", help="MODEL.onnx by default.")
+    ] = None,
+    vec_normalize: Annotated[
+        Path | None, typer.Option(help="The saved statistics of VecNormalize.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Export an SB3 model's deterministic policy to ONNX, action range and clipping included.
+
+    A .zip of Stable-Baselines3 contains code: open only files from authors you trust.
+
+    Examples:
+
+      sme-leaderboard export-sb3 runs/demo/model.zip
+    """
+    from leaderboard.artefact.export_sb3 import export_sb3 as export
+
+    target = model.with_suffix(".onnx") if out_file is None else out_file
+    if target.exists() and not force:
+        raise OptionError(f"{target}: already exists. Use --force to replace it, or another --out.")
+    path = export(model, target, vec_normalize=vec_normalize)
+    out().print(f"{escape(str(path))}, {path.stat().st_size:,} bytes", soft_wrap=True)
+
+
+def new(
+    bundle: BundleFolder,
+    runs: Annotated[
+        list[str],
+        typer.Option(
+            "--runs",
+            help="Run folders of `sme train`, or a file runs.json that lists spec, policy, steps "
+            "and seed of each run, with policy null if it failed. Accepts patterns; repeatable.",
+        ),
+    ],
+    method: Annotated[str, typer.Option(help="Name of the method, as the board shows it.")],
+    submitter: Annotated[str, typer.Option(help="Your name or your lab's.")],
+    suite: SuiteName = "smoke-v1",
+    method_version: Annotated[str, typer.Option(help="Version of the method.")] = "1",
+    family: Annotated[
+        str | None, typer.Option(help="Family such as PPO; the method's name by default.")
+    ] = None,
+    knowledge: Annotated[
+        Knowledge,
+        typer.Option(
+            help="What the method knows of the task. generic: nothing. family: that it is an SME. "
+            "oracle: its optimal policy."
+        ),
+    ] = "generic",
+    code: Annotated[str | None, typer.Option(help="An https link to the code.")] = None,
+    statement: Annotated[str, typer.Option(help="A note for readers of the board.")] = "",
+    started: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CLASS=N",
+            help="Number of runs started in a class, if it exceeds those listed; the others "
+            "score 1. Repeatable.",
+        ),
+    ] = None,
+    key: KeyFile = DEFAULT_KEY,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing bundle.")] = False,
+) -> None:
+    """Create a signed submission from trained runs.
+
+    Every instance of the suite needs a run; `sme show smoke` lists the instances.
+
+    Examples:
+
+      sme train sha256:dfe78aa6aba8 --algorithm TD3 --seed 0
+
+      sme-leaderboard new td3 --runs 'runs/*' --method TD3 --submitter "A Lab"
+    """
+    from leaderboard.bundle import make_bundle
+
+    folders = _expanded(runs)
+    file = find_suite(suite)
+    with Progress("exporting", max(1, len(folders)), console=err(), unit="runs") as progress:
+        made = make_bundle(
+            bundle,
+            suite=file,
+            key=SigningKey.read(key),
+            runs=folders,
+            method=method,
+            version=method_version,
+            family=family or method,
+            knowledge=knowledge,
+            submitter=submitter,
+            code=code,
+            statement=statement,
+            runs_started=_runs_started(started or []),
+            force=force,
+            progress=progress.update_of,
+        )
+    out().print(f"{made.signed.id}\n{len(made.signed.submission.runs)} runs", soft_wrap=True)
+    out().print(f"Next: sme-leaderboard check {escape(str(bundle))}", soft_wrap=True)
+
+
+def _expanded(patterns: list[str]) -> list[Path]:
+    """The paths that match, sorted, without duplicates.
+
+    Raises:
+      OptionError: nothing matches a pattern.
+    """
+    paths: dict[Path, None] = {}
+    for pattern in patterns:
+        path = Path(pattern)
+        matches = [path]
+        if not path.exists():
+            root = Path(path.anchor) if path.is_absolute() else Path()
+            matches = sorted(root.glob(str(path.relative_to(path.anchor))))
+        if not matches:
+            raise OptionError(f"runs={pattern!r}: no such folder or file. Correct the path.")
+        paths |= dict.fromkeys(matches)
+    return list(paths)
+
+
+def _runs_started(pairs: list[str]) -> dict[str, int]:
+    counts = {}
+    for pair in pairs:
+        name, equals, count = pair.partition("=")
+        if not equals or not count.strip().isdecimal():
+            raise OptionError(f"started={pair!r}: must be CLASS=N, as in --started default=12.")
+        counts[name.strip()] = int(count)
+    return counts
+
+
+def check(
+    bundle: BundleFolder,
+    suite: Annotated[
+        str | None, typer.Option(help="The suite's file, if it is not in the catalogue.")
+    ] = None,
+    protocol: ProtocolName = "paper-v1",
+    json: Json = False,
+) -> None:
+    """Score a submission locally, exactly as the board does: all checks, sandbox and scores.
+
+    Examples:
+
+      sme-leaderboard check td3
+
+      sme-leaderboard check td3 --protocol quick-v1
+    """
+    from leaderboard.bundle import Bundle
+    from leaderboard.documents.board import BoardDocument
+    from leaderboard.documents.checks import check_submission
+    from leaderboard.scoring.score import score_submission
+    from sme_registry.evaluation import resolve_protocol
+
+    content = Bundle.read(bundle)
+    submission = content.signed.submission
+    file = find_suite(suite or submission.suite.name)
+    board = BoardDocument(
+        title="check",
+        suite_name=file.versioned_name,
+        suite=file.suite,
+        protocol_name=Path(protocol).stem,
+        protocol=resolve_protocol(protocol),
+        key="0" * 64,
+    )
+    check_submission(board, submission, datetime.datetime.now(datetime.UTC))
+    with Progress("scoring", len(submission.runs), console=err(), unit="states") as progress:
+        result = score_submission(board, submission, content.artefact, progress=progress.update_of)
+    if json:
+        print_json(result.to_dict())
+    if result.status == "rejected":
+        raise Rejection(result.code, result.message)
+    if not json:
+        _print_scores(result)
+
+
+def _print_scores(result: Result) -> None:
+    for name in SYMBOLS:
+        value = getattr(result.scores, name)
+        out().print(f"{LABELS[name]:18s} {value.value:.4f}  ({value.low:.4f} to {value.high:.4f})")
+    if not result.enough_runs:
+        out().print("The board will list it without a rank: too few runs in a class.")
+    if result.oracle_like:
+        out().print("The board will mark it oracle-like, which requires the method's code.")
+
+
+def submit(
+    bundle: BundleFolder,
+    board: BoardOrUrl,
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Send a submission to a board's folder or to a served board.
+
+    Sending the same one twice changes nothing. A served board needs the key for the uploads.
+
+    Examples:
+
+      sme-leaderboard submit td3 board
+
+      sme-leaderboard submit td3 http://127.0.0.1:8000
+    """
+    from leaderboard import intake
+    from leaderboard.bundle import Bundle
+    from leaderboard.store import Store
+    from leaderboard.web import client
+
+    if is_url(board):
+        total = len(Bundle.read(bundle).signed.submission.runs)
+        with Progress("uploading", total, console=err(), unit="artefacts") as progress:
+            id = client.submit(board, bundle, SigningKey.read(key), progress=progress.update_of)
+    else:
+        with Store.open(Path(board)) as store:
+            id = intake.submit_bundle(store, bundle)
+    out().print(id, soft_wrap=True)
+
+
+def withdraw(
+    board: BoardOrUrl,
+    id: Annotated[
+        str,
+        typer.Argument(
+            metavar="ID", help="The submission's id; its first digits suffice for a folder."
+        ),
+    ],
+    reason: Annotated[str, typer.Option(help="Reason, shown on its page.")] = "",
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Withdraw your submission. Its page stays and shows the withdrawal.
+
+    Examples:
+
+      sme-leaderboard withdraw board 3f2a --reason "a bug in the wrapper"
+    """
+    from leaderboard import intake
+    from leaderboard.store import Store
+    from leaderboard.web import client
+
+    signing_key = SigningKey.read(key)
+    if is_url(board):
+        client.withdraw(board, id, signing_key, reason)
+    else:
+        with Store.open(Path(board)) as store:
+            id = find_entry(store, id).id
+            intake.withdraw(store, intake.withdrawal_of(id, signing_key, reason))
+    out().print(f"{id} withdrawn", soft_wrap=True)
