@@ -1,14 +1,14 @@
-"""Protocol buffers from bytes: a message's fields, one after the other, and nothing built.
+"""A strict reader of protocol buffers: the fields of a message, one by one, without copies.
 
     field  = tag value            tag = varint(number << 3 | type)
-    type 0 = varint               seven bits a byte, lowest first, the high bit set but in the last
+    type 0 = varint               seven bits a byte, lowest first; the high bit: more follow
     type 1 = 8 bytes, type 5 = 4 bytes
     type 2 = varint(length) and as many bytes: text, bytes, a message, or packed numbers
 
-Stricter than the format, so that no other reader can see something else in the same bytes: numbers
-are in their shortest form, and the groups of old (types 3 and 4) are refused. Values are views of
-the bytes, messages are entered only where the caller does so, and every field and every packed
-number costs one of a `Budget`: neither memory nor time grows beyond it.
+It is stricter than the format, so that every other reader sees the same in these bytes: numbers
+must be in their shortest form, and groups (types 3 and 4) are rejected. Values are views of the
+bytes. Nested messages are read only on request. Every field and packed number costs one unit of a
+`Budget`, which bounds memory and time.
 
 Source: Protocol Buffers, "Encoding".
 """
@@ -25,7 +25,7 @@ _MAX_FIELD = 2**29 - 1
 
 
 class WireError(ValueError):
-    """The bytes are no message."""
+    """The bytes are not a message."""
 
 
 class BudgetError(ValueError):
@@ -38,7 +38,7 @@ class Field(NamedTuple):
     Attributes:
       number: which field.
       type: `VARINT`, `FIXED64`, `LENGTH` or `FIXED32`.
-      value: the number of a varint, in [0, 2⁶⁴); else a view of the bytes.
+      value: the number of a varint, in [0, 2⁶⁴); otherwise a view of the bytes.
     """
 
     number: int
@@ -47,17 +47,17 @@ class Field(NamedTuple):
 
 
 class Budget:
-    """How many fields and packed numbers may still be read.
+    """The number of fields and packed numbers that may still be read.
 
     Args:
-      left: in all.
+      left: the number.
     """
 
     def __init__(self, left: int) -> None:
         self.left = left
 
     def spend(self) -> None:
-        """Take one.
+        """Use one.
 
         Raises:
           BudgetError: none is left.
@@ -68,16 +68,16 @@ class Budget:
 
 
 def fields(message: memoryview, budget: Budget) -> Iterator[Field]:
-    """The fields of a message, in their order.
+    """The fields of a message, in order.
 
     Args:
       message: its bytes.
-      budget: shared by all messages of one file.
+      budget: shared by all messages of a file.
 
     Raises:
-      WireError: truncated, a number not in its shortest form or beyond 64 bits, or a type or field
-        number that there is not.
-      BudgetError: more fields than allowed.
+      WireError: the message is truncated, a number is not in its shortest form or exceeds 64 bits,
+        or a type or field number does not exist.
+      BudgetError: too many fields.
     """
     at, end = 0, len(message)
     while at < end:
@@ -106,7 +106,7 @@ def varints(packed: memoryview, budget: Budget) -> Iterator[int]:
     """Packed varints, each in [0, 2⁶⁴).
 
     Raises:
-      WireError, BudgetError: as `fields`.
+      WireError, BudgetError: see `fields`.
     """
     at = 0
     while at < len(packed):
@@ -116,19 +116,19 @@ def varints(packed: memoryview, budget: Budget) -> Iterator[int]:
 
 
 def signed(value: int) -> int:
-    """A varint as the int64 that it stands for."""
+    """The int64 that a varint represents."""
     return value - 2**64 if value >= 2**63 else value
 
 
 def _varint(view: memoryview, at: int) -> tuple[int, int]:
-    """The varint at a place, and the place after it."""
-    if at < len(view) and view[at] < 0x80:  # most of them
+    """The varint at a position, and the position after it."""
+    if at < len(view) and view[at] < 0x80:  # the usual case
         return view[at], at + 1
     value = 0
     for shift, byte in zip(range(0, 70, 7), view[at : at + 10], strict=False):
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             if value >= 2**64 or (byte == 0 and shift > 0):
-                raise WireError("a number that is beyond 64 bits, or longer than it need be")
+                raise WireError("a number that exceeds 64 bits or is not in its shortest form")
             return value, at + shift // 7 + 1
     raise WireError("a number that does not end")

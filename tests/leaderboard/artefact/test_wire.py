@@ -43,10 +43,10 @@ def test_it_reads_what_googles_library_writes(i, name, floats):
     [
         (b"\x08", "does not end"),
         (b"\x08\x80", "does not end"),
-        (b"\x08" + b"\xff" * 9 + b"\x02", "beyond 64 bits"),
+        (b"\x08" + b"\xff" * 9 + b"\x02", "exceeds 64 bits"),
         (b"\x08" + b"\xff" * 10 + b"\x01", "does not end"),
-        (b"\x08\x80\x00", "longer than it need be"),
-        (b"\x88\x00\x01", "longer than it need be"),
+        (b"\x08\x80\x00", "not in its shortest form"),
+        (b"\x88\x00\x01", "not in its shortest form"),
         (b"\x0a\x05abcd", "field 1 ends 1 bytes after"),
         (b"\x0a\xff\xff\xff\xff\xff\xff\xff\xff\xff\x01", "ends .* bytes after its message"),
         (b"\x0d\x00\x00\x00", "field 1 ends 1 bytes after"),
