@@ -225,9 +225,7 @@ def similarity_map(
             cmap="viridis",
             interpolation="nearest",
         )
-        # Two strokes, so that the outline is seen on dark and on light alike.
-        for colour, width in (("white", 3.0), ("black", 1.2)):
-            axes.plot([0, 1, 1, 0, 0], [0, 0, 1, 1, 0], color=colour, linewidth=width)
+        draw_unit_square(axes, 3.0, 1.2)
         bar = figure.colorbar(image, ax=axes, label="similarity r̃  (1 = optimal)")
         bar.outline.set_visible(False)
         inside = (side >= 0.0) & (side <= 1.0)
@@ -240,6 +238,12 @@ def similarity_map(
         axes.set_xlabel("state channel 1")
         axes.set_ylabel("state channel 2")
     return Path(path)
+
+
+def draw_unit_square(axes: Axes, outer: float, inner: float) -> None:
+    """The outline of the unit square, white around black: visible on dark and on light colours."""
+    for colour, width in (("white", outer), ("black", inner)):
+        axes.plot([0, 1, 1, 0, 0], [0, 0, 1, 1, 0], color=colour, linewidth=width)
 
 
 def similarity_on_grid(asked: Any, spec: SMESpec, side: Array, time: float) -> Array:

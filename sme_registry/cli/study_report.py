@@ -36,7 +36,7 @@ def report(
 
       sme study report runs/all --out paper/study --format pdf,latex
     """
-    from sme_registry.studies.report import write_report
+    from sme_registry.studies import write_report
 
     chosen = [name.strip() for name in formats.split(",") if name.strip()]
     written = write_report(folder, out, tuple(dict.fromkeys(chosen)))

@@ -1,5 +1,11 @@
-"""`sme study report`: what a study's folder shows, as one page, figures and tables."""
+"""A study's results as data frames, and its report: one page, figures and tables."""
 
-from sme_registry.studies.report.write import FORMATS, write_report
+from sme_registry.errors import MissingDependencyError
 
-__all__ = ["FORMATS", "write_report"]
+try:
+    import pandas  # noqa: F401
+except ImportError:
+    raise MissingDependencyError(
+        "The results of a study need pandas, which is not installed. "
+        "Run `pip install 'sme-registry[studies]'`."
+    ) from None

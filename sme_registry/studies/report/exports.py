@@ -1,320 +1,237 @@
-"""A study's tables as files: every number as CSV, and what a paper prints as LaTeX.
+"""A study's frames as files: every number as CSV, and the tables that people read as LaTeX.
 
-A `Data` is long, a row a number or a few, for other programs; a `Printed` is what people read,
-already in words, and also stands on the page.
+A `TextTable` holds finished text, for a paper and for the report's page. `tables` documents the
+columns of the CSV files.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sme_registry.studies.report.analysis import METRICS
-from sme_registry.studies.report.tables import Analysis
+import pandas as pd
 
-_METRIC_LABELS = {metric.key: metric.label for metric in METRICS}
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, OFFLINE_INTERVAL
+from sme_registry.terminal import escape_latex, fixed
 
-
-@dataclass(frozen=True)
-class Data:
-    """A long table of numbers; None is an empty entry."""
-
-    name: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-
-    def csv(self) -> str:
-        """As CSV, floats so that they read back as they are."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows(self.rows)
-        return text.getvalue()
+CSV_TABLES = (
+    "results", "curves", "counts", "missing", "contrasts", "levels", "regions", "aggregates",
+    "profiles", "improvements", "learning_curves",
+)  # fmt: skip
+ABSENT = "–"
+_STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
+_REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
 
 
-@dataclass(frozen=True)
-class Printed:
-    """A table for people; its first column names the rows."""
+@dataclass(frozen=True, eq=False)
+class TextTable:
+    """A table for people.
+
+    Attributes:
+      name: of its files.
+      title: what it shows, in a few words.
+      note: how to read it.
+      frame: its columns, all text; the first one names the rows.
+    """
 
     name: str
     title: str
     note: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    frame: pd.DataFrame
 
     def latex(self) -> str:
-        """As a `table` of LaTeX, with the rules of the package booktabs; ASCII only."""
-        lines = [
-            "% needs \\usepackage{booktabs}",
-            "\\begin{table}",
-            "  \\centering",
-            f"  \\caption{{{_tex(f'{self.title}. {self.note}')}}}",
-            f"  \\label{{tab:{self.name}}}",
-            f"  \\begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
-            "    \\toprule",
-            f"    {_tex_row(self.columns)}",
-            "    \\midrule",
-            *(f"    {_tex_row(row)}" for row in self.rows),
-            "    \\bottomrule",
-            "  \\end{tabular}",
-            "\\end{table}",
-        ]
-        return "\n".join(lines) + "\n"
+        """As a LaTeX `table` with the rules of the package booktabs; ASCII only."""
+        frame = self.frame.map(escape_latex).rename(columns=escape_latex)
+        table = frame.style.hide(axis="index").to_latex(
+            hrules=True,
+            column_format="l" + "r" * (len(frame.columns) - 1),
+            position_float="centering",
+            caption=escape_latex(f"{self.title}. {self.note}"),
+            label=f"tab:{self.name}",
+        )
+        return f"% needs \\usepackage{{booktabs}}\n{table}"
 
 
-def data(analysis: Analysis) -> list[Data]:
-    """Every table of the study, whole."""
-    runs = (
-        (
-            run.planned.class_name,
-            run.planned.algorithm,
-            run.planned.run,
-            *(metric.of(run.result) for metric in METRICS),
-            run.result.timing.total,
-            run.result.timing.steps_per_second,
-            run.result.key,
-        )
-        for run in analysis.results
+def csv_tables(analysis: Analysis) -> dict[str, str]:
+    """Every frame of the study as CSV, by name; floats read back as they are."""
+    names = (*CSV_TABLES, "offline") if analysis.has_offline_runs else CSV_TABLES
+    return {
+        name: getattr(analysis, name).to_csv(index=False, lineterminator="\n") for name in names
+    }
+
+
+def text_tables(analysis: Analysis) -> list[TextTable]:
+    """What people read: settings down, algorithms across. Tables without rows are left out."""
+    tables = [
+        *(offline_tables(analysis) if analysis.has_offline_runs else ()),
+        *(_contrasts(analysis, metric.key, metric.label) for metric in METRICS),
+        *(_regions(analysis, name) for name in analysis.algorithms),
+        _aggregates(analysis),
+        _improvements(analysis),
+        _counts(analysis),
+    ]
+    return [table for table in tables if not table.frame.empty]
+
+
+def offline_tables(analysis: Analysis) -> list[TextTable]:
+    """The behaviour policies next to the learners, and the differences."""
+    rows, at = analysis.offline, {"class_name": "class", "nu": "ν"}
+    similarity = _wide(
+        rows, at, "learner", lambda row: _mean(row.similarity, row.similarity_sd, row.runs)
     )
-    curves = (
-        (c.class_name, c.algorithm, c.measure, int(step), *map(float, values), c.runs)
-        for c in analysis.curves
-        for step, *values in zip(c.steps, c.median, c.low, c.high, strict=True)
-    )
-    profiles = (
-        (p.group, p.algorithm, p.metric, round(float(tau), 4), *map(float, at))
-        for p in analysis.profiles
-        for tau, *at in zip(
-            p.thresholds, p.estimate.value, p.estimate.low, p.estimate.high, strict=True
-        )
-    )
+    data = rows.drop_duplicates(["class_name", "nu"])
+    constant = [number(row.constant_similarity, 3) for row in data.itertuples()]
+    behaviour = [
+        _mean(row.behaviour_similarity, row.behaviour_similarity_sd, row.data_sets)
+        for row in data.itertuples()
+    ]
+    similarity.insert(2, "constant ½", constant)
+    similarity.insert(3, "behaviour policy", behaviour)
     return [
-        table_of("runs", f"class algorithm run {' '.join(_METRIC_LABELS)} seconds "
-              "steps_per_second key", runs),
-        table_of("counts", "class algorithm done failed planned", analysis.counts),
-        table_of("missing", "class algorithm run error", analysis.missing),
-        table_of(
-            "contrasts",
-            "class axis algorithm metric base level change low high pairs verdict",
-            (
-                (r.class_name, r.axis, r.algorithm, r.metric, r.base, r.level, r.change, r.low,
-                 r.high, r.pairs, r.verdict)
-                for r in analysis.contrasts
-            ),
+        TextTable(
+            "offline",
+            "Learning from data: mean similarity r̃",
+            "Mean over runs ± the standard deviation over steps (its mean over runs); in brackets "
+            "the number of runs, or of the behaviour policy's data sets. The constant ½ is "
+            "evaluated within distribution.",
+            similarity,
         ),
-        table_of(
-            "levels",
-            "class algorithm metric runs iqm low high linear",
-            (
-                (r.class_name, r.algorithm, r.metric, r.runs, r.value, r.low, r.high, r.linear)
-                for r in analysis.levels
-            ),
+        TextTable(
+            "offline-improvement",
+            "Learning from data: r̃ minus the behaviour policy's",
+            f"Mean over runs, with its 95 % bootstrap interval from {OFFLINE_INTERVAL} runs on. "
+            "†: above its data, *: below, by an interval that excludes 0 and rests on at least "
+            f"{ENOUGH_RUNS} runs.",
+            _wide(rows, at, "learner", _improvement),
         ),
-        table_of(
-            "regions",
-            "class algorithm region epsilon runs similarity similarity_q25 similarity_q75 "
-            "normalised_regret linear",
-            analysis.regions,
-        ),
-        table_of(
-            "decay",
-            "class algorithm run state_dim epsilon similarity_wd decay decay_points",
-            analysis.decay,
-        ),
-        table_of(
-            "scores",
-            "group algorithm metric statistic classes runs fewest_runs value low high",
-            (
-                (r.group, r.algorithm, r.metric, r.statistic, r.classes, r.runs, r.fewest, r.value,
-                 r.low, r.high)
-                for r in analysis.aggregates
-            ),
-        ),
-        table_of(
-            "improvement",
-            "group metric first second classes fewest_runs probability low high",
-            (
-                (r.group, r.metric, r.first, r.second, r.classes, r.fewest, r.value, r.low, r.high)
-                for r in analysis.improvements
-            ),
-        ),
-        table_of("curves", "class algorithm measure steps median q25 q75 runs", curves),
-        table_of("profiles", "group algorithm metric threshold share low high", profiles),
-    ]  # fmt: skip
-
-
-def printed(analysis: Analysis) -> list[Printed]:
-    """What people read: settings down, algorithms across."""
-    found = [_contrasts(analysis, metric.key) for metric in METRICS]
-    found += [_regions(analysis, name) for name in analysis.algorithms]
-    found += [_scores(analysis), _improvement(analysis), _counts(analysis)]
-    return [table for table in found if table.rows]
-
-
-def _contrasts(analysis: Analysis, metric: str) -> Printed:
-    at = {(r.class_name, r.algorithm): r for r in analysis.contrasts if r.metric == metric}
-    digits = 1 if metric == "final_return" else 2
-
-    def entry(name: str, algorithm: str) -> str:
-        row = at.get((name, algorithm))
-        if row is None:
-            return "–"
-        if row.low is None or row.high is None:
-            return f"{number(row.change, digits, '+')} (1 pair)"
-        ends = f"{number(row.low, digits, '+')}, {number(row.high, digits, '+')}"
-        star = {"worse": " *", "better": " †", "open": ""}[row.verdict] if row.settled else ""
-        few = "" if row.settled else f" (n = {row.pairs})"
-        return f"{number(row.change, digits, '+')} [{ends}]{few}{star}"
-
-    return Printed(
-        f"contrasts-{metric.replace('_', '-')}",
-        f"Change of {_METRIC_LABELS[metric]}, from the class {analysis.base}",
-        "IQM over pairs of runs, with the 95 % bootstrap interval of the change. "
-        "*: worse, †: better, by an interval that leaves out 0 and rests on enough pairs.",
-        ("class", "setting", *analysis.algorithms),
-        tuple(
-            (
-                name,
-                analysis.classes[name].label,
-                *(entry(name, algorithm) for algorithm in analysis.algorithms),
-            )
-            for name in analysis.classes
-            if any(place[0] == name for place in at)
-        ),
-    )
-
-
-def _regions(analysis: Analysis, algorithm: str) -> Printed:
-    rows = [row for row in analysis.regions if row.algorithm == algorithm]
-    regions = list(dict.fromkeys(row.region for row in rows))
-    at = {(row.class_name, row.region): row for row in rows}
-    return Printed(
-        f"regions-{_slug(algorithm)}",
-        f"Similarity r̃ of {algorithm} by region",
-        "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 the optimum's, 1 "
-        "the constant ½'s.",
-        ("class", *regions),
-        tuple(
-            (
-                name,
-                *(
-                    f"{at[name, region].similarity:.3f} ({at[name, region].regret:.2f})"
-                    for region in regions
-                ),
-            )
-            for name in analysis.classes
-            if (name, regions[0]) in at
-        ),
-    )
-
-
-def _scores(analysis: Analysis) -> Printed:
-    at = {(r.group, r.metric, r.statistic, r.algorithm): r for r in analysis.aggregates}
-    places = list(dict.fromkeys(key[:3] for key in at))
-    words = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
-    regions = {"wd_regret": "WD", "ood_regret": "OOD"}
-    return Printed(
-        "scores",
-        "Scores: 1 − normalised regret",
-        "Means over classes of a statistic over runs, with 95 % stratified bootstrap intervals. "
-        "Of the optimality gap less is better.",
-        ("classes", "region", "statistic", *analysis.algorithms),
-        tuple(
-            (
-                group,
-                regions[metric],
-                words[statistic],
-                *(
-                    _with_interval(row.value, row.low, row.high)
-                    for name in analysis.algorithms
-                    for row in [at[group, metric, statistic, name]]
-                ),
-            )
-            for group, metric, statistic in places
-        ),
-    )
-
-
-def _improvement(analysis: Analysis) -> Printed:
-    at = {(r.group, r.metric, r.first, r.second): r for r in analysis.improvements}
-    rows = list(dict.fromkeys((r.group, r.first, r.second) for r in analysis.improvements))
-    return Printed(
-        "improvement",
-        "Probability of improvement",
-        "That a run of the first algorithm beats one of the second, on a class drawn at random.",
-        ("classes", "comparison", "WD", "OOD"),
-        tuple(
-            (
-                group,
-                f"{first} over {second}",
-                *(
-                    _with_interval(row.value, row.low, row.high)
-                    for metric in ("wd_regret", "ood_regret")
-                    for row in [at[group, metric, first, second]]
-                ),
-            )
-            for group, first, second in rows
-        ),
-    )
-
-
-def _counts(analysis: Analysis) -> Printed:
-    names = list(dict.fromkeys(count.algorithm for count in analysis.counts))
-    at = {(count.class_name, count.algorithm): count for count in analysis.counts}
-
-    def entry(name: str, algorithm: str) -> str:
-        count = at[name, algorithm]
-        failed = f", {count.failed} failed" if count.failed else ""
-        return f"{count.done} of {count.planned}{failed}"
-
-    return Printed(
-        "counts",
-        "Finished runs",
-        "What is missing is in no number.",
-        ("class", *names),
-        tuple((c, *(entry(c, name) for name in names)) for c in analysis.classes),
-    )
-
-
-def table_of(name: str, columns: str, rows: Any) -> Data:
-    """A long table; its columns in one string, between spaces."""
-    return Data(name, tuple(columns.split()), tuple(map(tuple, rows)))
-
-
-def _with_interval(value: float, low: float | None, high: float | None) -> str:
-    if low is None or high is None:
-        return number(value)
-    return f"{number(value)} [{number(low)}, {number(high)}]"
+    ]
 
 
 def number(value: float, digits: int = 2, sign: str = "") -> str:
     """A number with a true minus, and no sign on what rounds to 0."""
-    text = f"{value:{sign}.{digits}f}"
-    if not any(digit in text for digit in "123456789"):
-        text = text.lstrip("+-")
+    text = fixed(value, digits)
+    if sign and value > 0 and any(digit in text for digit in "123456789"):
+        text = sign + text
     return text.replace("-", "−")
 
 
-def _slug(text: str) -> str:
+def _contrasts(analysis: Analysis, metric: str, label: str) -> TextTable:
+    rows = analysis.contrasts[analysis.contrasts.metric == metric]
+    digits = 1 if metric == "final_return" else 2
+    frame = _wide(rows, {"class_name": "class"}, "algorithm", lambda row: _change(row, digits))
+    settings = [analysis.classes[name].label for name in frame["class"]]
+    frame.insert(1, "setting", settings)
+    return TextTable(
+        f"contrasts-{metric.replace('_', '-')}",
+        f"Change of {label}, from the class {analysis.base}",
+        "IQM over pairs of runs, with the 95 % bootstrap interval of the change. "
+        "*: worse, †: better, by an interval that excludes 0 and rests on enough pairs.",
+        frame,
+    )
+
+
+def _regions(analysis: Analysis, algorithm: str) -> TextTable:
+    rows = analysis.regions[analysis.regions.algorithm == algorithm]
+    return TextTable(
+        f"regions-{_file_name(algorithm)}",
+        f"Similarity r̃ of {algorithm} by region",
+        "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 for the optimum, 1 "
+        "for the constant ½.",
+        _wide(
+            rows,
+            {"class_name": "class"},
+            "region",
+            lambda row: f"{row.similarity:.3f} ({row.normalised_regret:.2f})",
+        ),
+    )
+
+
+def _aggregates(analysis: Analysis) -> TextTable:
+    rows = analysis.aggregates.replace({"metric": _REGIONS, "statistic": _STATISTICS})
+    at = {"group": "classes", "metric": "region", "statistic": "statistic"}
+    return TextTable(
+        "aggregates",
+        "Aggregates of 1 − normalised regret",
+        "Means over classes of a statistic over runs, with 95 % stratified bootstrap intervals. "
+        "For the optimality gap less is better.",
+        _wide(rows, at, "algorithm", lambda row: _with_interval(row.value, row.low, row.high)),
+    )
+
+
+def _improvements(analysis: Analysis) -> TextTable:
+    rows = analysis.improvements.replace({"metric": _REGIONS})
+    rows = rows.assign(comparison=rows["first"] + " over " + rows["second"])
+    at = {"group": "classes", "comparison": "comparison"}
+    return TextTable(
+        "improvements",
+        "Probability of improvement",
+        "That a run of the first algorithm beats one of the second, on a class drawn at random.",
+        _wide(rows, at, "metric", lambda row: _with_interval(row.probability, row.low, row.high)),
+    )
+
+
+def _counts(analysis: Analysis) -> TextTable:
+    def entry(row: Any) -> str:
+        failed = f", {row.failed} failed" if row.failed else ""
+        return f"{row.done} of {row.planned}{failed}"
+
+    return TextTable(
+        "counts",
+        "Finished runs",
+        "Missing runs are part of no other number.",
+        _wide(analysis.counts, {"class_name": "class"}, "algorithm", entry),
+    )
+
+
+def _wide(
+    rows: pd.DataFrame, index: dict[str, str], across: str, entry: Callable[[Any], str]
+) -> pd.DataFrame:
+    """A long table as text, `across` as columns; orders are those of the rows.
+
+    Args:
+      rows: the long table.
+      index: its columns that name the rows, and their headings.
+      across: the column whose values become columns.
+      entry: the text of a row.
+    """
+    keys = [*index, across]
+    text = rows[keys].assign(text=[entry(row) for row in rows.itertuples()])
+    wide = text.set_index(keys).text.unstack(across, sort=False).fillna(ABSENT)
+    wide = wide[list(dict.fromkeys(text[across]))].reset_index().rename(columns=index)
+    if "ν" in wide:
+        wide["ν"] = [f"{nu:g}" for nu in wide["ν"]]
+    return wide.rename_axis(columns=None)
+
+
+def _change(row: Any, digits: int) -> str:
+    if math.isnan(row.low):
+        return f"{number(row.change, digits, '+')} (1 pair)"
+    mark = {"worse": " *", "better": " †", "open": ""}[row.verdict] if row.enough_pairs else ""
+    few = "" if row.enough_pairs else f" (n = {row.pairs})"
+    ends = f"{number(row.low, digits, '+')}, {number(row.high, digits, '+')}"
+    return f"{number(row.change, digits, '+')} [{ends}]{few}{mark}"
+
+
+def _improvement(row: Any) -> str:
+    text = number(row.improvement, 3, "+")
+    if math.isnan(row.low):
+        return f"{text} (n = {row.runs})"
+    mark = {"above": " †", "below": " *"}.get(row.verdict, "")
+    few = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
+    return f"{text} [{number(row.low, 3, '+')}, {number(row.high, 3, '+')}]{few}{mark}"
+
+
+def _mean(value: float, sd: float, runs: int) -> str:
+    return f"{number(value, 3)} ± {number(sd, 3)} ({runs})"
+
+
+def _with_interval(value: float, low: float, high: float) -> str:
+    return number(value) if math.isnan(low) else f"{number(value)} [{number(low)}, {number(high)}]"
+
+
+def _file_name(text: str) -> str:
     """An algorithm's name as a part of a file's."""
-    return "".join(c if c.isalnum() else "-" for c in text)
-
-
-_TEX: dict[str, str] = {
-    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "−": "$-$", "–": "--", "½": r"$\frac12$", "ε": r"$\varepsilon$", "†": r"$^\dagger$",
-    "τ": r"$\tau$", "*": "$^*$", "≥": r"$\geq$", "’": "'", "ν": r"$\nu$",
-    "±": r"$\pm$",
-}  # fmt: skip
-
-
-def _tex(text: str) -> str:
-    return "".join(_TEX.get(c, c) for c in text.replace("r̃", "\0")).replace("\0", r"$\tilde r$")
-
-
-def _tex_row(cells: Sequence[str]) -> str:
-    return " & ".join(map(_tex, cells)) + r" \\"
+    return "".join(letter if letter.isalnum() else "-" for letter in text)

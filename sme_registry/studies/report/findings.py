@@ -7,12 +7,18 @@ where there are fewer, and otherwise open: no sentence turns an open one into "h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from sme_registry.diagnosis.questions import THRESHOLDS
-from sme_registry.studies.report.analysis import ALL, AXES, learnt_from
-from sme_registry.studies.report.tables import ENOUGH_RUNS, Aggregate, Analysis, Contrast
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.classes import ALL, AXES
+from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
+
+Contrast = Any  # a row of the table, as a named tuple
+Aggregate = Any
 
 WD, OOD = "wd_regret", "ood_regret"
 _NOT_LEARNT = THRESHOLDS["unlearnt"]  # of the constant's regret: nothing to speak of was learnt
@@ -41,16 +47,18 @@ def findings(analysis: Analysis) -> list[Finding]:
 
 def caveats(analysis: Analysis) -> list[str]:
     """What holds for everything that is said: how many runs, how many comparisons."""
-    done, missing = len(analysis.results), len(analysis.missing)
+    done, missing = len(analysis.runs), len(analysis.missing)
     said = []
     if missing:
-        failed = sum(bool(gap.error) for gap in analysis.missing)
+        failed = int((analysis.missing.error != "").sum())
         why = f", of which {failed} failed" if failed else ""
         said.append(
             f"{missing} of the plan's {done + missing} runs are not there yet{why}. They are in no "
             "number, and the table of runs names them."
         )
-    pairs = [row.pairs for row in analysis.contrasts if row.algorithm in analysis.learners]
+    pairs = [
+        row.pairs for row in analysis.contrasts.itertuples() if row.algorithm in analysis.learners
+    ]
     if pairs and min(pairs) < ENOUGH_RUNS:
         said.append(
             f"Some contrasts rest on as few as {min(pairs)} {_plural(min(pairs), 'pair')} of runs. "
@@ -58,7 +66,11 @@ def caveats(analysis: Analysis) -> list[str]:
             "in 48–86 %, depending on how runs spread; from 4 on in 94–98 %. Under "
             f"{ENOUGH_RUNS} pairs, this report calls a change an indication at most."
         )
-    contrasts = [row for row in analysis.contrasts if row.metric == WD and row.low is not None]
+    contrasts = [
+        row
+        for row in analysis.contrasts.itertuples()
+        if row.metric == WD and not math.isnan(row.low)
+    ]
     contrasts = [row for row in contrasts if row.algorithm in analysis.learners]
     if len(contrasts) > 1:
         said.append(
@@ -76,10 +88,10 @@ def caveats(analysis: Analysis) -> list[str]:
 
 def comparison(analysis: Analysis) -> str:
     """Which does best over all classes of those with equal data, and whether that is settled."""
-    data = learnt_from(analysis.results)
+    data = training_data(analysis.runs)
     rows = [
         row
-        for row in analysis.aggregates
+        for row in analysis.aggregates.itertuples()
         if (row.group, row.metric, row.statistic) == (ALL, WD, "iqm")
         and row.algorithm in analysis.learners
     ]
@@ -101,21 +113,21 @@ def _best(analysis: Analysis, rows: Sequence[Aggregate], data: tuple[float, int]
         f"{_interval(best.low, best.high)}, where 1 is the optimum and 0 the constant ½."
     )
     names = {row.algorithm for row in rows}
-    for row in analysis.improvements:
+    for row in analysis.improvements.itertuples():
         pair = {row.first, row.second}
         if (row.group, row.metric) != (ALL, WD) or best.algorithm not in pair:
             continue
         other = (pair - {best.algorithm}).pop()
         if other not in names:
             continue
-        value, low, high = row.value, row.low, row.high
+        value, low, high = row.probability, row.low, row.high
         if row.first == other:
             value = 1.0 - value
-            low, high = (None if end is None else 1.0 - end for end in (high, low))
-        if low is None or low <= 0.5:
+            low, high = 1.0 - high, 1.0 - low
+        if not low > 0.5:
             sure = ", which leaves open which of the two is better"
         else:
-            sure = "" if row.fewest >= ENOUGH_RUNS else ", an indication from few runs"
+            sure = "" if row.fewest_runs >= ENOUGH_RUNS else ", an indication from few runs"
         text += (
             f" A run of it beats one of {other} with probability {value:.2f}"
             f"{_interval(low, high)}{sure}."
@@ -125,7 +137,7 @@ def _best(analysis: Analysis, rows: Sequence[Aggregate], data: tuple[float, int]
 
 def _budgets(analysis: Analysis, algorithms: Sequence[str]) -> str:
     """How long each of some algorithms was trained, where that differs."""
-    steps = {run.planned.algorithm: run.planned.cell.steps for run in analysis.results}
+    steps = {run.algorithm: run.steps for run in analysis.runs.itertuples()}
     alike: dict[int, list[str]] = {}
     for name in algorithms:
         alike.setdefault(steps[name], []).append(name)
@@ -146,18 +158,18 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
             (),
         )
     points = []
-    base = analysis.level(analysis.base, algorithm, WD)
-    if base is not None and base.value >= _NOT_LEARNT:
+    base = _level(analysis, analysis.base, algorithm)
+    if base is not None and base.iqm >= _NOT_LEARNT:
         points.append(
             f"It has learnt next to nothing on the first class itself: its normalised regret there "
-            f"is {base.value:.2f}, and the constant action's 1. What has not been learnt cannot "
+            f"is {base.iqm:.2f}, and the constant action's 1. What has not been learnt cannot "
             "break, so the contrasts say little: they need a longer budget."
         )
     worse = [row for row in rows if row.verdict == "worse"]
     if not worse:
         better = [row for row in rows if row.verdict == "better"]
         found = f"; {_listed(analysis, better)} lower it" if better else ""
-        ends = [row.high for row in rows if row.high is not None]
+        ends = [row.high for row in rows if not math.isnan(row.high)]
         still = ": the intervals say what is still possible" if ends else ""
         headline = (
             f"No class has been shown to make {algorithm} worse within distribution{found}. "
@@ -165,7 +177,7 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
         )
         if ends:
             points.append(f"The largest upper end is {_signed(max(ends))}.")
-        alone = [row for row in rows if row.high is None]
+        alone = [row for row in rows if math.isnan(row.high)]
         if alone:
             most = max(alone, key=lambda row: row.change)
             points.append(
@@ -183,11 +195,11 @@ def _finding(analysis: Analysis, algorithm: str) -> Finding:
     )
     points += [_certainty(analysis, top, rows), _severity(analysis, top)]
     others = [row for row in _worst_of_each_axis(worse) if row.axis != top.axis]
-    settled = [row for row in others if row.settled]
+    settled = [row for row in others if row.enough_pairs]
     if settled:
         points.append(f"It is also made worse by {_listed(analysis, settled)}.")
     if len(settled) < len(others):
-        few = [row for row in others if not row.settled]
+        few = [row for row in others if not row.enough_pairs]
         points.append(
             f"There are indications, no more, that it is made worse by {_listed(analysis, few)}."
         )
@@ -223,7 +235,7 @@ def _uncertain(analysis: Analysis, larger: Sequence[Contrast]) -> str:
 
 def _severity(analysis: Analysis, top: Contrast) -> str:
     """Where the policies end up, between the references."""
-    level = analysis.level(top.class_name, top.algorithm, WD)
+    level = _level(analysis, top.class_name, top.algorithm)
     linear = level.linear if level is not None else None
     if top.level > 2.0 - _NOT_LEARNT:
         return f"At {top.level:.2f} it is worse than the constant action ½, which scores 1."
@@ -236,8 +248,8 @@ def _severity(analysis: Analysis, top: Contrast) -> str:
         f"At {top.level:.2f} it is {relation} than the linear policy fitted to the optimum, which "
         f"has {linear:.2f} there, and better than the constant ½, which has 1."
     )
-    before = analysis.level(analysis.base, top.algorithm, WD)
-    if before is not None and before.linear is not None and linear - before.linear > _HURT:
+    before = _level(analysis, analysis.base, top.algorithm)
+    if before is not None and linear - before.linear > _HURT:
         text += (
             f" The linear policy's own regret rises from {before.linear:.2f}: the optimum itself "
             "is harder to fit there."
@@ -247,7 +259,7 @@ def _severity(analysis: Analysis, top: Contrast) -> str:
 
 def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> str:
     """How sure it is that this is the worst."""
-    if not top.settled:
+    if not top.enough_pairs:
         return (
             f"How sure? Not very: {top.pairs} pairs of runs are few, and this is an indication, "
             f"not a finding. {ENOUGH_RUNS} or more would settle more."
@@ -255,7 +267,7 @@ def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> s
     rivals = _worst_of_each_axis(
         row
         for row in rows
-        if row.axis != top.axis and (row.high is None or row.high >= (top.low or 0.0))
+        if row.axis != top.axis and (math.isnan(row.high) or row.high >= top.low)
     )
     if rivals:
         return (
@@ -270,8 +282,19 @@ def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> s
     )
 
 
+def _level(analysis: Analysis, class_name: str, algorithm: str) -> Any:
+    for row in analysis.levels.itertuples():
+        if (row.class_name, row.algorithm, row.metric) == (class_name, algorithm, WD):
+            return row
+    return None
+
+
 def _rows(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
-    return [row for row in analysis.contrasts if (row.algorithm, row.metric) == (algorithm, metric)]
+    return [
+        row
+        for row in analysis.contrasts.itertuples()
+        if (row.algorithm, row.metric) == (algorithm, metric)
+    ]
 
 
 def _worst_of_each_axis(rows: Iterable[Contrast]) -> list[Contrast]:
@@ -288,10 +311,10 @@ def _listed(analysis: Analysis, rows: Sequence[Contrast]) -> str:
     for row in rows:
         interval = (
             "a single pair, no interval"
-            if row.low is None
+            if math.isnan(row.low)
             else f"interval {_signed(row.low)} to {_signed(row.high)}"
         )
-        few = "" if row.settled or row.low is None else f", only {row.pairs} pairs"
+        few = "" if row.enough_pairs or math.isnan(row.low) else f", only {row.pairs} pairs"
         parts.append(
             f"{_property(analysis, row)} ({row.class_name}: {_signed(row.change)}, {interval}{few})"
         )
@@ -317,14 +340,12 @@ def _verb(change: float, *, most: bool) -> str:
     return f"{verb}{' most' if most else ''}{'' if change >= _HURT else ', though little,'}"
 
 
-def _interval(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+def _interval(low: float, high: float) -> str:
+    return "" if math.isnan(low) else f" ({low:.2f} to {high:.2f})"
 
 
-def _signed(value: float | None) -> str:
+def _signed(value: float) -> str:
     """`+0.44`, `−0.02`, `0.00`."""
-    if value is None:
-        return "?"
     text = f"{value:+.2f}"
     return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
 

@@ -13,16 +13,16 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from sme_registry.studies.report.exports import Printed
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.exports import TextTable
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import caveats, comparison, findings
 from sme_registry.studies.report.offline import offline_words
-from sme_registry.studies.report.tables import Analysis
 
 _SECTIONS = {
-    "breaks": ("What breaks it", ("contrasts", "regret")),
+    "breaks": ("What breaks it", ("contrasts", "wd-regret", "ood-regret")),
     "regions": ("Inside and outside of the training cube", ("regions", "decay", "maps")),
-    "algorithms": ("Algorithms compared", ("scores", "profiles", "improvement")),
+    "algorithms": ("Algorithms compared", ("aggregates", "profiles", "improvements")),
     "learning": ("Learning", ("learning-curves",)),
 }
 _OFFLINE = "offline"  # how the names of all that learning from data adds begin
@@ -33,7 +33,7 @@ def page(
     analysis: Analysis,
     figures: Sequence[Picture],
     absent: Sequence[str],
-    tables: Sequence[Printed],
+    tables: Sequence[TextTable],
 ) -> str:
     """The whole page.
 
@@ -48,7 +48,7 @@ def page(
     style = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
     sections, names = [], {}
     own_tables = [table for table in tables if table.name.startswith(_OFFLINE)]
-    if analysis.offline:
+    if analysis.has_offline_runs:
         sections.append(_learnt_from_data(analysis, figures, own_tables))
         names[_OFFLINE] = "Learning from data"
     sections.append(_in_words(analysis))
@@ -67,7 +67,7 @@ def page(
     names |= {"tables": "Tables", "origin": "Where this comes from"}
     links = "".join(f'<li><a href="#{key}">{escape(name)}</a></li>' for key, name in names.items())
     plan = file.plan
-    done = len(analysis.results)
+    done = len(analysis.runs)
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -99,7 +99,7 @@ def page(
 
 
 def _learnt_from_data(
-    analysis: Analysis, figures: Sequence[Picture], tables: Sequence[Printed]
+    analysis: Analysis, figures: Sequence[Picture], tables: Sequence[TextTable]
 ) -> str:
     """What cells that learn from data add, tables opened; it comes first."""
     own = [figure for figure in figures if figure.name.startswith(_OFFLINE)]
@@ -139,8 +139,8 @@ def _in_words(analysis: Analysis) -> str:
 
 def _origin(analysis: Analysis) -> str:
     file, plan = analysis.file, analysis.file.plan
-    results = [run.result for run in analysis.results]
-    hours = sum(result.timing.total for result in results) / 3600.0
+    results = [analysis.cells[key] for key in analysis.runs.key]
+    hours = analysis.runs.seconds.sum() / 3600.0
     versions = Counter(
         ", ".join(f"{name} {version}" for name, version in sorted(result.versions.items()))
         for result in results
@@ -176,7 +176,7 @@ def _origin(analysis: Analysis) -> str:
     gaps = [
         f"{gap.algorithm} on {gap.class_name}, run {gap.run}"
         + (f": failed: {gap.error}" if gap.error else "")
-        for gap in analysis.missing
+        for gap in analysis.missing.itertuples()
     ]
     named = ""
     if gaps:
@@ -204,13 +204,13 @@ def _figure(figure: Picture) -> str:
     )
 
 
-def _table(table: Printed, *, opened: bool = False) -> str:
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in table.columns)
+def _table(table: TextTable, *, opened: bool = False) -> str:
+    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in table.frame.columns)
     rows = "".join(
         f'<tr><th scope="row">{escape(first)}</th>'
         + "".join(f"<td>{escape(entry)}</td>" for entry in rest)
         + "</tr>"
-        for first, *rest in table.rows
+        for first, *rest in table.frame.itertuples(index=False)
     )
     label = escape(table.title, quote=True)
     return (

@@ -1,23 +1,65 @@
-"""What a study's report is made of, as plain values: `analysis` computes them.
+"""Summary tables of a study: functions from its frames (`frames`) to frames.
 
-Axis letters: `P` evaluations of a learning curve, `K` thresholds of a profile.
-"""
+The run is the unit: its regions and evaluations are no further evidence. Missing runs are counted
+in `counts` and `missing`, and are part of no other number. An unknown interval end is NaN.
+
+    value            1 − normalised regret, for statistics that expect more to be better
+    change           IQM over run numbers i of  x_i(class) − x_i(first class)
+    low, high        ends of a 95 % bootstrap interval (`statistics`); NaN for a single run
+
+| table | one row per | columns |
+|---|---|---|
+| `runs` | run | class_name, algorithm, run, and `frames.RUN_COLUMNS` |
+| `counts` | class × algorithm | done, failed, planned |
+| `missing` | run that has not finished | run, error ("" if it has not failed) |
+| `regions` | class × algorithm × region | epsilon_high, runs, similarity (IQM), similarity_q25, similarity_q75, normalised_regret (IQM), linear_normalised_regret (median) |
+| `levels` | class × algorithm × metric | runs, iqm, low, high, linear (median of the linear policy on the same tasks) |
+| `contrasts` | class × algorithm × metric | axis, base (IQM on the first class), level (IQM on this one), change, low, high, pairs, enough_pairs, verdict (worse, better, open) |
+| `aggregates` | group × metric × algorithm × statistic | classes, runs, fewest_runs (in a class), value, low, high |
+| `profiles` | group × metric × algorithm × threshold | fewest_runs, share (of runs whose value is above the threshold), low, high |
+| `improvements` | group × metric × pair of algorithms | first, second, classes, fewest_runs, probability, low, high |
+| `learning_curves` | class × algorithm × measure × step | median, q25, q75 over runs, smoothed; runs, window (evaluations averaged) |
+| `offline` | class × ν × learner | runs, similarity, similarity_sd, improvement (means over runs), low, high, verdict (above, above_few, below, below_few, open), behaviour_similarity, behaviour_similarity_sd, data_sets, constant_similarity |
+"""  # noqa: E501
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-from sme_registry.spec import PlannedCell, StudyFile
-from sme_registry.statistics import Array, Estimate
-from sme_registry.studies.engine.result import CellResult
+import numpy as np
+import pandas as pd
 
-# Under this many runs an interval is an indication only. Of normal, exponential and two-humped
-# runs a 95 % interval of one class holds the truth in 32–62 % of cases with 2 runs, in 48–86 %
-# with 3, in 94–98 % with 4 to 10.
+from sme_registry import statistics
+from sme_registry.spec import StudyAlgorithm, StudyPlan
+from sme_registry.statistics import Array, Statistic
+from sme_registry.studies.report.classes import ClassInfo, Group
+from sme_registry.studies.report.frames import (
+    RUN,
+    RUN_COLUMNS,
+    frame,
+    ordered,
+    window,
+)
+
+# With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
+# 95 % interval of one class covers the truth in 32–62 % of cases with 2 runs, in 48–86 % with 3, in
+# 94–98 % with 4 to 10.
 ENOUGH_RUNS = 5
-OFFLINE_INTERVAL = 4  # runs under which a mean improvement has no interval at all
+OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
+THRESHOLDS = np.linspace(0.0, 1.0, 101)
+STATISTICS: dict[str, Statistic] = {
+    "iqm": statistics.iqm,
+    "median": statistics.median,
+    "optimality_gap": statistics.optimality_gap,
+}
+CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per step"}
+_PLACE = ["class_name", "algorithm"]
+
+Runs = Mapping[tuple[str, str], pd.DataFrame]
 
 
 @dataclass(frozen=True)
@@ -25,333 +67,399 @@ class Metric:
     """A number of a run that a task may change.
 
     Attributes:
-      key: as in tables.
-      label: as on an axis of a figure.
+      key: its column in `results`.
+      label: on an axis of a figure.
       worse: +1 where more of it is worse, −1 where less is.
-      of: reads it from a result; None where the run has none.
     """
 
     key: str
     label: str
     worse: int
-    of: Callable[[CellResult], float | None]
+
+
+METRICS = (
+    Metric("wd_regret", "WD regret", 1),
+    Metric("ood_regret", "OOD regret", 1),
+    Metric("ood_decay", "OOD decay", 1),
+    Metric("final_return", "final return, % of optimum", -1),
+    Metric("online_regret", "online regret", 1),
+)
+REGRET_METRICS = METRICS[:2]
 
 
 @dataclass(frozen=True)
-class ClassInfo:
-    """A class of the plan, seen from the first one.
+class Bootstrap:
+    """Intervals as a function of the study, of the table and of the row that they are in.
 
     Attributes:
-      name: in the plan.
-      axis: the field in which it differs from the first class; "" for the first; `SEVERAL`.
-        `policy_init` counts only where nothing else differs, as its readings part with others.
-      label: `k = 25`; of several axes each of them.
-      setting: every axis' value.
+      digest: of the study's plan.
+      draws: bootstrap samples of each interval.
     """
 
-    name: str
-    axis: str
-    label: str
-    setting: Mapping[str, Any]
+    digest: str
+    draws: int = statistics.DRAWS
+
+    def seed(self, *parts: str) -> str:
+        """The seed of an interval."""
+        return " ".join((self.digest, *parts))
+
+    def interval(
+        self, values: Array, label: str, statistic: Statistic = statistics.iqm
+    ) -> tuple[float, float]:
+        """The interval of a statistic of `[n]` runs; NaN for a single run."""
+        if len(values) < 2:
+            return math.nan, math.nan
+        column = {"": np.asarray(values)[:, None]}
+        low, high = statistics.stratified_bootstrap(column, self.draws, self.seed(label), statistic)
+        return float(low[0]), float(high[0])
 
 
-@dataclass(frozen=True)
-class Run:
-    """A finished run and its place in the plan."""
-
-    planned: PlannedCell
-    result: CellResult
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """Class and algorithm."""
-        return self.planned.class_name, self.planned.algorithm
+def runs(results: pd.DataFrame) -> pd.DataFrame:
+    """One row per run: `results` without the columns of its regions."""
+    return results.drop_duplicates(RUN)[[*RUN, *RUN_COLUMNS]].reset_index(drop=True)
 
 
-class Missing(NamedTuple):
-    """A run that the plan has and the folder has not; `error` where it failed."""
-
-    class_name: str
-    algorithm: str
-    run: int
-    error: str
-
-
-class Count(NamedTuple):
-    """Runs of an algorithm on a class."""
-
-    class_name: str
-    algorithm: str
-    done: int
-    failed: int
-    planned: int
+def missing(plan: StudyPlan, runs: pd.DataFrame, errors: Mapping[str, str]) -> pd.DataFrame:
+    """The runs that have not finished, in the plan's order; `errors` are by the cells' digests."""
+    done = set(runs.key)
+    rows = [
+        (cell.class_name, cell.algorithm, cell.run, errors.get(cell.cell.digest, ""))
+        for cell in plan.cells
+        if cell.cell.digest not in done
+    ]
+    columns = {"class_name": "str", "algorithm": "str", "run": "int64", "error": "str"}
+    return frame(rows, columns)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Learning curves of an algorithm on a class, of one measure.
-
-    Attributes:
-      steps: `[P]` environment steps.
-      median: `[P]` over runs, smoothed.
-      low: `[P]` lower quartile over runs, smoothed.
-      high: `[P]` upper quartile.
-      runs: how many.
-      window: evaluations that were averaged.
-    """
-
-    class_name: str
-    algorithm: str
-    measure: str
-    steps: Array
-    median: Array
-    low: Array
-    high: Array
-    runs: int
-    window: int
+def counts(plan: StudyPlan, missing: pd.DataFrame) -> pd.DataFrame:
+    """How many runs of each algorithm on each class have finished and failed."""
+    planned = frame(
+        [(c.class_name, c.algorithm) for c in ordered(plan)], dict.fromkeys(_PLACE, "str")
+    )
+    table = planned.groupby(_PLACE, sort=False).size().rename("planned").to_frame()
+    absent = missing.groupby(_PLACE).size().reindex(table.index, fill_value=0)
+    failed = missing[missing.error != ""].groupby(_PLACE).size()
+    table.insert(0, "done", table.planned - absent)
+    table.insert(1, "failed", failed.reindex(table.index, fill_value=0))
+    return table.reset_index()
 
 
-class RegionRow(NamedTuple):
-    """An algorithm on a class in a region: over its runs.
-
-    `linear` is the normalised regret of the linear least-squares policy on the same states.
-    """
-
-    class_name: str
-    algorithm: str
-    region: str
-    epsilon: float
-    runs: int
-    similarity: float
-    similarity_low: float
-    similarity_high: float
-    regret: float
-    linear: float
-
-
-class DecayRow(NamedTuple):
-    """A run: its similarity within the cube, and what it loses in the outermost shell."""
-
-    class_name: str
-    algorithm: str
-    run: int
-    state_dim: int
-    epsilon: float
-    similarity: float
-    decay: float
-    decay_points: float
-
-
-@dataclass(frozen=True)
-class Level:
-    """An algorithm on a class by one metric: IQM over its runs, with its interval.
-
-    Attributes:
-      low: lower end; None from a single run.
-      linear: the linear policy's median on the same tasks, where the metric is of a region.
-    """
-
-    class_name: str
-    algorithm: str
-    metric: str
-    runs: int
-    value: float
-    low: float | None
-    high: float | None
-    linear: float | None
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """What a class changes for an algorithm, against the plan's first class.
-
-    Attributes:
-      base: IQM on the first class, of the paired runs.
-      level: IQM on this class, of the same run numbers.
-      change: IQM of the paired differences.
-      low: lower end of its interval; None from a single pair.
-      high: upper end.
-      pairs: run numbers that both classes have.
-      worse: +1 where a rise is worse, −1 where a fall is.
-    """
-
-    class_name: str
-    axis: str
-    algorithm: str
-    metric: str
-    base: float
-    level: float
-    change: float
-    low: float | None
-    high: float | None
-    pairs: int
-    worse: int
-
-    @property
-    def verdict(self) -> str:
-        """`worse`, `better` or `open`: whether the interval leaves out 0, and on which side."""
-        if self.low is None or self.high is None or self.low <= 0.0 <= self.high:
-            return "open"
-        return "worse" if self.change * self.worse > 0 else "better"
-
-    @property
-    def settled(self) -> bool:
-        """Whether there are runs enough for the interval to hold what it says."""
-        return self.pairs >= ENOUGH_RUNS
-
-
-@dataclass(frozen=True)
-class Aggregate:
-    """An algorithm's score over the classes of a group, classes counting alike.
-
-    Attributes:
-      group: an axis, with the first class; or all classes.
-      metric: of which the score is 1 minus it.
-      statistic: "iqm", "median" or "optimality_gap", taken within each class.
-      classes: how many: those where every compared algorithm has runs.
-      runs: in them.
-      fewest: runs in the class that has the fewest.
-    """
-
-    group: str
-    algorithm: str
-    metric: str
-    statistic: str
-    classes: int
-    runs: int
-    fewest: int
-    value: float
-    low: float | None
-    high: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """The share of an algorithm's runs that score above each of `[K]` thresholds."""
-
-    group: str
-    algorithm: str
-    metric: str
-    fewest: int
-    thresholds: Array
-    estimate: Estimate
-
-
-@dataclass(frozen=True)
-class Improvement:
-    """How probably a run of one algorithm beats one of another, over the classes of a group."""
-
-    group: str
-    metric: str
-    first: str
-    second: str
-    classes: int
-    fewest: int
-    value: float
-    low: float | None
-    high: float | None
-
-
-class OfflineData(NamedTuple):
-    """Data sets of one ν on a class: who made them, beside a constant.
-
-    Attributes:
-      sets: how many data sets.
-      behaviour: mean r̃ of the policy that made them, over the sets.
-      behaviour_sd: standard deviation over steps, its mean over the sets.
-      constant: mean r̃ of the constant ½ within distribution, over the runs.
-    """
-
-    class_name: str
-    nu: float
-    sets: int
-    behaviour: float
-    behaviour_sd: float
-    constant: float
-
-
-class OfflineScore(NamedTuple):
-    """What a learner made of data sets of one ν on a class.
-
-    Attributes:
-      learner: what it `uses`, with its settings where the plan has several.
-      runs: how many.
-      score: mean r̃ of the last live episodes, over the runs.
-      score_sd: standard deviation over steps, its mean over the runs.
-      change: mean over the runs of r̃ less the r̃ of the policy that made the run's data.
-      low: lower end of the 95 % interval of `change`; None under `OFFLINE_INTERVAL` runs.
-      high: upper end.
-      changes: of the runs.
-    """
-
-    class_name: str
-    nu: float
-    learner: str
-    runs: int
-    score: float
-    score_sd: float
-    change: float
-    low: float | None
-    high: float | None
-    changes: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Group:
-    """Classes that are looked at together.
-
-    Attributes:
-      name: `all classes`, or an axis as a reader calls it.
-      axis: the field; "" for all classes.
-      classes: in the order of the axis' values, the first class of the plan among them.
-      compared: those where every algorithm that is compared has runs.
-      left_out: the others that have any.
-    """
-
-    name: str
-    axis: str
-    classes: tuple[str, ...]
-    compared: tuple[str, ...]
-    left_out: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Analysis:
-    """A study's tables.
-
-    Attributes:
-      file: the plan.
-      results: finished runs, in the plan's order.
-      algorithms: those with a finished run, in the plan's order.
-      learners: those of them that learn.
-      base: the first class' name.
-      offline_data: of cells that learn from data, by class and ν; empty where there are none.
-      offline: their learners, likewise.
-    """
-
-    file: StudyFile
-    results: tuple[Run, ...]
-    missing: tuple[Missing, ...]
-    counts: tuple[Count, ...]
-    classes: Mapping[str, ClassInfo]
-    algorithms: tuple[str, ...]
-    learners: tuple[str, ...]
-    base: str
-    groups: tuple[Group, ...]
-    curves: tuple[Curve, ...]
-    regions: tuple[RegionRow, ...]
-    decay: tuple[DecayRow, ...]
-    levels: tuple[Level, ...]
-    contrasts: tuple[Contrast, ...]
-    aggregates: tuple[Aggregate, ...]
-    profiles: tuple[Profile, ...]
-    improvements: tuple[Improvement, ...]
-    offline_data: tuple[OfflineData, ...] = ()
-    offline: tuple[OfflineScore, ...] = ()
-
-    def level(self, class_name: str, algorithm: str, metric: str) -> Level | None:
-        """A level; None where there are no runs."""
-        wanted = class_name, algorithm, metric
-        return next(
-            (x for x in self.levels if (x.class_name, x.algorithm, x.metric) == wanted), None
+def regions(results: pd.DataFrame) -> pd.DataFrame:
+    """Each algorithm on each class in each region, over its runs."""
+    return (
+        results.groupby([*_PLACE, "region"], sort=False)
+        .agg(
+            epsilon_high=("epsilon_high", "first"),
+            runs=("run", "size"),
+            similarity=("similarity", _iqm),
+            similarity_q25=("similarity", lambda values: np.quantile(values, 0.25)),
+            similarity_q75=("similarity", lambda values: np.quantile(values, 0.75)),
+            normalised_regret=("normalised_regret", _iqm),
+            linear_normalised_regret=("linear_normalised_regret", "median"),
         )
+        .reset_index()
+    )
+
+
+def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The IQM of every metric."""
+    linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
+    rows = []
+    for place, group in by_place(runs(results)).items():
+        for metric in METRICS:
+            values = group[metric.key].dropna().to_numpy()
+            if len(values):
+                low, high = bootstrap.interval(values, _label("level", place, metric))
+                reference = linear[place].get(metric.key, math.nan)
+                rows.append((*place, metric.key, len(values), _iqm(values), low, high, reference))
+    return frame(rows, _PLACE_METRIC | {"runs": "int64"} | _floats("iqm low high linear"))
+
+
+def contrasts(
+    runs: pd.DataFrame, classes: Mapping[str, ClassInfo], bootstrap: Bootstrap
+) -> pd.DataFrame:
+    """What each class changes compared with the plan's first one, between runs of equal number."""
+    first = next(iter(classes))
+    keys = [metric.key for metric in METRICS]
+    base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
+    pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
+    rows = []
+    for place, group in by_place(pairs).items():
+        for metric in METRICS:
+            both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
+            if not len(both):
+                continue
+            change = both[:, 0] - both[:, 1]
+            low, high = bootstrap.interval(change, _label("contrast", place, metric))
+            level, before = statistics.iqm(both)
+            middle = _iqm(change)
+            verdict = contrast_verdict(middle * metric.worse, low, high)
+            rows.append(
+                (*place, metric.key, classes[place[0]].axis, before, level, middle, low, high,
+                 len(both), len(both) >= ENOUGH_RUNS, verdict)
+            )  # fmt: skip
+    columns = {"axis": "str", **_floats("base level change low high"), "pairs": "int64",
+               "enough_pairs": "bool", "verdict": "str"}  # fmt: skip
+    return frame(rows, _PLACE_METRIC | columns)
+
+
+def contrast_verdict(worsening: float, low: float, high: float) -> str:
+    """`worse` or `better` where the interval of a change excludes 0, else `open`."""
+    if not (low > 0.0 or high < 0.0):
+        return "open"
+    return "worse" if worsening > 0 else "better"
+
+
+def aggregates(
+    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
+) -> pd.DataFrame:
+    """Statistics of 1 − normalised regret over the classes of each group; classes count alike."""
+    rows = []
+    for group, metric, algorithm, values in _compared(runs, groups, algorithms):
+        sizes = [len(x) for x in values.values()]
+        classes = {name: x[:, None] for name, x in values.items()}
+        seed = bootstrap.seed("aggregate", algorithm, metric.key)
+        for name, statistic in STATISTICS.items():
+            low, high = statistics.stratified_bootstrap(classes, bootstrap.draws, seed, statistic)
+            ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
+            value = statistics.aggregate(classes, statistic)[0]
+            rows.append(
+                (group.name, metric.key, algorithm, name, len(sizes), sum(sizes), min(sizes), value,
+                 *ends)
+            )  # fmt: skip
+    columns = _strings("group metric algorithm statistic") | _integers("classes runs fewest_runs")
+    return frame(rows, columns | _floats("value low high"))
+
+
+def profiles(
+    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
+) -> pd.DataFrame:
+    """Shares of runs whose 1 − normalised regret is above each threshold."""
+    rows: list[Any] = []
+    for group, metric, algorithm, values in _compared(runs, groups, algorithms):
+        fewest = min(map(len, values.values()))
+        seed = bootstrap.seed("profile", algorithm, metric.key)
+        shares = statistics.performance_profile(values, THRESHOLDS, bootstrap.draws, seed)
+        shares_at = zip(THRESHOLDS.round(4), shares.value, shares.low, shares.high, strict=True)
+        rows += [(group.name, metric.key, algorithm, fewest, *at) for at in shares_at]
+    columns = _strings("group metric algorithm") | _integers("fewest_runs")
+    return frame(rows, columns | _floats("threshold share low high"))
+
+
+def improvements(
+    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
+) -> pd.DataFrame:
+    """Every pair of algorithms, except those that learnt from different data."""
+    data, at = training_data(runs), by_place(runs)
+    pairs = [
+        pair
+        for pair in itertools.combinations(algorithms, 2)
+        if len({data[name] for name in pair} - {None}) < 2
+    ]
+    rows = []
+    for group, metric, (first, second) in itertools.product(groups, REGRET_METRICS, pairs):
+        if not group.compared:
+            continue
+        x, y = (_values(at, group, algorithm, metric) for algorithm in (first, second))
+        fewest = min(len(values) for values in (*x.values(), *y.values()))
+        seed = bootstrap.seed("improvement", first, second, metric.key)
+        estimate = statistics.probability_of_improvement(x, y, bootstrap.draws, seed)
+        ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
+        place = group.name, metric.key, first, second
+        rows.append((*place, len(x), fewest, estimate.value[0], *ends))
+    columns = _strings("group metric first second") | _integers("classes fewest_runs")
+    return frame(rows, columns | _floats("probability low high"))
+
+
+def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Median and quartiles over runs, then the mean over a window of evaluations."""
+    horizons = runs.groupby("class_name").horizon.first()
+    tables = [frame([], _CURVE_COLUMNS)]
+    for (class_name, algorithm), group in curves.groupby(_PLACE, sort=False):
+        each = [run for _, run in group.groupby("run")]
+        P = min(map(len, each))
+        steps = np.median([run.step[:P] for run in each], axis=0).astype(int)
+        for measure in CURVES:
+            values = np.array([run[measure][:P] for run in each])
+            if measure == "episode_return":
+                values *= 100.0 / horizons[class_name]
+            quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            q25, median, q75 = (_smoothed(line, window(P)) for line in quartiles)
+            table = {
+                "class_name": class_name, "algorithm": algorithm, "measure": measure, "step": steps,
+                "median": median, "q25": q25, "q75": q75, "runs": len(each), "window": window(P),
+            }  # fmt: skip
+            tables.append(pd.DataFrame(table))
+    return pd.concat(tables, ignore_index=True).astype(_CURVE_COLUMNS)
+
+
+def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
+    """Each algorithm's data as (ν, transitions); None where it learns online or not at all."""
+    return {
+        row.algorithm: None if math.isnan(row.nu) else (row.nu, int(row.transitions))
+        for row in runs.drop_duplicates("algorithm").itertuples()
+    }
+
+
+def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
+    """One row per run of an offline learner: with `learner` and the WD `constant_similarity`.
+
+    Ordered by class, ν, learner and run.
+    """
+    names = learner_names(algorithms)
+    places = list(dict.fromkeys(names.values()))
+    rows = results[results.nu.notna()].drop_duplicates(RUN)
+    rows = rows.assign(learner=rows.algorithm.map(names))
+    order = {name: i for i, name in enumerate(dict.fromkeys(rows.class_name))}
+    keys = pd.DataFrame({
+        "class": rows.class_name.map(order), "nu": rows.nu,
+        "learner": rows.learner.map(places.index), "run": rows.run,
+    })  # fmt: skip
+    return rows.loc[keys.sort_values([*keys], kind="stable").index].reset_index(drop=True)
+
+
+def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """Each offline learner on each class at each ν, with the data that it learnt from.
+
+    Args:
+      runs: see `offline_runs`.
+      bootstrap: of the intervals.
+    """
+    data = {place: _data_columns(group) for place, group in runs.groupby(["class_name", "nu"])}
+    rows = []
+    for (class_name, nu, learner), group in runs.groupby(
+        ["class_name", "nu", "learner"], sort=False
+    ):
+        changes = group.improvement.to_numpy()
+        low = high = math.nan
+        if len(changes) >= OFFLINE_INTERVAL:
+            label = f"offline {learner} {class_name} {nu:g}"
+            low, high = bootstrap.interval(changes, label, statistics.mean)
+        rows.append(
+            {
+                "class_name": class_name, "nu": nu, "learner": learner, "runs": len(group),
+                "similarity": group.offline_similarity.to_numpy().mean(),
+                "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
+                "improvement": changes.mean(), "low": low, "high": high,
+                "verdict": offline_verdict(changes, low, high), **data[class_name, nu],
+            }
+        )  # fmt: skip
+    columns = {
+        "class_name": "str", "nu": "float64", "learner": "str", "runs": "int64",
+        **_floats("similarity similarity_sd improvement low high"), "verdict": "str",
+        **_floats("behaviour_similarity behaviour_similarity_sd"), "data_sets": "int64",
+        "constant_similarity": "float64",
+    }  # fmt: skip
+    return frame(rows, columns)
+
+
+def offline_verdict(improvements: Array, low: float, high: float) -> str:
+    """Whether a learner surpasses its data, from the improvements of its runs.
+
+    `above` or `below` if `ENOUGH_RUNS` runs have an interval that excludes 0; `above_few` or
+    `below_few` if all of fewer runs, but more than one, are on one side; otherwise `open`.
+    """
+    if len(improvements) >= ENOUGH_RUNS:
+        return "above" if low > 0.0 else "below" if high < 0.0 else "open"
+    if len(improvements) > 1 and improvements.min() > 0.0:
+        return "above_few"
+    return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
+
+
+def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
+    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
+    settings = {
+        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
+        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
+        for algorithm in algorithms
+    }
+    names = {}
+    for algorithm in algorithms:
+        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
+        own = settings[algorithm.name]
+        differing = [
+            f"{key} = {own[key]}" if key in own else f"default {key}"
+            for key in sorted({key for each in alike for key in each})
+            if any(each.get(key) != alike[0].get(key) for each in alike)
+        ]
+        name = algorithm.uses.removeprefix("offline:").upper()
+        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
+    return names
+
+
+def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
+    """The rows of each (class, algorithm), in their order."""
+    return dict(iter(rows.groupby(_PLACE, sort=False)))
+
+
+def _data_columns(runs: pd.DataFrame) -> dict[str, Any]:
+    """The data sets of one ν on a class; each counts once, however many runs learnt from it."""
+    data_sets = runs.drop_duplicates("dataset_digest")
+    return {
+        "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
+        "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
+        "data_sets": len(data_sets),
+        "constant_similarity": runs.constant_similarity.to_numpy().mean(),
+    }
+
+
+def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
+    """The regret metrics of the linear policy: medians over the tasks of an algorithm's runs."""
+    regrets = [run.linear_normalised_regret.to_numpy() for _, run in results.groupby("run")]
+    wd = np.array([regret[0] for regret in regrets])
+    ood = np.array([regret[1:].mean() if len(regret) > 1 else math.nan for regret in regrets])
+    values = {"wd_regret": wd, "ood_regret": ood, "ood_decay": ood - wd}
+    return {key: float(np.median(value)) for key, value in values.items()}
+
+
+def _compared(
+    runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str]
+) -> Iterator[tuple[Group, Metric, str, dict[str, Array]]]:
+    """Each group that can be compared, with each regret metric and algorithm, and its values."""
+    at = by_place(runs)
+    comparable = [group for group in groups if group.compared]
+    for group, metric, algorithm in itertools.product(comparable, REGRET_METRICS, algorithms):
+        yield group, metric, algorithm, _values(at, group, algorithm, metric)
+
+
+def _values(at: Runs, group: Group, algorithm: str, metric: Metric) -> dict[str, Array]:
+    """`[n]` 1 − regret of the runs of each class."""
+    return {name: 1.0 - at[name, algorithm][metric.key].to_numpy() for name in group.compared}
+
+
+def _iqm(values: Any) -> float:
+    return float(statistics.iqm(values))
+
+
+def _label(table: str, place: tuple[str, str], metric: Metric) -> str:
+    class_name, algorithm = place
+    return f"{table} {algorithm} {class_name} {metric.key}"
+
+
+def _smoothed(line: Array, width: int) -> Array:
+    """Means over the last `width` entries, fewer at the beginning."""
+    total = np.concatenate([[0.0], np.cumsum(line)])
+    ends = np.arange(1, len(line) + 1)
+    begins = np.maximum(0, ends - width)
+    return np.asarray((total[ends] - total[begins]) / (ends - begins))
+
+
+def _floats(names: str) -> dict[str, str]:
+    return dict.fromkeys(names.split(), "float64")
+
+
+def _integers(names: str) -> dict[str, str]:
+    return dict.fromkeys(names.split(), "int64")
+
+
+def _strings(names: str) -> dict[str, str]:
+    return dict.fromkeys(names.split(), "str")
+
+
+_PLACE_METRIC = _strings("class_name algorithm metric")
+_CURVE_COLUMNS = (
+    _strings("class_name algorithm measure")
+    | _integers("step")
+    | _floats("median q25 q75")
+    | _integers("runs window")
+)

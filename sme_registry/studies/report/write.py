@@ -18,9 +18,9 @@ from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 from sme_registry.studies.engine.ledger import REPORT, Ledger
 from sme_registry.studies.report.analysis import analyse
-from sme_registry.studies.report.exports import data, printed
-from sme_registry.studies.report.figures import pictures
-from sme_registry.studies.report.offline import offline_data, offline_pictures, offline_printed
+from sme_registry.studies.report.exports import csv_tables, text_tables
+from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.frames import plan_file
 from sme_registry.studies.report.page import page
 
 FORMATS = ("html", "png", "pdf", "csv", "latex")
@@ -55,11 +55,7 @@ def write_report(
     if unknown or not formats:
         raise OptionError(f"format={','.join(unknown)!r}: must be of {', '.join(FORMATS)}.")
     ledger = Ledger(folder)
-    file = ledger.plan_file()
-    if file is None:
-        raise OptionError(
-            f"folder={str(folder)!r}: holds no study. Give the folder of `sme study run`."
-        )
+    file = plan_file(ledger)
     keys = [planned.cell.digest for planned in file.plan.cells]
     results = ledger.results(keys)
     if not results:
@@ -69,12 +65,10 @@ def write_report(
         )
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     analysis = analyse(file, results, failures)
-    tables = [*offline_printed(analysis), *printed(analysis)]
-    numbers = [*data(analysis), *offline_data(analysis)]
+    tables = text_tables(analysis)
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     drawn = [ending for name, ending in _DRAWN.items() if name in formats]
-    figures, absent = pictures(analysis, drawn, models) if drawn else ([], [])
-    figures += offline_pictures(analysis, drawn) if drawn else []
+    figures, absent = draw_figures(analysis, drawn, models) if drawn else ([], [])
 
     target = Path(folder) / REPORT if out is None else Path(out)
     contents: dict[str, str | bytes] = {}
@@ -84,7 +78,7 @@ def write_report(
         if ending in formats:
             contents |= {f"figures/{x.name}.{ending}": x.files[ending] for x in figures}
     if "csv" in formats:
-        contents |= {f"tables/{table.name}.csv": table.csv() for table in numbers}
+        contents |= {f"tables/{name}.csv": text for name, text in csv_tables(analysis).items()}
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
     return [write_atomically(target / name, content) for name, content in contents.items()]

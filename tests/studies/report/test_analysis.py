@@ -1,18 +1,24 @@
-"""A study's tables: what is in them is what the runs left, and what is missing is in none."""
+"""A study's tables: they hold what the runs left, and missing runs are part of no number."""
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sme_registry import statistics
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import ALL, METRICS, SEVERAL, analyse, window
-from sme_registry.studies.report.tables import Analysis, Contrast
+from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.classes import ALL, SEVERAL
+from sme_registry.studies.report.frames import window
+from sme_registry.studies.report.tables import METRICS
+
+TABLES = (
+    "learning_curves", "regions", "levels", "contrasts", "aggregates", "profiles", "improvements",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +26,8 @@ def study(finished: Path) -> tuple[Any, dict[str, Any], Analysis]:
     ledger = Ledger(finished)
     file, results = ledger.plan_file(), ledger.results()
     assert file is not None
-    failures = {key: failure.error for key, failure in ledger.failures().items()}
-    return file, results, analyse(file, results, failures, draws=200)
+    errors = {key: failure.error for key, failure in ledger.failures().items()}
+    return file, results, analyse(file, results, errors, draws=200)
 
 
 def regrets(study: Any, class_name: str, algorithm: str) -> dict[int, float]:
@@ -34,22 +40,29 @@ def regrets(study: Any, class_name: str, algorithm: str) -> dict[int, float]:
     }
 
 
-def contrast(analysis: Analysis, class_name: str, algorithm: str, metric: str) -> Contrast:
+def row_of(table: pd.DataFrame, class_name: str, algorithm: str, metric: str) -> Any:
+    """The only row of a place; None where there is none."""
     wanted = class_name, algorithm, metric
-    (found,) = (r for r in analysis.contrasts if (r.class_name, r.algorithm, r.metric) == wanted)
-    return found
+    rows = [r for r in table.itertuples() if (r.class_name, r.algorithm, r.metric) == wanted]
+    assert len(rows) < 2
+    return rows[0] if rows else None
+
+
+def contrast(analysis: Analysis, class_name: str, algorithm: str, metric: str) -> Any:
+    return row_of(analysis.contrasts, class_name, algorithm, metric)
 
 
 def test_what_is_missing_is_counted_and_named(study):
     analysis = study[2]
-    assert [(*gap[:3], bool(gap.error)) for gap in analysis.missing] == [
-        ("k-25", "Beta", 3, True),
-        ("k-25", "Beta", 4, False),
+    assert list(analysis.missing.itertuples(index=False, name=None)) == [
+        ("k-25", "Beta", 3, "ValueError: <b>bad</b>"),
+        ("k-25", "Beta", 4, ""),
     ]
-    counts = {count[:2]: count[2:] for count in analysis.counts}
+    rows = analysis.counts.itertuples(index=False, name=None)
+    counts = {count[:2]: count[2:] for count in rows}
     assert counts["k-25", "Beta"] == (3, 1, 5)
     assert counts["default", "Alpha"] == (5, 0, 5)
-    assert len(analysis.results) == sum(count.done for count in analysis.counts) == 73
+    assert len(analysis.runs) == analysis.counts.done.sum() == 73
 
 
 def test_a_class_is_known_by_the_axis_in_which_it_differs_from_the_first(study):
@@ -70,7 +83,7 @@ def test_a_contrast_pairs_runs_of_one_number(study):
     assert row.pairs == 3
     assert row.change == pytest.approx(statistics.iqm([after[i] - before[i] for i in range(3)]))
     assert row.base == pytest.approx(statistics.iqm([before[i] for i in range(3)]))
-    assert not row.settled
+    assert not row.enough_pairs
     assert row.verdict == "worse"
 
 
@@ -78,14 +91,13 @@ def test_contrasts_find_what_each_learner_was_made_to_suffer_from(study):
     analysis = study[2]
     for algorithm, class_name in (("Alpha", "r_min-0_5"), ("Beta", "k-25")):
         rows = [
-            row for row in analysis.contrasts
+            row for row in analysis.contrasts.itertuples()
             if (row.algorithm, row.metric) == (algorithm, "wd_regret")
         ]  # fmt: skip
         assert max(rows, key=lambda row: row.change).class_name == class_name
     row = contrast(analysis, "r_min-0_5", "Alpha", "wd_regret")
-    assert row.low is not None
     assert row.low > 0.2
-    assert row.settled
+    assert row.enough_pairs
     assert contrast(analysis, "r_min-0_5", "Alpha", "final_return").verdict == "worse"
     assert contrast(analysis, "r_min-0_5", "constant", "wd_regret").verdict == "open"
 
@@ -93,17 +105,18 @@ def test_contrasts_find_what_each_learner_was_made_to_suffer_from(study):
 def test_what_learns_nothing_has_no_regret_of_training(study):
     analysis = study[2]
     assert analysis.learners == ("Alpha", "Beta")
-    assert analysis.level("default", "constant", "online_regret") is None
-    assert analysis.level("default", "Alpha", "online_regret") is not None
+    assert row_of(analysis.levels, "default", "constant", "online_regret") is None
+    assert row_of(analysis.levels, "default", "Alpha", "online_regret") is not None
 
 
 def test_one_run_has_no_interval(study):
     file, results, _ = study
     first = [cell for cell in file.plan.cells if cell.run == 0]
     alone = analyse(file, {c.cell.digest: results[c.cell.digest] for c in first}, draws=50)
-    for row in (*alone.contrasts, *alone.levels, *alone.aggregates, *alone.improvements):
-        assert (row.low, row.high) == (None, None)
-    assert {row.verdict for row in alone.contrasts} == {"open"}
+    for table in (alone.contrasts, alone.levels, alone.aggregates, alone.improvements):
+        assert len(table) > 0
+        assert table[["low", "high"]].isna().all(axis=None)
+    assert set(alone.contrasts.verdict) == {"open"}
 
 
 def test_only_classes_where_all_have_runs_are_compared(study):
@@ -116,21 +129,23 @@ def test_only_classes_where_all_have_runs_are_compared(study):
     group = cut.groups[0]
     assert group.name == ALL
     assert group.left_out == ("plane",)
-    assert {row.classes for row in cut.aggregates if row.group == ALL} == {4}
+    assert set(cut.aggregates[cut.aggregates.group == ALL].classes) == {4}
 
 
 def test_curves_are_the_median_over_runs_then_smoothed(study):
     file, results, analysis = study
-    (curve,) = (
-        c for c in analysis.curves
-        if (c.class_name, c.algorithm, c.measure) == ("default", "Alpha", "episode_return")
-    )  # fmt: skip
+    curves = analysis.learning_curves
+    curve = curves[
+        (curves.class_name == "default")
+        & (curves.algorithm == "Alpha")
+        & (curves.measure == "episode_return")
+    ]
     cells = [c.cell.digest for c in file.plan.cells if (c.class_name, c.algorithm) == (
         "default", "Alpha")]  # fmt: skip
     raw = 5.0 * np.median([results[key].curve.episode_return for key in cells], axis=0)  # T = 20
-    assert curve.window == 2
-    assert curve.median == pytest.approx([raw[0], *((raw[1:] + raw[:-1]) / 2)])
-    assert np.all((curve.low <= curve.median) & (curve.median <= curve.high))
+    assert set(curve.window) == {2}
+    assert list(curve["median"]) == pytest.approx([raw[0], *((raw[1:] + raw[:-1]) / 2)])
+    assert np.all((curve.q25 <= curve["median"]) & (curve["median"] <= curve.q75))
 
 
 @pytest.mark.parametrize(("evaluations", "width"), [(1, 1), (10, 1), (40, 4), (100, 10), (400, 10)])
@@ -141,31 +156,31 @@ def test_the_window_is_ten_evaluations_where_there_are_enough(evaluations: int, 
 def test_the_same_results_give_the_same_tables(study):
     file, results, analysis = study
     again = analyse(file, dict(reversed(results.items())), draws=200)
-    assert again.contrasts == analysis.contrasts
-    assert again.aggregates == analysis.aggregates
-    assert again.improvements == analysis.improvements
+    for table in TABLES:
+        pd.testing.assert_frame_equal(getattr(again, table), getattr(analysis, table), rtol=0)
 
 
 def test_without_the_first_class_there_are_no_contrasts(study):
     file, results, _ = study
     first = {c.cell.digest for c in file.plan.cells if c.class_name == "default"}
     cut = analyse(file, {k: v for k, v in results.items() if k not in first}, draws=50)
-    assert cut.contrasts == ()
-    assert len(cut.results) == len(results) - len(first)
+    assert cut.contrasts.empty
+    assert len(cut.runs) == len(results) - len(first)
 
 
 def test_of_no_result_there_are_no_numbers(study):
     empty = analyse(study[0], {}, draws=50)
     assert len(empty.missing) == 75
-    tables = dataclasses.asdict(empty)
-    for name in ("curves", "regions", "decay", "levels", "contrasts", "aggregates", "profiles"):
-        assert tables[name] == ()
+    assert empty.results.empty
+    for name in TABLES:
+        assert getattr(empty, name).empty
 
 
 def test_every_metric_says_which_way_is_worse():
     assert {metric.key: metric.worse for metric in METRICS} == {
         "wd_regret": 1,
         "ood_regret": 1,
+        "ood_decay": 1,
         "final_return": -1,
         "online_regret": 1,
     }

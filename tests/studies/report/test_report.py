@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from sme_registry.errors import OptionError
 from sme_registry.studies.engine.ledger import Ledger
-from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.findings import caveats, comparison, findings
-from sme_registry.studies.report.tables import Analysis
+from sme_registry.studies.report.tables import ENOUGH_RUNS, contrast_verdict
 
 pytest.importorskip("matplotlib")
 
 from sme_registry.cli.app import app
-from sme_registry.studies.report import write_report
-from sme_registry.studies.report.figures import pictures
+from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.write import write_report
 
 SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF"}
 FIGURES = {
     "contrasts-regret", "contrasts-training", "wd-regret", "ood-regret", "regions", "decay",
-    "scores", "profiles-wd", "profiles-ood", "improvement", "learning-curves-k",
+    "aggregates", "profiles-wd", "profiles-ood", "improvements", "learning-curves-k",
     "learning-curves-r_min", "learning-curves-complexity", "learning-curves-several-axes",
 }  # fmt: skip
 
@@ -130,22 +132,25 @@ def test_the_same_results_give_the_same_report(finished: Path, written: Path, tm
 
 
 def test_the_csv_holds_every_number_of_the_tables(written: Path, finished: Path):
-    with (written / "tables" / "contrasts.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
     ledger = Ledger(finished)
     file = ledger.plan_file()
     assert file is not None
-    failures = {key: failure.error for key, failure in ledger.failures().items()}
-    contrasts = analyse(file, ledger.results(), failures).contrasts
-    assert [float(row["change"]) for row in rows] == [row.change for row in contrasts]
-    assert [row["low"] for row in rows] == [str(row.low) for row in contrasts]
-    with (written / "tables" / "runs.csv").open(newline="") as stream:
-        assert len(list(csv.DictReader(stream))) == 73
+    errors = {key: failure.error for key, failure in ledger.failures().items()}
+    analysis = analyse(file, ledger.results(), errors)
+    for path in (written / "tables").glob("*.csv"):
+        table = getattr(analysis, path.stem)
+        numbers = table.select_dtypes("float64")
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        assert list(rows[0] if rows else table) == list(table)
+        read = [[float(row[name] or "nan") for name in numbers] for row in rows]
+        assert np.array_equal(read, numbers.to_numpy(), equal_nan=True)
+    assert len(analysis.results) == 73 * 3
 
 
 def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path):
     files = list((written / "tables").glob("*.tex"))
-    assert len(files) == 10
+    assert len(files) == 11
     for path in files:
         text = path.read_text()
         assert text.isascii(), path
@@ -169,14 +174,17 @@ def test_the_words_name_what_each_learner_was_made_to_suffer_from(analysis: Anal
 
 def contrasted(analysis: Analysis, *changes: tuple[str, str, dict[str, Any]]) -> Analysis:
     """With other contrasts of Alpha, each by its class and metric."""
-    rows = {(r.class_name, r.algorithm, r.metric): r for r in analysis.contrasts}
+    rows = analysis.contrasts.copy()
     for class_name, metric, fields in changes:
-        at = class_name, "Alpha", metric
-        rows[at] = dataclasses.replace(rows[at], **fields)
-    return dataclasses.replace(analysis, contrasts=tuple(rows.values()))
+        at = (rows.class_name == class_name) & (rows.algorithm == "Alpha") & (rows.metric == metric)
+        for name, value in fields.items():
+            rows.loc[at, name] = value
+    rows["enough_pairs"] = rows.pairs >= ENOUGH_RUNS
+    rows["verdict"] = [contrast_verdict(r.change, r.low, r.high) for r in rows.itertuples()]
+    return dataclasses.replace(analysis, contrasts=rows)
 
 
-ALONE = {"low": None, "high": None, "pairs": 1}
+ALONE = {"low": math.nan, "high": math.nan, "pairs": 1}
 
 
 def test_the_words_name_what_looks_worse_than_what_is_certain(analysis: Analysis):
@@ -247,7 +255,7 @@ def test_the_words_claim_nothing_from_one_run(finished: Path):
         assert finding.headline.startswith("No class has been shown")
         assert finding.headline.endswith("That is no proof of the contrary.")
         rows = [
-            row for row in cut.contrasts
+            row for row in cut.contrasts.itertuples()
             if (row.algorithm, row.metric) == (finding.algorithm, "wd_regret")
         ]  # fmt: skip
         most = max(rows, key=lambda row: row.change)
@@ -276,12 +284,8 @@ def test_the_words_say_when_there_is_nothing_to_contrast(finished: Path):
 
 
 def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
-    levels = tuple(
-        dataclasses.replace(level, value=0.97)
-        if (level.class_name, level.metric) == ("default", "wd_regret")
-        else level
-        for level in analysis.levels
-    )
+    levels = analysis.levels.copy()
+    levels.loc[(levels.class_name == "default") & (levels.metric == "wd_regret"), "iqm"] = 0.97
     for finding in findings(dataclasses.replace(analysis, levels=levels)):
         assert "learnt next to nothing" in finding.points[0]
 
@@ -289,7 +293,7 @@ def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
 def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis):
     text = comparison(analysis)
     assert "scores highest" in text
-    blurred = tuple(dataclasses.replace(r, low=0.1, high=0.9) for r in analysis.improvements)
+    blurred = analysis.improvements.assign(low=0.1, high=0.9)
     text = comparison(dataclasses.replace(analysis, improvements=blurred))
     assert "leaves open which of the two is better" in text
 
@@ -297,23 +301,17 @@ def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis)
 def test_the_comparison_says_who_was_trained_for_longer(analysis: Analysis):
     assert "trained for" not in comparison(analysis)
 
-    def longer(run: Any) -> Any:
-        cell = run.planned.cell.model_copy(update={"steps": 4000})
-        return dataclasses.replace(run, planned=run.planned.model_copy(update={"cell": cell}))
-
-    results = tuple(longer(r) if r.planned.algorithm == "Alpha" else r for r in analysis.results)
-    text = comparison(dataclasses.replace(analysis, results=results))
+    runs = analysis.runs.copy()
+    runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
+    text = comparison(dataclasses.replace(analysis, runs=runs))
     assert text.startswith("Alpha was trained for 4,000 steps, Beta for 40. Over the 5 classes")
 
 
 def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):
-    levels = tuple(  # the worst is in the last panel, and far above the others
-        dataclasses.replace(level, value=1.7, low=1.5, high=1.9)
-        if (level.class_name, level.algorithm) == ("plane", "Alpha")
-        else level
-        for level in analysis.levels
-    )
-    found, _ = pictures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
+    levels = analysis.levels.copy()  # the worst is in the last panel, and far above the others
+    worst = (levels.class_name == "plane") & (levels.algorithm == "Alpha")
+    levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
+    found, _ = draw_figures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
     assert len(figures) == len(found) == len(FIGURES)
     for picture, figure in zip(found, figures, strict=True):
         for axes in figure.axes:

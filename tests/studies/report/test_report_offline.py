@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult, OfflineResult
-from sme_registry.studies.report.analysis import ALL, CURVES, analyse
-from sme_registry.studies.report.exports import number
-from sme_registry.studies.report.tables import Analysis, Curve
+from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.classes import ALL
+from sme_registry.studies.report.exports import number, offline_tables
+from sme_registry.studies.report.tables import CURVES
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")
 
-from sme_registry.studies.report import write_report
-from sme_registry.studies.report.figures import pictures
+from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.figures.offline import draw_offline
 from sme_registry.studies.report.findings import comparison
-from sme_registry.studies.report.offline import (
-    offline_data,
-    offline_pictures,
-    offline_printed,
-    offline_words,
-)
+from sme_registry.studies.report.offline import offline_words
+from sme_registry.studies.report.write import write_report
 
 CLASSES: dict[str, dict[str, Any]] = {"shallow": {}, "deep": {"complexity": 3}}
 NUS = (0.0, 0.5)
@@ -100,20 +97,16 @@ def first_runs(file: StudyFile, done: dict[str, CellResult], runs: int) -> Analy
 
 
 def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis: Analysis) -> None:
-    assert [row[:3] for row in analysis.offline_data] == [
-        (name, nu, 5) for name in CLASSES for nu in NUS
+    rows = analysis.offline[["class_name", "nu", "learner", "data_sets"]]
+    assert list(rows.itertuples(index=False, name=None)) == [
+        (name, nu, learner, 5) for name in CLASSES for nu in NUS for learner in ("BC", "IQL")
     ]
-    assert [row.behaviour for row in analysis.offline_data[:2]] == pytest.approx(
-        [1.002, 1.002 - 0.5 / 6.0]
-    )
-    assert {row.learner for row in analysis.offline} == {"BC", "IQL"}
-    for row in analysis.offline:
+    for row in analysis.offline.itertuples():
         assert row.runs == 5
-        assert row.score_sd == pytest.approx(0.03)
-        assert row.change == pytest.approx(CHANGES[row.learner, row.class_name])
-        assert row.low is not None
-        assert row.high is not None
-        assert row.low < row.change < row.high
+        assert row.behaviour_similarity == pytest.approx(1.002 - row.nu / 6.0)
+        assert row.similarity_sd == pytest.approx(0.03)
+        assert row.improvement == pytest.approx(CHANGES[row.learner, row.class_name])
+        assert row.low < row.improvement < row.high
 
 
 def test_settings_besides_nu_tell_learners_apart() -> None:
@@ -123,7 +116,7 @@ def test_settings_besides_nu_tell_learners_apart() -> None:
     ]
     file = planned(algorithms=algorithms, seeds=1)
     found = analyse(file, results(file), draws=300)
-    assert [row.learner for row in found.offline] == [
+    assert list(found.offline.learner) == [
         "IQL (default expectile)", "IQL (expectile = 0.9)",
     ] * 2  # fmt: skip
 
@@ -146,20 +139,21 @@ def test_of_few_runs_nothing_is_called_shown(
     file: StudyFile, done: dict[str, CellResult], runs: int
 ) -> None:
     few = first_runs(file, done, runs)
-    assert all((row.low is None) == (runs < 4) for row in few.offline)
+    assert set(few.offline.low.isna()) == {runs < 4}
     text = " ".join(offline_words(few))
     assert "It is shown" not in text
     assert ("All of its few runs surpass their data" in text) == (runs > 1)
     assert ("A single run, no more than a hint" in text) == (runs == 1)
     assert ("It has not been shown to surpass its data" in text) == (runs == 1)
     assert "With so few runs this is an indication." in text
-    (picture,) = offline_pictures(few, ("svg",))
+    (picture,) = draw_offline(few, ("svg",))
     assert ("there is no interval" in picture.caption) == (runs < 4)
     assert ("bootstrap intervals of the mean" in picture.caption) == (runs == 4)
 
 
 def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
-    pairs = {(row.first, row.second) for row in analysis.improvements if row.group == ALL}
+    rows = analysis.improvements[analysis.improvements.group == ALL]
+    pairs = set(zip(rows["first"], rows["second"], strict=True))
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
     assert pairs == learners
     text = comparison(analysis)
@@ -177,23 +171,23 @@ def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
     analysis: Analysis, figures: list[Any]
 ) -> None:
     names = [f"BC ({i})" for i in range(10)]
-    steps = np.arange(1.0, 4.0)
-    curves = tuple(
-        Curve(c, name, measure, steps, *[steps + i] * 3, 1, 1)
+    steps = np.arange(1, 4)
+    curves = pd.concat(
+        pd.DataFrame(
+            {"class_name": c, "algorithm": name, "measure": measure, "step": steps,
+             "median": steps + i, "q25": steps + i, "q75": steps + i, "runs": 1, "window": 1}
+        )
         for i, name in enumerate(names)
         for c in CLASSES
         for measure in CURVES
-    )
-    run = analysis.results[0]
-    results = tuple(
-        dataclasses.replace(run, planned=run.planned.model_copy(update={"algorithm": name}))
-        for name in names
-    )
-    many = dataclasses.replace(
-        analysis, algorithms=tuple(names), learners=tuple(names), results=results, curves=curves,
-        contrasts=(), profiles=(),
     )  # fmt: skip
-    found, _ = pictures(many, ("svg",), {})
+    runs = pd.concat([analysis.runs[:1].assign(algorithm=name) for name in names])
+    nothing = {name: getattr(analysis, name)[:0] for name in ("contrasts", "profiles", "offline")}
+    many = dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names), runs=runs, learning_curves=curves,
+        offline_runs=analysis.offline_runs[:0], **nothing,
+    )  # fmt: skip
+    found, _ = draw_figures(many, ("svg",), {})
     assert found[-1].name == "learning-curves-complexity"
     figure = figures[-1]
     shown = [axes for axes in figure.axes if axes.get_visible()]
@@ -221,23 +215,27 @@ def test_the_report_has_it_first_and_in_every_format(
         text = (out / "tables" / f"{name}.tex").read_text()
         assert text.isascii()
         assert "$\\nu$" in text
-    with (out / "tables/offline-runs.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == len(done)
-    assert all(
-        float(row["change"]) == float(row["score"]) - float(row["behaviour"]) for row in rows
+    rows = pd.read_csv(out / "tables/results.csv").drop_duplicates(
+        ["class_name", "algorithm", "run"]
     )
+    assert len(rows) == len(done)
+    difference = rows.offline_similarity - rows.behaviour_similarity
+    assert list(rows.improvement) == pytest.approx(list(difference), abs=1e-12)
 
 
 def test_the_table_has_the_behaviour_beside_the_learners(analysis: Analysis) -> None:
-    scores, changes = offline_printed(analysis)
-    assert scores.columns == ("class", "ν", "constant ½", "behaviour policy", "BC", "IQL")
-    constant = number(analysis.offline_data[0].constant, 3)
-    assert scores.rows[0] == (
-        "shallow", "0", constant, "1.002 ± 0.100 (5)", "1.006 ± 0.030 (5)", "1.052 ± 0.030 (5)",
-    )  # fmt: skip
-    assert changes.rows[0][2].startswith("+0.004 [")
-    assert changes.rows[-1][3].endswith(" *")
+    similarities, improvements = (table.frame for table in offline_tables(analysis))
+    constant = number(analysis.offline.constant_similarity[0], 3)
+    assert similarities.iloc[0].to_dict() == {
+        "class": "shallow",
+        "ν": "0",
+        "constant ½": constant,
+        "behaviour policy": "1.002 ± 0.100 (5)",
+        "BC": "1.006 ± 0.030 (5)",
+        "IQL": "1.052 ± 0.030 (5)",
+    }
+    assert improvements.BC[0].startswith("+0.004 [")
+    assert improvements.IQL.iloc[-1].endswith(" *")
 
 
 def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
@@ -245,6 +243,7 @@ def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
     file = ledger.plan_file()
     assert file is not None
     found = analyse(file, ledger.results(), draws=100)
-    assert (found.offline, found.offline_data) == ((), ())
-    assert not [*offline_data(found), *offline_printed(found), *offline_words(found)]
-    assert offline_pictures(found, ("svg",)) == []
+    assert found.offline.empty
+    assert not found.has_offline_runs
+    assert offline_words(found) == []
+    assert draw_offline(found, ("svg",)) == []

@@ -1,0 +1,99 @@
+"""Similarity over the plane, for tasks with two state channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sme_registry.errors import SMEError
+from sme_registry.evaluation import as_policy
+from sme_registry.plots import draw_unit_square, drawing, literal, similarity_on_grid
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.figures.panels import WIDTH, Picture
+
+_EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5
+_LOW, _HIGH = -_EPSILON / 2.0, 1.0 + _EPSILON / 2.0
+_BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+
+
+def draw_maps(
+    analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
+) -> Picture | str:
+    """One map a class and algorithm whose models were kept; a sentence where there is none."""
+    plane = analysis.runs[analysis.runs.state_dim == 2]
+    if plane.empty:
+        return "No maps of the plane: no finished run has a task with two state channels."
+    maps, problem = _maps(analysis, plane[plane.key.isin(models)], models)
+    if not maps:
+        return (
+            "No maps of the plane: they need trained models. Run the study with --keep-models in a "
+            f"new folder.{problem}"
+        )
+    classes = list(dict.fromkeys(class_name for class_name, _ in maps))
+    names = list(dict.fromkeys(algorithm for _, algorithm in maps))
+    size = (min(WIDTH, 1.4 + 2.0 * len(classes)), 0.5 + 1.95 * len(names))
+    with drawing(size, tuple(formats)) as (figure, files):
+        panels = figure.subplots(len(names), len(classes), squeeze=False, sharex=True, sharey=True)
+        image: Any = None
+        for (y, x), axes in np.ndenumerate(panels):
+            axes.grid(visible=False)
+            axes.set_xticks([0, 1])
+            axes.set_yticks([0, 1])
+            if y == 0:
+                axes.set_title(classes[x])
+            if x == 0:
+                axes.set_ylabel(literal(names[y]))
+            if (classes[x], names[y]) in maps:
+                image = _draw_map(axes, *maps[classes[x], names[y]])
+            else:
+                axes.set_axis_off()
+        bar = figure.colorbar(image, ax=panels, label="similarity r̃", shrink=0.8)
+        bar.outline.set_visible(False)
+    return Picture(
+        "maps",
+        "Similarity over the plane, beyond the unit square",
+        "r̃ of a trained policy at each state of the plane, halfway through the episode; the square "
+        "is the unit square, where it was trained. For each algorithm the run with the median r̃ "
+        f"within distribution, among those whose model was kept.{problem}",
+        files,
+        is_map=True,
+    )
+
+
+def _maps(
+    analysis: Analysis, runs: pd.DataFrame, models: Mapping[str, Path]
+) -> tuple[dict[tuple[str, str], tuple[Any, float]], str]:
+    """(class, algorithm) → its median run's map and WD similarity; and the last problem."""
+    side = _LOW + (np.arange(_RESOLUTION) + 0.5) * (_HIGH - _LOW) / _RESOLUTION
+    inside = analysis.results[analysis.results.region == "WD"].drop_duplicates("key")
+    similarity = inside.set_index("key").similarity
+    maps, problem = {}, ""
+    for place, group in runs.groupby(["class_name", "algorithm"], sort=False):
+        ordered = group.assign(similarity=group.key.map(similarity)).sort_values(
+            ["similarity", "run"]
+        )
+        median = ordered.iloc[(len(ordered) - 1) // 2]
+        spec = analysis.cells[median.key].cell.spec
+        try:
+            policy = as_policy(models[median.key], spec)
+            maps[place] = similarity_on_grid(policy, spec, side, _TIME), median.similarity
+        except SMEError as error:
+            problem = f" {error}"
+    return maps, problem
+
+
+def _draw_map(axes: Any, similarity: Any, inside: float) -> Any:
+    image = axes.imshow(
+        similarity, origin="lower", extent=(_LOW, _HIGH, _LOW, _HIGH), vmin=0.0, vmax=1.0,
+        cmap="viridis", interpolation="nearest",
+    )  # fmt: skip
+    draw_unit_square(axes, 2.4, 1.0)
+    axes.text(
+        0.03, 0.03, f"WD {inside:.2f}", transform=axes.transAxes, fontsize=7.5, bbox=_BOX,
+        color="black",
+    )  # fmt: skip
+    return image

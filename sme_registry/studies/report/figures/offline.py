@@ -1,0 +1,102 @@
+"""The improvement of offline learners over the behaviour policy, against ν."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+from sme_registry.plots import COLOURS, GREY, MARKERS, literal
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.figures.panels import (
+    CONSTANT_DASH,
+    WIDTH,
+    Look,
+    Picture,
+    columns,
+    cycled,
+    line_sample,
+    marks,
+    panel_grid,
+)
+from sme_registry.studies.report.tables import ENOUGH_RUNS, OFFLINE_INTERVAL
+
+_LEARNER_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+_OPTIMUM_DASH: Any = (0, (1, 1.2))
+
+
+def draw_offline(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
+    """One panel a class; no figure where no run learnt from data."""
+    if not analysis.has_offline_runs:
+        return []
+    classes = list(dict.fromkeys(analysis.offline.class_name))
+    drawn = {
+        name: Look(cycled(COLOURS, i), cycled(MARKERS, i), cycled(_LEARNER_DASHES, i))
+        for i, name in enumerate(dict.fromkeys(analysis.offline.learner))
+    }
+    across, down = columns(len(classes))
+    size = (max(3.6, min(WIDTH, 1.0 + 2.4 * across)), 0.9 + 2.4 * down)
+    with panel_grid(len(classes), size, formats, share_x=True) as (grid, files):
+        for axes, class_name in zip(grid.panels, classes, strict=True):
+            _draw_class(axes, analysis, class_name, drawn)
+        grid.label_rows("r̃ − r̃ of the behaviour")
+        grid.label_columns("ν of the behaviour policy")
+        first = grid.panels[0]
+        handles = [
+            line_sample(
+                first, name, linewidth=1.4, markersize=4.5, color=look.colour, marker=look.marker,
+                linestyle=look.dash,
+            )
+            for name, look in drawn.items()
+        ]  # fmt: skip
+        handles += [
+            line_sample(first, label, color=colour, linewidth=1.1, linestyle=dash)
+            for label, dash, colour in (
+                ("behaviour policy", "-", "black"),
+                ("optimum", _OPTIMUM_DASH, GREY),
+                ("constant ½", CONSTANT_DASH, GREY),
+            )
+        ]
+        grid.figure.legend(handles=handles, loc="outside lower center", ncols=2 * across)
+    title = "Improvement over the behaviour policy"
+    return [Picture("offline-improvement", title, _caption(analysis), files)]
+
+
+def _draw_class(axes: Any, analysis: Analysis, class_name: str, drawn: dict[str, Look]) -> None:
+    rows = analysis.offline[analysis.offline.class_name == class_name]
+    runs = analysis.offline_runs[analysis.offline_runs.class_name == class_name]
+    data = rows.drop_duplicates("nu")
+    axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
+    for similarity, dash in ((1.0, _OPTIMUM_DASH), (data.constant_similarity, CONSTANT_DASH)):
+        height = similarity - data.behaviour_similarity
+        axes.plot(data.nu, height, color=GREY, linewidth=1.1, linestyle=dash, zorder=1.6)
+    nus = sorted(set(analysis.offline.nu))
+    apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
+    for index, (name, look) in enumerate(drawn.items()):
+        shift = (index - (len(drawn) - 1) / 2) * 0.25 * apart / len(drawn)
+        own, each = rows[rows.learner == name], runs[runs.learner == name]
+        axes.plot(
+            own.nu + shift, own.improvement, color=look.colour, linewidth=1.4, linestyle=look.dash
+        )
+        axes.plot(
+            each.nu + shift, each.improvement, color=look.colour, marker=look.marker,
+            markersize=2.5, markeredgewidth=0.0, alpha=0.5, linestyle="none", zorder=2.5,
+        )  # fmt: skip
+        enough = own.runs >= ENOUGH_RUNS
+        marks(axes, own, "improvement", own.nu + shift, enough, look, upright=True)
+    axes.set_title(literal(class_name))
+
+
+def _caption(analysis: Analysis) -> str:
+    few = analysis.offline.runs.min()
+    caption = (
+        "A small mark is a run, a large one the mean over runs: similarity of the learner minus "
+        "that of the policy that made its data."
+    )
+    if not analysis.offline.low.isna().all():
+        caption += " Bars are 95 % bootstrap intervals of the mean."
+    if few < OFFLINE_INTERVAL:
+        caption += f" With fewer than {OFFLINE_INTERVAL} runs there is no interval."
+    if few < ENOUGH_RUNS:
+        caption += f" Hollow: fewer than {ENOUGH_RUNS} runs, an indication only."
+    return caption

@@ -1,0 +1,231 @@
+"""What the figures share: a grid of panels, the look of each algorithm, marks, and the legend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
+from sme_registry.studies.report.analysis import Analysis
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+LINEAR_DASH = REFERENCE_DASHES["linear_least_squares"]
+CONSTANT_DASH = REFERENCE_DASHES["constant_half"]
+HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawn figure.
+
+    Attributes:
+      name: of its files.
+      title: what it shows, in a few words.
+      caption: how to read it.
+      files: its bytes, by format.
+      is_map: whether its colours are a scale, which a dark page must not invert.
+    """
+
+    name: str
+    title: str
+    caption: str
+    files: Mapping[str, bytes]
+    is_map: bool = False
+
+
+class Look(NamedTuple):
+    """How an algorithm is drawn in every figure."""
+
+    colour: Any
+    marker: str
+    dash: Any
+
+
+class Grid(NamedTuple):
+    """Panels in reading order.
+
+    Attributes:
+      figure: that they are in.
+      stacks: `[panel, row]`: a panel is a stack of axes, mostly of one.
+      across: panels in a row of the grid.
+    """
+
+    figure: Figure
+    stacks: Any
+    across: int
+
+    @property
+    def panels(self) -> list[Axes]:
+        """The lowest axes of each panel: its only one, unless panels are stacks."""
+        return list(self.stacks[:, -1])
+
+    def label_rows(self, label: str, row: int = -1) -> None:
+        """Label the y axis of the first panel in each row of the grid."""
+        for stack in self.stacks[:: self.across]:
+            stack[row].set_ylabel(label)
+
+    def label_columns(self, label: str) -> None:
+        """Label the x axis of the lowest panel in each column of the grid, and of no other."""
+        for index, axes in enumerate(self.panels):
+            lowest = index + self.across >= len(self.panels)
+            axes.tick_params(labelbottom=lowest)
+            axes.set_xlabel(label if lowest else "")
+
+
+def columns(panels: int, most: int = 3) -> tuple[int, int]:
+    """How many columns and rows a grid has."""
+    across = min(most, panels)
+    return across, math.ceil(panels / across)
+
+
+@contextmanager
+def panel_grid(
+    panels: int,
+    size: tuple[float, float],
+    formats: Sequence[str],
+    *,
+    most_across: int = 3,
+    stack: int = 1,
+    share_x: bool = False,
+) -> Iterator[tuple[Grid, dict[str, bytes]]]:
+    """A figure of panels with a common y axis, at most so many in a row.
+
+    Args:
+      panels: how many.
+      size: width and height in inches.
+      formats: of `plots.FORMATS`.
+      most_across: panels in a row.
+      stack: axes in a panel, one above the other; they share x, and y with the same row of others.
+      share_x: whether all panels share x.
+
+    Yields:
+      The grid, and a dict that holds each format's bytes after the block.
+    """
+    across, down = columns(panels, most_across)
+    with drawing(size, tuple(formats)) as (figure, files):
+        axes = figure.subplots(stack * down, across, squeeze=False)
+        stacks = np.concatenate([block.T for block in np.split(axes, down)])
+        for unused in stacks[panels:].ravel():
+            unused.set_visible(False)
+        for index, panel in enumerate(stacks[:panels]):
+            for row, one in enumerate(panel):
+                if index:
+                    one.sharey(stacks[0][row])
+                if row < stack - 1:
+                    one.sharex(panel[-1])
+                    one.tick_params(labelbottom=False)
+                one.tick_params(labelleft=index % across == 0)
+            if share_x and index:
+                panel[-1].sharex(stacks[0][-1])
+        yield Grid(figure, stacks[:panels], across), files
+
+
+def looks(analysis: Analysis) -> dict[str, Look]:
+    """The look of each algorithm: colours for those that learn, grey for references."""
+    result = {
+        name: Look(cycled(COLOURS, i), cycled(MARKERS, i), cycled(DASHES, i))
+        for i, name in enumerate(analysis.learners)
+    }
+    references = [name for name in analysis.algorithms if name not in result]
+    for i, name in enumerate(references):
+        result[name] = Look(GREY, cycled("x+12", i), DASHES[1 + i % 4])
+    return result
+
+
+def cycled(values: Sequence[Any], index: int) -> Any:
+    """The value at an index, from the beginning again after the last."""
+    return values[index % len(values)]
+
+
+def marks(
+    axes: Axes,
+    rows: pd.DataFrame,
+    value: str,
+    at: Iterable[float],
+    filled: Iterable[bool],
+    look: Look,
+    *,
+    upright: bool = False,
+    joined: bool = False,
+) -> None:
+    """Values with their intervals, `low` to `high`.
+
+    Args:
+      axes: to draw in.
+      rows: with the columns `low` and `high`, NaN where there is no interval.
+      value: the column that is drawn.
+      at: where each row stands on the other axis.
+      filled: whether each mark is filled, not hollow.
+      look: of the marks.
+      upright: values along y instead of x.
+      joined: whether a line joins them.
+    """
+    at = list(at)
+    if joined:
+        axes.plot(at, rows[value], color=look.colour, linewidth=1.1, linestyle=look.dash, alpha=0.7)
+    for place, row_value, low, high, is_filled in zip(
+        at, rows[value], rows.low, rows.high, filled, strict=True
+    ):
+        if not math.isnan(low):
+            ends = ([place, place], [low, high])
+            axes.plot(*(ends if upright else ends[::-1]), color=look.colour, linewidth=1.4)
+        point = (place, row_value) if upright else (row_value, place)
+        axes.plot(
+            *point, color=look.colour, marker=look.marker, markersize=4.5, markeredgewidth=1.1,
+            markerfacecolor=look.colour if is_filled else "white", linestyle="none", zorder=3,
+        )  # fmt: skip
+
+
+def marks_by_algorithm(
+    axes: Axes,
+    rows: pd.DataFrame,
+    value: str,
+    at: pd.Series,
+    filled: pd.Series,
+    looks: Mapping[str, Look],
+    *,
+    spread: float = 0.7,
+    **options: bool,
+) -> None:
+    """`marks` of each algorithm, next to one another around each place."""
+    for index, (name, look) in enumerate(looks.items()):
+        own = rows.algorithm == name
+        shift = (index - (len(looks) - 1) / 2) * spread / len(looks)
+        marks(axes, rows[own], value, at[own] + shift, filled[own], look, **options)
+
+
+def shade_rows(axes: Axes, places: Iterable[float]) -> None:
+    """A light band behind each row of marks, instead of grid lines."""
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    for y in places:
+        axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
+
+
+def line_sample(axes: Axes, label: str, **style: Any) -> Any:
+    """A line without points, for a legend."""
+    return axes.plot([], [], label=literal(label), **style)[0]
+
+
+def legend(figure: Figure, looks: Mapping[str, Look], extra: Sequence[Any] = ()) -> None:
+    """The legend of algorithms below the figure, with further lines after them."""
+    handles = [
+        line_sample(
+            figure.axes[0], name, color=look.colour, marker=look.marker, markersize=4.5,
+            linewidth=1.4, linestyle=look.dash,
+        )
+        for name, look in looks.items()
+    ]  # fmt: skip
+    handles += extra
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))

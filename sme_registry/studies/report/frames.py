@@ -1,0 +1,265 @@
+"""`load`: a study's finished runs as two tidy pandas frames, from which the report is made, too.
+
+    results, curves = sme_registry.studies.load("runs/ablations")
+    inside = results[results.region == "WD"]
+    inside.groupby(["class_name", "algorithm"]).wd_regret.median().unstack()
+
+`results`: one row per run and region, ordered by class, algorithm, run, region.
+
+    class_name, algorithm, run   the run's place in the plan; run is a number from 0
+    region                       WD, OOD 1, OOD 2, …
+    epsilon_low, epsilon_high    ε of the region's inner and outer face; 0 for WD
+    states                       number of evaluation states in the region
+    similarity, similarity_sd    mean r̃, in [0, 1], and its standard deviation over states
+    mae                          mean |a − a*|, in [0, 1]
+    normalised_regret            mean |a − a*| / mean |½ − a*|: 0 optimal, 1 the constant ½
+    similarity_decay             (r̃_WD − r̃) / r̃_WD; 0 in WD, negative where r̃ is higher outside
+    similarity_loss              100 (r̃_WD − r̃), in points of similarity
+    clipped_share                share of action entries outside the action range, in [0, 1]
+    linear_normalised_regret     of the linear policy fitted to the optimum, on the same states
+    best_constant_normalised_regret, random_normalised_regret   of these references, likewise
+    constant_similarity          mean r̃ of the constant ½, in [0, 1]
+
+Columns of the run, repeated in each of its regions; NaN or NA where the run has no such number:
+
+    wd_regret, ood_regret        normalised regret in WD, and its mean over the shells
+    ood_decay                    ood_regret − wd_regret
+    final_return                 mean return of the last evaluations, in % of the optimum's
+    online_regret                mean of 1 − step reward over training, in [0, 1]
+    uses, action_range, steps    the algorithm, its action range, its training steps
+    state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, spec_seed
+                                 fields of the task's spec; spec_seed as text
+    spec_digest, seed            the task's digest; the seed of training
+    nu, transitions, dataset_digest   the data set of an offline run: ν in [0, 1], its size
+    behaviour_similarity, behaviour_similarity_sd    r̃ of the behaviour policy over the data set
+    offline_similarity, offline_similarity_sd        r̃ of the learner over its last episodes
+    improvement                  offline_similarity − behaviour_similarity
+    seconds, steps_per_second    CPU time of the run, and training speed
+    key                          digest of the run's cell, which names its file
+
+`curves`: one row per run and evaluation during training, ordered by class, algorithm, run, step.
+
+    class_name, algorithm, run   as above
+    step                         training steps before the evaluation (offline: gradient steps)
+    episode_return               mean return of its episodes, in [0, horizon]
+    regret                       mean of 1 − step reward over their steps, in [0, 1]
+    similarity                   mean r̃ over their steps, in [0, 1]
+    length                       mean length of the episodes, in steps
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import RegionReport
+from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellResult
+
+RUN = ["class_name", "algorithm", "run"]
+REGION_COLUMNS = {
+    "region": "str", "epsilon_low": "float64", "epsilon_high": "float64", "states": "int64",
+    "similarity": "float64", "similarity_sd": "float64", "mae": "float64",
+    "normalised_regret": "float64", "similarity_decay": "float64", "similarity_loss": "float64",
+    "clipped_share": "float64", "linear_normalised_regret": "float64",
+    "best_constant_normalised_regret": "float64", "random_normalised_regret": "float64",
+    "constant_similarity": "float64",
+}  # fmt: skip
+RUN_COLUMNS = {
+    "wd_regret": "float64", "ood_regret": "float64", "ood_decay": "float64",
+    "final_return": "float64", "online_regret": "float64", "uses": "str", "action_range": "str",
+    "steps": "int64", "state_dim": "int64", "action_dim": "int64", "k": "int64",
+    "r_min": "float64", "D": "float64", "complexity": "int64", "horizon": "int64",
+    "hidden_width": "int64", "policy_init": "str", "spec_seed": "str", "spec_digest": "str",
+    "seed": "int64", "nu": "float64", "transitions": "Int64", "dataset_digest": "str",
+    "behaviour_similarity": "float64", "behaviour_similarity_sd": "float64",
+    "offline_similarity": "float64", "offline_similarity_sd": "float64",
+    "improvement": "float64", "seconds": "float64", "steps_per_second": "float64", "key": "str",
+}  # fmt: skip
+_PLACE_COLUMNS = {"class_name": "str", "algorithm": "str", "run": "int64"}
+_RESULTS = _PLACE_COLUMNS | REGION_COLUMNS | RUN_COLUMNS
+_CURVES = _PLACE_COLUMNS | {
+    "step": "int64", "episode_return": "float64", "regret": "float64", "similarity": "float64",
+    "length": "float64",
+}  # fmt: skip
+_SPEC_FIELDS = (
+    "state_dim", "action_dim", "k", "r_min", "D", "complexity", "horizon", "hidden_width",
+    "policy_init",
+)  # fmt: skip
+_REFERENCES = {
+    "linear_normalised_regret": "linear_least_squares",
+    "best_constant_normalised_regret": "best_constant",
+    "random_normalised_regret": "uniform_random",
+}
+_LONGEST_WINDOW = 10
+
+
+class StudyFrames(NamedTuple):
+    """A study's finished runs; the module's docstring lists the columns.
+
+    Attributes:
+      results: one row per run and region.
+      curves: one row per run and evaluation during training.
+    """
+
+    results: pd.DataFrame
+    curves: pd.DataFrame
+
+
+def load(folder: str | os.PathLike[str]) -> StudyFrames:
+    """Load the finished runs of a study.
+
+    Args:
+      folder: the study's folder.
+
+    Returns:
+      The frames; without rows if no run of the plan has finished.
+
+    Raises:
+      OptionError: the folder holds no study.
+      MalformedDocumentError, SpecError, DigestMismatchError: its plan is invalid.
+      MissingDependencyError: pandas is not installed.
+    """
+    ledger = Ledger(folder)
+    file = plan_file(ledger)
+    return study_frames(file.plan, ledger.results(cell.cell.digest for cell in file.plan.cells))
+
+
+def plan_file(ledger: Ledger) -> StudyFile:
+    """The plan in a study's folder.
+
+    Raises:
+      OptionError: the folder holds no study.
+      MalformedDocumentError, SpecError, DigestMismatchError: the plan is invalid.
+    """
+    file = ledger.plan_file()
+    if file is None:
+        raise OptionError(
+            f"folder={str(ledger.folder)!r}: holds no study. Give the folder of `sme study run`."
+        )
+    return file
+
+
+def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFrames:
+    """The frames of a plan's runs.
+
+    Args:
+      plan: the plan; cells that are not in it are ignored.
+      results: finished runs, by the digests of their cells.
+    """
+    finished = [(cell, results[cell.cell.digest]) for cell in ordered(plan)
+                if cell.cell.digest in results]  # fmt: skip
+    rows = [row for cell, result in finished for row in _result_rows(cell, result)]
+    evaluations = [row for cell, result in finished for row in _curve_rows(cell, result)]
+    return StudyFrames(frame(rows, _RESULTS), frame(evaluations, _CURVES))
+
+
+def ordered(plan: StudyPlan) -> list[PlannedCell]:
+    """The plan's cells by class, then algorithm, then run; the plan itself has runs outermost."""
+    classes = {member.name: i for i, member in enumerate(plan.classes)}
+    algorithms = {algorithm.name: i for i, algorithm in enumerate(plan.algorithms)}
+    return sorted(plan.cells, key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
+
+
+def frame(rows: Sequence[Any], columns: Mapping[str, str]) -> pd.DataFrame:
+    """A frame with these columns and their dtypes, also where there are no rows."""
+    return pd.DataFrame(rows, columns=list(columns)).astype(dict(columns))
+
+
+def window(evaluations: int) -> int:
+    """How many evaluations are averaged: the paper's 10 of its 400, fewer where there are few."""
+    return min(_LONGEST_WINDOW, max(1, evaluations // 10))
+
+
+def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+    run = _place(cell) | _run_columns(result)
+    references = result.report.references
+    for index, region in enumerate(result.report.regions):
+        yield run | {
+            **_region_columns(region),
+            **{
+                column: references[name][index].normalised_regret
+                for column, name in _REFERENCES.items()
+            },
+            "constant_similarity": references["constant_half"][index].similarity,
+        }
+
+
+def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[tuple[Any, ...]]:
+    curve = result.curve
+    columns = (curve.steps, curve.episode_return, curve.regret, curve.similarity, curve.length)
+    for evaluation in zip(*columns, strict=True):
+        yield (*_place(cell).values(), *evaluation)
+
+
+def _place(cell: PlannedCell) -> dict[str, Any]:
+    return {"class_name": cell.class_name, "algorithm": cell.algorithm, "run": cell.run}
+
+
+def _region_columns(region: RegionReport) -> dict[str, Any]:
+    return {
+        "region": region.name,
+        "epsilon_low": region.epsilon_low,
+        "epsilon_high": region.epsilon_high,
+        "states": region.states,
+        "similarity": region.similarity,
+        "similarity_sd": region.similarity_sd,
+        "mae": region.mae,
+        "normalised_regret": region.normalised_regret,
+        "similarity_decay": region.similarity_decay,
+        "similarity_loss": region.similarity_loss,
+        "clipped_share": region.clipped_share,
+    }
+
+
+def _run_columns(result: CellResult) -> dict[str, Any]:
+    cell, report = result.cell, result.report
+    return {
+        "wd_regret": report.wd_regret,
+        "ood_regret": report.ood_regret,
+        "ood_decay": report.ood_decay,
+        "final_return": _final_return(result),
+        "online_regret": math.nan if result.online_regret is None else result.online_regret,
+        "uses": cell.uses,
+        "action_range": cell.action_range,
+        "steps": cell.steps,
+        **{name: getattr(cell.spec, name) for name in _SPEC_FIELDS},
+        "spec_seed": str(cell.spec.seed),
+        "spec_digest": cell.spec.digest,
+        "seed": cell.seed,
+        **_offline_columns(result),
+        "seconds": result.timing.total,
+        "steps_per_second": result.timing.steps_per_second,
+        "key": result.key,
+    }
+
+
+def _offline_columns(result: CellResult) -> dict[str, Any]:
+    offline = result.offline
+    if offline is None:
+        return {}  # NaN, NA
+    return {
+        "nu": offline.nu,
+        "transitions": offline.transitions,
+        "dataset_digest": offline.dataset_digest,
+        "behaviour_similarity": offline.behaviour_similarity,
+        "behaviour_similarity_sd": offline.behaviour_similarity_sd,
+        "offline_similarity": offline.similarity,
+        "offline_similarity_sd": offline.similarity_sd,
+        "improvement": offline.similarity - offline.behaviour_similarity,
+    }
+
+
+def _final_return(result: CellResult) -> float:
+    """Mean return over the last window of evaluations, in % of T; NaN without evaluations."""
+    returns = result.curve.episode_return
+    if not returns:
+        return math.nan
+    return 100.0 * float(np.mean(returns[-window(len(returns)) :])) / result.cell.spec.horizon
