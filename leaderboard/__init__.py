@@ -1,4 +1,4 @@
-"""The leaderboard: submissions of policies, every number of which is recomputed here.
+"""A leaderboard of policies that recomputes every score.
 
     submission → verification → scores → ranking → pages
 

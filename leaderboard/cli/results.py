@@ -38,8 +38,9 @@ def rank(
     metric: Annotated[
         Metric,
         typer.Option(
+            metavar="METRIC",
             help="wd_regret: inside the training cube. ood_regret: outside it. ood_decay: their "
-            "difference."
+            "difference.",
         ),
     ] = "wd_regret",
     json: Json = False,

@@ -92,8 +92,9 @@ def new(
     knowledge: Annotated[
         Knowledge,
         typer.Option(
+            metavar="LEVEL",
             help="What the method knows of the task. generic: nothing. family: that it is an SME. "
-            "oracle: its optimal policy."
+            "oracle: its optimal policy.",
         ),
     ] = "generic",
     code: Annotated[str | None, typer.Option(help="An https link to the code.")] = None,

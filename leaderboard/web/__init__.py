@@ -1,1 +1,1 @@
-"""The leaderboard over HTTP: the application, its pages and its client."""
+"""The leaderboard over HTTP: server, pages and client."""

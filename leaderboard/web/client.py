@@ -1,7 +1,7 @@
-"""Sends a bundle to a served board: the artefacts that it lacks, then the submission.
+"""Client of a served board: sends artefacts and submissions, reads status, withdraws.
 
-Everything is asked for by its hash, so that a request that got lost is sent again as it was. What
-the board refuses is raised here as the same `Rejection`, with the board's own code and words.
+Every object is addressed by its hash, so a lost request can be repeated unchanged. A rejection by
+the board is raised here as the same `Rejection`, with the board's code and message.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Progress = Callable[[int, int], None]
 
 _WAITS = (0.25, 1.0, 4.0)  # seconds before each further attempt
 _TRANSIENT = frozenset({408, 502, 503, 504})
-_MAX_ANSWER = 64 * 2**20  # a board is a stranger, too
+_MAX_ANSWER = 64 * 2**20  # a board may be hostile, too
 _CHUNK = 64 * 2**10
 
 
@@ -46,134 +46,134 @@ def submit(
 
     Args:
       url: of the board, such as `https://board.example`.
-      bundle: its folder.
-      key: signs the uploads; the submission is signed already.
-      progress: called with the number of artefacts that the board has, and of all of them.
-      insecure: allow plain http to other machines than this one, in a network that you trust.
+      bundle: the bundle's folder.
+      key: signs the uploads; the submission itself is already signed.
+      progress: called with the number of artefacts on the board and of all artefacts.
+      insecure: allow plain http to other machines, in a network that you trust.
 
     Returns:
-      The submission's id. It is scored later; `status` tells.
+      The submission's id. The board scores it later; see `status`.
 
     Raises:
-      Rejection: the bundle is wrong, or the board refuses it.
-      BoardError: the board cannot be reached or does not answer as a board does.
-      OptionError: the URL is not one of a board.
+      Rejection: the bundle is invalid, or the board rejects it.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL is invalid.
     """
     content = Bundle.read(bundle)
     runs = content.signed.submission.runs
     digests = list(dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact))
-    with _Board(url, insecure=insecure) as board:
+    with _Client(url, insecure=insecure) as client:
         for done, digest in enumerate(digests, start=1):
             path = f"/api/objects/{hex_of(digest)}"
-            if not board.has(path):
+            if not client.has(path):
                 sign = functools.partial(upload_header, key, digest)
-                board.ask("PUT", path, content.artefact(digest), sign)
+                client.request("PUT", path, content.artefact(digest), sign)
             if progress is not None:
                 progress(done, len(digests))
-        answer = board.ask("POST", "/api/submissions", content.signed.to_bytes())
+        answer = client.request("POST", "/api/submissions", content.signed.to_bytes())
     if not isinstance(answer, dict) or answer.get("id") != content.signed.id:
-        raise BoardError(f"{url}: took the submission for another one. Ask whoever keeps it.")
+        raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
     return content.signed.id
 
 
 def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
-    """What a board says of a submission: `id`, `status`, and its `result` once it is scored.
+    """A submission's `id`, `status` and, once it is scored, `result`, as the board answers.
 
-    Until the board shows any number the result is None, and `withheld` says why.
+    While the board withholds scores, the result is None and `withheld` has the reason.
 
     Raises:
       Rejection: `unknown_submission`.
-      BoardError: the board cannot be reached or does not answer as a board does.
-      OptionError: the URL is not one of a board, or the id is none.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL or the id is invalid.
     """
-    with _Board(url, insecure=insecure) as board:
-        answer = board.ask("GET", f"/api/submissions/{_digits(id)}")
+    with _Client(url, insecure=insecure) as client:
+        answer = client.request("GET", f"/api/submissions/{_digits(id)}")
     if not isinstance(answer, dict) or answer.get("id") != f"sha256:{_digits(id)}":
-        raise BoardError(f"{url}: answers for another submission. Ask whoever keeps it.")
+        raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
     return answer
 
 
 def withdraw(
     url: str, id: str, key: SigningKey, reason: str = "", *, insecure: bool = False
 ) -> None:
-    """Take a submission off a board.
+    """Withdraw a submission from a board.
 
     Args:
       url: of the board.
       id: the submission's.
-      key: the one that signed the submission.
+      key: the key that signed the submission.
       reason: shown on the submission's page; up to 300 characters.
-      insecure: allow plain http to other machines than this one.
+      insecure: allow plain http to other machines.
 
     Raises:
-      Rejection: the board refuses it.
-      BoardError: the board cannot be reached or does not answer as a board does.
-      OptionError: the URL is not one of a board, or the id is none.
+      Rejection: the board rejects it.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL or the id is invalid.
     """
     signed = withdrawal_of(f"sha256:{_digits(id)}", key, reason)
-    with _Board(url, insecure=insecure) as board:
-        board.ask("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
+    with _Client(url, insecure=insecure) as client:
+        client.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 
-class _Board:
-    """A served board: sends, tries again where the network failed, reads what comes back."""
+class _Client:
+    """An HTTP client of one board, which repeats requests after network failures."""
 
     def __init__(self, url: str, *, insecure: bool) -> None:
         try:
             import httpx
         except ImportError:
             raise MissingDependencyError(
-                "httpx: not installed, and needed to send a submission. "
+                "httpx: is not installed and is required to reach a served board. "
                 "Run `pip install 'sme-registry[leaderboard]'`."
             ) from None
         self._httpx = httpx
-        self._url, near = _checked(httpx.URL, url, insecure=insecure)
-        self._client = httpx.Client(timeout=httpx.Timeout(30.0, read=120.0), trust_env=not near)
+        self._url, is_local = _checked(httpx.URL, url, insecure=insecure)
+        self._client = httpx.Client(timeout=httpx.Timeout(30.0, read=120.0), trust_env=not is_local)
 
-    def __enter__(self) -> _Board:
+    def __enter__(self) -> _Client:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
     def has(self, path: str) -> bool:
-        """Whether there is something at a path of the board."""
-        code, answer = self._patiently("HEAD", path)
+        """Whether a path of the board exists."""
+        code, answer = self._send("HEAD", path)
         if code != 404:
-            self._refuse_failure(code, answer)
+            self._raise_error(code, answer)
         return code != 404
 
-    def ask(
+    def request(
         self,
         method: str,
         path: str,
         content: bytes | None = None,
         sign: Callable[[], str] | None = None,
     ) -> Any:
-        """The board's answer to a request, as plain data; None where it is none."""
-        code, answer = self._patiently(method, path, content, sign)
-        self._refuse_failure(code, answer)
+        """The JSON of the board's answer; None if it is not JSON."""
+        code, answer = self._send(method, path, content, sign)
+        self._raise_error(code, answer)
         return answer
 
-    def _refuse_failure(self, code: int, answer: Any) -> None:
+    def _raise_error(self, code: int, answer: Any) -> None:
         if 200 <= code < 300:
             return
-        refusal = answer if isinstance(answer, dict) else {}
-        message = _shown(refusal.get("message") or f"answers with HTTP status {code}")
-        if (reason := str(refusal.get("code"))) in CODES:
+        error = answer if isinstance(answer, dict) else {}
+        message = _printable(error.get("message") or f"answered with HTTP status {code}")
+        if (reason := str(error.get("code"))) in CODES:
             raise Rejection(reason, message)
         raise BoardError(f"{self._url}: {message}")
 
-    def _patiently(
+    def _send(
         self,
         method: str,
         path: str,
         content: bytes | None = None,
         sign: Callable[[], str] | None = None,
     ) -> tuple[int, Any]:
-        """Status and answer, asked for several times where they do not come.
+        """Status and answer of a request, repeated after failures of the network.
 
-        Every request is safe to repeat: objects and documents are known by their digests.
+        Every request is safe to repeat, because digests identify objects and documents.
         """
         for wait in (*_WAITS, None):
             try:
@@ -195,7 +195,7 @@ class _Board:
     ) -> tuple[int, Any]:
         headers = {"Accept": "application/json"}
         if sign is not None:
-            headers["Authorization"] = sign()  # anew for each attempt: it is fresh for minutes
+            headers["Authorization"] = sign()  # for each attempt, because it is valid for minutes
         with self._client.stream(
             method, self._url + path, content=content, headers=headers
         ) as answer:
@@ -207,7 +207,7 @@ class _Board:
             text += chunk
             if len(text) > _MAX_ANSWER:
                 raise BoardError(
-                    f"{self._url}: answers with more than {_MAX_ANSWER:,} bytes. Check the URL."
+                    f"{self._url}: answered with more than {_MAX_ANSWER:,} bytes. Check the URL."
                 )
         with contextlib.suppress(MalformedDocumentError):
             return parse_json(bytes(text), self._url)
@@ -215,25 +215,25 @@ class _Board:
 
 
 def _checked(parse: Callable[[str], httpx.URL], url: str, *, insecure: bool) -> tuple[str, bool]:
-    """The URL without a slash at its end, if a policy may be sent to it; whether it is near.
+    """The URL without its final slash, and whether it is on this machine.
 
-    What is near, on this machine, is asked without a proxy, and needs no encryption.
+    A board on this machine is reached without a proxy, and needs no encryption.
     """
     try:
         parts = parse(url)
-    except Exception:  # httpx.InvalidURL is no ValueError
+    except Exception:  # httpx.InvalidURL is not a ValueError
         parts = parse("")
     if parts.scheme not in ("http", "https") or not parts.host or parts.query or parts.userinfo:
         raise OptionError(
             f"url={url!r:.80}: must be http(s)://host[:port][/path]. Copy it from the board's page."
         )
-    near = _is_loopback(parts.host)
-    if parts.scheme == "http" and not (near or insecure):
+    is_local = _is_loopback(parts.host)
+    if parts.scheme == "http" and not (is_local or insecure):
         raise OptionError(
             f"url={url!r:.80}: must be https for another machine. "
-            "Use https, or reach it through a tunnel."
+            "Use https, or a tunnel to the board."
         )
-    return str(parts).rstrip("/"), near
+    return str(parts).rstrip("/"), is_local
 
 
 def _is_loopback(host: str) -> bool:
@@ -248,11 +248,11 @@ def _digits(id: str) -> str:
         return hex_of(id)
     except ValueError:
         raise OptionError(
-            f"id={id!r:.90}: must be 'sha256:' and 64 hex digits: where a board is served, their "
-            "beginning is not enough. Copy the whole id from the board."
+            f"id={id!r:.90}: must be 'sha256:' and 64 hex digits; a served board needs all of "
+            "them. Copy the id from the board."
         ) from None
 
 
-def _shown(text: object) -> str:
-    """A stranger's words, cut and without control characters: they go to a terminal."""
+def _printable(text: object) -> str:
+    """A server's text for a terminal: shortened, and without control characters."""
     return "".join(c if c.isprintable() else " " for c in str(text)[:2000])
