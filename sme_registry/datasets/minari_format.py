@@ -10,7 +10,6 @@ These are of fixed size, so Minari cannot append steps to an existing episode.
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy.typing as npt
 
 from sme_registry.datasets.arrays import Transitions, num_agents
 from sme_registry.datasets.record import KEY, DatasetRecord
-from sme_registry.errors import MissingDependencyError
+from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
 
 DATA, METADATA, NAMESPACE_METADATA = "main_data.hdf5", "metadata.json", "namespace_metadata.json"
@@ -39,12 +38,7 @@ def require_minari() -> None:
     Raises:
       MissingDependencyError: names the extra to install.
     """
-    missing = [name for name in ("minari", "h5py") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise MissingDependencyError(
-            f"data sets need {' and '.join(missing)}, which is not installed. "
-            "Run `pip install 'sme-registry[offline]'`."
-        )
+    require_packages("data sets", {"minari": "Minari", "h5py": "h5py"}, "offline")
 
 
 def minari_dataset(data_folder: Path) -> Any:

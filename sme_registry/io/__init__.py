@@ -4,7 +4,7 @@ from sme_registry.io.checks import choice, integer_in
 from sme_registry.io.files import TEMPORARY, atomic_file, temporary_beside, write_atomically
 from sme_registry.io.folders import build_folder, claim_folder, refuse_existing, sync_folder
 from sme_registry.io.imports import import_object
-from sme_registry.io.installed import versions
+from sme_registry.io.installed import is_installed, require_packages, versions
 from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
 from sme_registry.io.locks import Lock, file_lock, is_locked
 
@@ -19,10 +19,12 @@ __all__ = [
     "file_lock",
     "import_object",
     "integer_in",
+    "is_installed",
     "is_locked",
     "parse_json",
     "read_json",
     "refuse_existing",
+    "require_packages",
     "sync_folder",
     "temporary_beside",
     "to_json",

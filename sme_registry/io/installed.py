@@ -1,12 +1,14 @@
-"""`versions`: what is installed of the packages that numbers depend on."""
+"""Installed packages: their versions, and an error if an optional one is missing."""
 
 from __future__ import annotations
 
+import importlib.util
 import platform
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 
+from sme_registry.errors import MissingDependencyError
 from sme_registry.version import __version__
 
 
@@ -27,3 +29,28 @@ def versions(packages: Iterable[str], *, if_imported: Iterable[str] = ()) -> dic
         except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
             continue
     return installed
+
+
+def is_installed(package: str) -> bool:
+    """Whether a package can be imported; does not import it."""
+    return importlib.util.find_spec(package) is not None
+
+
+def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> None:
+    """Check that optional packages are installed; imports none of them.
+
+    Args:
+      purpose: what needs them, which the message begins with.
+      packages: their full names by the name to import.
+      extra: of this package, which installs them.
+
+    Raises:
+      MissingDependencyError: names the missing packages and the command that installs them.
+    """
+    missing = [name for package, name in packages.items() if not is_installed(package)]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        raise MissingDependencyError(
+            f"{purpose}: {' and '.join(missing)} {verb} not installed. "
+            f"Run `pip install 'sme-registry[{extra}]'`."
+        )

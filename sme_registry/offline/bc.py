@@ -1,4 +1,4 @@
-"""Behaviour cloning: the policy of least squared error to the actions of a data set.
+"""Behaviour cloning: regression of a policy to the actions of a data set.
 
     L(π) = mean over batch and channels of (π(o) − u)²,   u = 2a − 1
 
@@ -20,7 +20,7 @@ class BC:
     Args:
       observation_dim: O.
       action_dim: A.
-      hyperparameters: see there.
+      hyperparameters: see `BCHyperparameters`.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class BC:
 
     @property
     def actor(self) -> nn.Sequential:
-        """The network from observations to what tanh makes the policy's u."""
+        """The network from observations to the argument of tanh, whose value is the policy's u."""
         return self._actor
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -42,7 +42,7 @@ class BC:
         return {"actor": nn.functional.mse_loss(u, batch.actions)}
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step; the loss as it was before it."""
+        """One gradient step; returns the loss before it."""
         losses = self.losses(batch)
         self._adam.zero_grad(set_to_none=False)
         losses["actor"].backward()  # type: ignore[no-untyped-call]

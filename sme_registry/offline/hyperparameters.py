@@ -1,6 +1,6 @@
-"""What can be set of BC and IQL, and where each default is from. No PyTorch here.
+"""Hyperparameters of BC and IQL, with the source of each default. Does not import PyTorch.
 
-| | BC | IQL | from |
+| | BC | IQL | source |
 |---|---|---|---|
 | hidden layers, ReLU | 256, 256 | 256, 256 in each network | IQL's paper; d3rlpy |
 | Adam's learning rate | 1e-3 | 3e-4 for actor, critics and value | d3rlpy's BC; IQL's paper |
@@ -10,7 +10,7 @@
 | soft update of the target critics | – | 0.005 each step | IQL's paper |
 
 IQL's paper: Kostrikov, Nair, Levine, *Offline Reinforcement Learning with Implicit Q-Learning*,
-2021. It also lets the actor's learning rate decay by a cosine; d3rlpy does not, nor do we.
+2021. It also decays the actor's learning rate by a cosine; neither d3rlpy nor this package does.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.spec.document import Integer, Real, StrictModel
+from sme_registry.errors import OptionError
+from sme_registry.spec import Integer, Real, StrictModel
+from sme_registry.training import algorithms
 
 _Width = Annotated[Integer, Field(ge=1, le=4096)]
 _Widths = Annotated[tuple[_Width, ...], Field(strict=False, min_length=1, max_length=8)]
@@ -29,11 +30,11 @@ _Rate = Annotated[Real, Field(gt=0, le=1)]
 
 
 class BCHyperparameters(StrictModel):
-    """Of behaviour cloning.
+    """Hyperparameters of behaviour cloning.
 
     Attributes:
       hidden: widths of the policy's hidden layers.
-      learning_rate: Adam's.
+      learning_rate: of Adam.
     """
 
     hidden: _Widths = (256, 256)
@@ -41,16 +42,16 @@ class BCHyperparameters(StrictModel):
 
 
 class IQLHyperparameters(StrictModel):
-    """Of implicit Q-learning.
+    """Hyperparameters of implicit Q-learning.
 
     Attributes:
       hidden: widths of the hidden layers of policy, critics and value function.
-      learning_rate: Adam's, of all of them.
+      learning_rate: of Adam, for all networks.
       discount: γ.
-      expectile: τ of the value function; ½ is the mean, towards 1 the maximum.
-      inverse_temperature: β; 0 is behaviour cloning.
-      max_weight: what exp(β advantage) is cut at.
-      target_rate: the share of the critics that moves into their targets in each step.
+      expectile: τ of the value function; ½ gives the mean, values near 1 the maximum.
+      inverse_temperature: β; 0 gives behaviour cloning.
+      max_weight: upper limit of exp(β advantage).
+      target_rate: ρ of the soft update of the target critics in each step.
     """
 
     hidden: _Widths = (256, 256)
@@ -64,10 +65,10 @@ class IQLHyperparameters(StrictModel):
 
 Hyperparameters = BCHyperparameters | IQLHyperparameters
 
-# Each with what `sme offline train --help` says of it.
+# Names with their descriptions in `sme offline train --help`.
 ALGORITHMS: dict[str, str] = {
-    "bc": "behaviour cloning: the policy of least squared error to the actions of the set",
-    "iql": "implicit Q-learning: cloning that weighs each action by its advantage",
+    "bc": "behaviour cloning: regression to the actions of the data set",
+    "iql": "implicit Q-learning: cloning weighted by the advantage of each action",
 }
 _FIELDS: dict[str, type[BCHyperparameters] | type[IQLHyperparameters]] = {
     "bc": BCHyperparameters,
@@ -76,27 +77,21 @@ _FIELDS: dict[str, type[BCHyperparameters] | type[IQLHyperparameters]] = {
 
 
 def known_algorithm(name: str) -> str:
-    """The algorithm's name as it is written, whatever the case it was given in.
+    """The exact name of an offline algorithm, whose case does not matter.
 
     Raises:
-      UnknownNameError: no such algorithm; says which there are and what is near.
+      UnknownNameError: no such algorithm; lists all, and suggests a similar one.
     """
-    found = str(name).casefold()
-    if found not in ALGORITHMS:
-        raise UnknownNameError(
-            f"algorithm={name!r}: must be one of {', '.join(ALGORITHMS)}."
-            f"{did_you_mean(found, ALGORITHMS)}"
-        )
-    return found
+    return algorithms.known_algorithm(name, ALGORITHMS)
 
 
 def hyperparameters_of(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
-    """An algorithm's hyperparameters: its defaults, with some changed.
+    """The hyperparameters of an algorithm: its defaults, with changes.
 
     Raises:
       UnknownNameError: no such algorithm.
-      OptionError: `changes` is no mapping.
-      SpecError: a field is unknown, or its value out of range.
+      OptionError: `changes` is not a mapping.
+      SpecError: a field is unknown, or its value is out of range.
     """
     kind = _FIELDS[known_algorithm(algorithm)]
     if changes is not None and not isinstance(changes, Mapping):

@@ -1,15 +1,15 @@
-"""Implicit Q-learning: no action is ever asked about that the data set does not hold.
+"""Implicit Q-learning: no action outside the data set is ever evaluated.
 
     L(V) = mean of |τ − 1{d < 0}| d²,     d = min Q̄(o, u) − V(o)           expectile regression
     L(Q) = sum over the critics of the mean of (R + γ c V(o') − Q(o, u))²
     L(π) = mean of −min(exp(β d), w_max) log N(u; tanh μ(o), σ² I)          weighted cloning
     Q̄ ← (1 − ρ) Q̄ + ρ Q                                                    after each step
 
-c is 0 after a termination and 1 else, also after a timeout; σ is one number for each channel, in
-[e⁻⁵, e²]. Source: Kostrikov, Nair, Levine, 2021, arXiv 2110.06169.
+c is 0 after a termination and 1 otherwise, also after a timeout; σ is one number for each channel,
+in [e⁻⁵, e²]. Source: Kostrikov, Nair, Levine, 2021, arXiv 2110.06169.
 
-The three losses touch disjoint parameters, so that they are taken at the same weights and in one
-backward pass, with V(o) and Q̄ asked once. Implementations that update V first weigh the actions by
+The three losses have disjoint parameters, so one backward pass at the same weights computes all of
+them, with V(o) and Q̄ evaluated once. Implementations that update V first weight the actions by
 the V of one step later.
 
 Imports PyTorch; import it inside functions only.
@@ -36,18 +36,18 @@ class IQL:
     Attributes:
       critics, targets: from `[B, O + A]` to `[B, 1]` each.
       value: from `[B, O]` to `[B, 1]`.
-      spread: `[A]`, of which the sigmoid is log σ's place between −5 and 2.
+      spread: `[A]`; its sigmoid is the position of log σ between −5 and 2.
 
     Args:
       observation_dim: O.
       action_dim: A.
-      hyperparameters: see there.
+      hyperparameters: see `IQLHyperparameters`.
     """
 
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: IQLHyperparameters
     ) -> None:
-        self._set = hyperparameters
+        self._hyperparameters = hyperparameters
         hidden = hyperparameters.hidden
         self._actor = mlp(observation_dim, hidden, action_dim)
         self.spread = nn.Parameter(torch.zeros(action_dim))
@@ -65,42 +65,44 @@ class IQL:
         self._adam = torch.optim.Adam(
             [*parameters, self.spread], lr=hyperparameters.learning_rate, fused=True
         )
-        self._followed: list[Tensor] = list(self.critics.parameters())
-        self._following: list[Tensor] = list(self.targets.parameters())
+        self._critic_parameters: list[Tensor] = list(self.critics.parameters())
+        self._target_parameters: list[Tensor] = list(self.targets.parameters())
 
     @property
     def actor(self) -> nn.Sequential:
-        """The network from observations to what tanh makes the policy's mean u."""
+        """The network from observations to the argument of tanh, whose value is the mean u."""
         return self._actor
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """The terms of the loss: `value`, `critic` and `actor`."""
-        given = torch.cat([batch.observations, batch.actions], dim=1)
+        inputs = torch.cat([batch.observations, batch.actions], dim=1)
         with torch.no_grad():
-            q = torch.minimum(*(target(given) for target in self.targets))
-            ahead = self.value(batch.next_observations)
-            goal = batch.rewards + self._set.discount * batch.continues * ahead
+            q = torch.minimum(*(target(inputs) for target in self.targets))
+            next_value = self.value(batch.next_observations)
+            goal = batch.rewards + self._hyperparameters.discount * batch.continues * next_value
         advantage = q - self.value(batch.observations)
         with torch.no_grad():
-            asymmetry = (self._set.expectile - (advantage < 0.0).float()).abs()
-            weight = (self._set.inverse_temperature * advantage).exp()
-            weight.clamp_(max=self._set.max_weight)
+            asymmetry = (self._hyperparameters.expectile - (advantage < 0.0).float()).abs()
+            weight = (self._hyperparameters.inverse_temperature * advantage).exp()
+            weight.clamp_(max=self._hyperparameters.max_weight)
         mean = torch.tanh(self._actor(batch.observations))
         log_sigma = _LOW + (_HIGH - _LOW) * torch.sigmoid(self.spread)
         standardised = (batch.actions - mean) * torch.exp(-log_sigma)
         log_density = -0.5 * standardised.square() - log_sigma - _HALF_LOG_2_PI
         return {
             "value": (asymmetry * advantage.square()).mean(),
-            "critic": sum(nn.functional.mse_loss(critic(given), goal) for critic in self.critics),
+            "critic": sum(nn.functional.mse_loss(critic(inputs), goal) for critic in self.critics),
             "actor": -(weight * log_density.sum(dim=1, keepdim=True)).mean(),
         }
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step of everything; the terms of the loss as they were before it."""
+        """One gradient step of all networks; returns the terms of the loss before it."""
         losses = self.losses(batch)
         self._adam.zero_grad(set_to_none=False)
         (losses["value"] + losses["critic"] + losses["actor"]).backward()  # type: ignore[no-untyped-call]
         self._adam.step()
-        with torch.no_grad():  # or the targets' history would grow with each step
-            torch._foreach_lerp_(self._following, self._followed, self._set.target_rate)
+        with torch.no_grad():  # the targets must not track gradients
+            torch._foreach_lerp_(
+                self._target_parameters, self._critic_parameters, self._hyperparameters.target_rate
+            )
         return losses

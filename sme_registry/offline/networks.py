@@ -1,11 +1,11 @@
-"""What both learners are made of: fully connected networks, batches, and actions in [−1, 1].
+"""Parts of both learners: fully connected networks, batches, and actions in [−1, 1].
 
 Imports PyTorch; import it inside functions only.
 
-Actions lie in [0, 1] and the learners work with u = 2a − 1 in [−1, 1], so that a critic's inputs
-are centred. A policy's mean is tanh of its last layer: always an action, and ½ where that is 0. The
-density that IQL needs is a normal one *around* that mean, not one squeezed through a tanh: actions
-of exactly 0 and 1 occur in data, and of those the squeezed density has no finite logarithm.
+Actions lie in [0, 1], and the learners use u = 2a − 1 in [−1, 1], so that a critic's inputs are
+centred. A policy's mean is tanh of its last layer: always a valid action, and ½ where that is 0.
+The density that IQL requires is a normal one *around* that mean, not one squashed by tanh: actions
+of exactly 0 and 1 occur in data, and their squashed density has no finite logarithm.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from sme_registry.evaluation.policies.npz import Layer
 
 
 class Batch(NamedTuple):
-    """Transitions to learn from in one step; `B` rows, float32.
+    """The transitions of one gradient step; `B` rows, float32.
 
     Attributes:
       observations: `[B, O]`.
       actions: `[B, A]` u = 2a − 1, in [−1, 1].
       next_observations: `[B, O]`.
       rewards: `[B, 1]`.
-      continues: `[B, 1]` 0 where the episode terminated, else 1; a timeout is no termination.
+      continues: `[B, 1]` 0 if the episode terminated, else 1, also after a timeout.
     """
 
     observations: Tensor
@@ -41,18 +41,18 @@ class Batch(NamedTuple):
 
 
 class Learner(Protocol):
-    """What `train_offline` trains."""
+    """An offline learner."""
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step; the terms of the loss by name, as they were before it."""
+        """One gradient step; returns the terms of the loss before it, by name."""
 
     @property
     def actor(self) -> nn.Sequential:
-        """The network from observations to what tanh makes the policy's mean u."""
+        """The network from observations to the argument of tanh, whose value is the mean u."""
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
-    """Fully connected layers with ReLU between them, initialised as PyTorch does."""
+    """Fully connected layers with ReLU between them, with PyTorch's initialisation."""
     widths = [inputs, *hidden]
     layers: list[nn.Module] = []
     for before, after in itertools.pairwise(widths):
@@ -70,14 +70,14 @@ def weights(network: nn.Sequential) -> list[Layer]:
 
 
 class Batches:
-    """A data set as one float32 matrix, cut into batches of shuffled rows without end.
+    """An endless iterator over batches of shuffled rows of a data set.
 
-    Each row comes once before any comes again. All columns of a batch are gathered at once: seven
-    gathers of a few columns each would take as long as a network.
+    Every row is used once before any repeats. The data set is one float32 matrix, so that one
+    gather gets all columns of a batch; one for each column would take as long as a network.
 
     Args:
-      transitions: the set.
-      batch_size: B, at most the rows of the set.
+      transitions: the data set.
+      batch_size: B, at most the rows of the data set.
       generator: of the shuffles.
     """
 
@@ -96,12 +96,12 @@ class Batches:
         self._batch_size, self._generator = batch_size, generator
 
     def __iter__(self) -> Iterator[Batch]:
-        waiting = torch.empty(0, dtype=torch.int64)
+        remaining = torch.empty(0, dtype=torch.int64)
         while True:
             shuffled = torch.randperm(len(self._rows), generator=self._generator)
-            waiting = torch.cat([waiting, shuffled])
-            whole = len(waiting) // self._batch_size * self._batch_size
-            for chosen in torch.split(waiting[:whole], self._batch_size):
-                rows = self._rows.index_select(0, chosen)
+            remaining = torch.cat([remaining, shuffled])
+            whole = len(remaining) // self._batch_size * self._batch_size
+            for indices in torch.split(remaining[:whole], self._batch_size):
+                rows = self._rows.index_select(0, indices)
                 yield Batch(*torch.split(rows, self._widths, dim=1))
-            waiting = waiting[whole:]
+            remaining = remaining[whole:]

@@ -1,89 +1,85 @@
-"""The algorithms by name, loaded when they are needed: importing PyTorch takes seconds.
+"""Stable-Baselines3's algorithms by name, imported only when needed: PyTorch takes seconds.
 
-And how all of them are run here: on one thread, quietly, with a replay buffer of the size needed.
+Also the settings they share here: one thread, no messages, a replay buffer of the size needed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
-from sme_registry.errors import MissingDependencyError, UnknownNameError, did_you_mean
+from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.io import require_packages
 from sme_registry.spec import SMESpec
 
-# Each with what `sme train --help` says of it. The value's class is in `stable_baselines3`.
+# Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
 ALGORITHMS = {
     "TD3": "off-policy, deterministic; the fastest learner on the default task",
     "SAC": "off-policy, entropy-regularised",
-    "DDPG": "off-policy, deterministic; TD3's ancestor",
-    "PPO": "on-policy; ten times faster a step, and many more steps to learn",
+    "DDPG": "off-policy, deterministic; the predecessor of TD3",
+    "PPO": "on-policy; steps ten times faster, but learns from many more",
     "A2C": "on-policy",
 }
 _ON_POLICY = ("PPO", "A2C")
-_TEAMS_AT_ONCE = 8
-_ROLLOUT, _FEWEST_STEPS = 2048, 16  # SB3's PPO collects this many of one environment
+_TEAMS = 8
+_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO, of one environment; ours at least
 _MAX_REPLAY = 1_000_000  # SB3's default
 
 
 def default_algorithm(spec: SMESpec) -> str:
-    """What trains where nothing else is asked for: TD3, and on a team PPO."""
+    """The algorithm used by default: TD3, and PPO for a team."""
     return "TD3" if spec.team is None else "PPO"
 
 
 def default_num_envs(spec: SMESpec, algorithm: str) -> int:
-    """Environments at once where nothing else is asked for: 1, and of a team on-policy 8.
+    """The number of parallel environments by default: 1, and 8 for a team and an on-policy one.
 
-    Off-policy more of them would mean fewer updates.
+    With an off-policy algorithm, more environments would mean fewer updates.
     """
-    return _TEAMS_AT_ONCE if spec.team is not None and algorithm in _ON_POLICY else 1
+    return _TEAMS if spec.team is not None and algorithm in _ON_POLICY else 1
 
 
 def rollout_steps(spec: SMESpec, algorithm: str, num_envs: int) -> int | None:
-    """PPO's `n_steps` on a team; None leaves SB3's default.
+    """PPO's `n_steps` for a team; None keeps SB3's default.
 
-    Its default, 2,048 steps, is of each lane, and a team has a lane for each agent: 8 teams of 4
-    would collect 65,536 transitions for one update. On Team4, seed 0, 16,384 steps of the team then
-    left r̃ at 0.77; with 2,048 transitions shared out over the lanes it was 0.85. So trained, mean
-    regret fell from 0.89 to 0.14 by step 55,000, and then rose again, to 0.55 at 100,000; with four
-    times the rollout it fell steadily and slower, to 0.23 at 64,000.
+    The default is 2,048 steps for each lane, and a team has one lane for each agent: 8 teams of 4
+    agents would collect 65,536 transitions for one update. On Team4, seed 0, r̃ was 0.77 after
+    16,384 team steps with the default, and 0.85 with 2,048 transitions divided over the lanes. Mean
+    regret then fell from 0.89 to 0.14 by step 55,000 and rose to 0.55 by step 100,000; with four
+    times the rollout it fell steadily but more slowly, to 0.23 at step 64,000.
     """
     if spec.team is None or algorithm != "PPO":
         return None
-    return max(_FEWEST_STEPS, _ROLLOUT // (num_envs * len(spec.team.agents)))
+    return max(_MIN_ROLLOUT, _ROLLOUT // (num_envs * len(spec.team.agents)))
 
 
-def known_algorithm(name: str) -> str:
-    """The algorithm's name as it is written, whatever the case it was given in.
-
-    Raises:
-      UnknownNameError: no such algorithm; says which there are and what is near.
-    """
-    by_fold = {known.casefold(): known for known in ALGORITHMS}
-    found = by_fold.get(str(name).casefold())
-    if found is None:
-        raise UnknownNameError(
-            f"algorithm={name!r}: must be one of {', '.join(ALGORITHMS)}."
-            f"{did_you_mean(str(name), ALGORITHMS)}"
-        )
-    return found
-
-
-def refuse_without_dependencies() -> None:
-    """Raise where Stable-Baselines3 or PyTorch is not installed; imports neither.
+def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:
+    """The exact name of an algorithm, whose case does not matter.
 
     Raises:
-      MissingDependencyError: says what to install.
+      UnknownNameError: no such algorithm; lists all, and suggests a similar one.
     """
-    for package, known_as in (("stable_baselines3", "Stable-Baselines3"), ("torch", "PyTorch")):
-        if importlib.util.find_spec(package) is None:
-            raise MissingDependencyError(
-                f"training: {known_as} is not installed. Run `pip install 'sme-registry[train]'`."
-            )
+    for known in algorithms:
+        if known.casefold() == str(name).casefold():
+            return known
+    raise UnknownNameError(
+        f"algorithm={name!r}: must be one of {', '.join(algorithms)}."
+        f"{did_you_mean(str(name), algorithms)}"
+    )
+
+
+def require_sb3() -> None:
+    """Check that Stable-Baselines3 and PyTorch are installed; imports neither.
+
+    Raises:
+      MissingDependencyError: names the extra to install.
+    """
+    packages = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
+    require_packages("training", packages, "train")
 
 
 def load_algorithm(name: str) -> Any:
@@ -94,24 +90,24 @@ def load_algorithm(name: str) -> Any:
       MissingDependencyError: Stable-Baselines3 is not installed.
     """
     name = known_algorithm(name)
-    refuse_without_dependencies()
-    # It imports the retired `gym` where that is installed, which then prints a long notice.
+    require_sb3()
+    # It imports the deprecated `gym` if that is installed, which prints a long notice.
     with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return getattr(importlib.import_module("stable_baselines3"), name)
 
 
-def is_sb3(found: Any) -> bool:
-    """Whether this is a class of Stable-Baselines3's kind, or an object of one."""
+def is_sb3(algorithm: Any) -> bool:
+    """Whether this is a subclass of Stable-Baselines3's base class, or an instance of one."""
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    return issubclass(found if isinstance(found, type) else type(found), BaseAlgorithm)
+    return issubclass(algorithm if isinstance(algorithm, type) else type(algorithm), BaseAlgorithm)
 
 
 def replay_settings(algorithm: Any, transitions: int) -> dict[str, int]:
-    """The size of an off-policy algorithm's replay buffer; nothing for another.
+    """The size of an off-policy algorithm's replay buffer; empty for an on-policy algorithm.
 
-    Never smaller than what will be stored, so nothing that SB3's default would do changes.
+    It holds all transitions, or as many as SB3's default, so results do not depend on it.
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -121,7 +117,7 @@ def replay_settings(algorithm: Any, transitions: int) -> dict[str, int]:
 
 
 def silence(model: Any) -> None:
-    """Have an SB3 model log nowhere; left to itself it makes a folder among temporary files."""
+    """Disable the logger of an SB3 model; by default it creates a temporary folder."""
     from stable_baselines3.common.logger import Logger
 
     model.set_logger(Logger(None, []))
@@ -129,7 +125,7 @@ def silence(model: Any) -> None:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """No warnings of the libraries below: they speak to programmers about their own insides."""
+    """Hide warnings of libraries, which address their developers and not our users."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -137,7 +133,7 @@ def quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread for PyTorch, whose default is put back afterwards."""
+    """Run PyTorch on one thread; the previous number is restored afterwards."""
     import torch
 
     before = torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""What happens beside SB3's training loop: exact regret of each episode, checkpoints, progress.
+"""`RunCallback`: logs the exact regret of each episode, saves checkpoints and shows progress.
 
 Imports Stable-Baselines3; import it inside functions only.
 """
@@ -18,60 +18,58 @@ _RECENT = 20  # episodes in the running mean that the progress shows
 
 
 class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """Sums what the environment says of each step, and writes it down when an episode ends.
+    """Logs finished episodes, saves checkpoints and updates the progress during SB3's training.
 
-    SB3 counts a step for each agent of a team; here, as in all that is written, a step is one of
-    the whole team.
+    SB3 counts one step for each agent of a team; here and in all files a step is one of the team.
 
     Args:
-      log: where episodes go.
-      progress: what shows the progress.
-      checkpoint: called with the steps done, every `checkpoint_every` steps.
+      log: of finished episodes.
+      progress: of the training.
+      save_checkpoint: called every `checkpoint_every` steps.
       checkpoint_every: steps.
-      wall_before: seconds of training in earlier sessions.
-      agents: the agents of the team, whose lanes lie side by side; none where there is no team.
+      agents: names of a team's agents, whose lanes are adjacent; empty for a single agent.
     """
 
     def __init__(
         self,
         log: EpisodeLog,
         progress: Progress,
-        checkpoint: Callable[[int], None],
+        save_checkpoint: Callable[[], None],
         checkpoint_every: int,
-        wall_before: float,
         agents: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        self._log, self._progress, self._checkpoint = log, progress, checkpoint
-        self._every, self._wall_before = checkpoint_every, wall_before
+        self._log, self._progress, self._save_checkpoint = log, progress, save_checkpoint
+        self._every = checkpoint_every
         self._agents = tuple(agents)
         self._lanes_each = max(1, len(self._agents))
+        self._wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
         self._start = time.monotonic()
         self._last_checkpoint = 0
 
     @property
     def wall_seconds(self) -> float:
-        """Seconds of training, over all sessions."""
+        """Seconds of training over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
     @property
     def steps_done(self) -> int:
-        """Environment steps of the whole run, over all environments."""
+        """Environment steps of the whole run over all environments."""
         return int(self.num_timesteps) // self._lanes_each
 
     def _on_training_start(self) -> None:
         lanes = self.training_env.num_envs
-        # return, length, sum of regret, sum of similarity; the episode under way in each lane
+        # return, length, sum of regret and sum of similarity of the current episode in each lane
         self._sums = np.zeros((4, lanes))
         self._last_checkpoint = self.steps_done
         self._start = time.monotonic()
         self._note = self._running_mean()
 
     def _on_rollout_start(self) -> None:
-        # Between rollouts the model is consistent: all it has seen is learnt from and in its
-        # replay buffer. For off-policy algorithms that is after each step of the environment.
+        # Between rollouts the model is consistent: it has learnt from all transitions, and they are
+        # in its replay buffer. For off-policy algorithms that is after each environment step.
         if self.steps_done - self._last_checkpoint >= self._every:
-            self._checkpoint(self.steps_done)
+            self._save_checkpoint()
             self._last_checkpoint = self.steps_done
 
     def _on_step(self) -> bool:
@@ -80,7 +78,7 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
         self._sums[1] += 1.0
         self._sums[2] += [info["regret"] for info in infos]
         self._sums[3] += [info["similarity"] for info in infos]
-        # A team's lanes end together: the first of them stands for all.
+        # The lanes of a team end together, so checking the first one is enough.
         for lane in np.flatnonzero(dones[:: self._lanes_each]) * self._lanes_each:
             self._log_episode(int(lane), int(not infos[lane]["TimeLimit.truncated"]))
         if dones.any():
@@ -89,7 +87,7 @@ class RunCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped
         return True
 
     def _log_episode(self, lane: int, terminated: int) -> None:
-        """Write down the episode that ended in this lane, or in those of a team from it on."""
+        """Log the episode that ended in this lane, or in a team's lanes from this one on."""
         lanes = slice(lane, lane + self._lanes_each)
         returned, length, regret, similarity = self._sums[:, lanes].mean(axis=1).tolist()
         regrets = (self._sums[2, lanes] / length).tolist() if self._agents else []

@@ -1,7 +1,7 @@
-"""`checkpoint.zip`: an SB3 model with its replay buffer, in one file that is whole or absent.
+"""`checkpoint.zip`: an SB3 model and its replay buffer in one file, written atomically.
 
-It is a model's .zip that SB3 can load, with one member more: the filled part of the replay buffer.
-In two files a kill between them would pair a model with another model's buffer.
+It is a model's .zip that SB3 can load, with one more member: the filled part of the replay buffer.
+With two files, a kill between the writes would pair a model with the wrong buffer.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def save(model: Any, path: Path) -> None:
-    """Write a checkpoint, whole or not at all.
+    """Write a checkpoint completely or not at all.
 
     Raises:
-      OptionError: it cannot be written; the one before is untouched.
+      OptionError: it cannot be written; the previous one is unchanged.
     """
     archive = io.BytesIO()
     model.save(archive)
@@ -41,17 +41,17 @@ def save(model: Any, path: Path) -> None:
 
 
 def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
-    """The model of a checkpoint, its replay buffer filled as it was.
+    """The model of a checkpoint, with its replay buffer.
 
     Args:
-      algorithm: the SB3 class that saved it.
-      path: the file. Loading one can run code of whoever made it.
-      env: the environment that it goes on in.
-      **kwargs: fields of the model to change, such as `buffer_size`; that one is raised to what
-        the checkpoint holds.
+      algorithm: the SB3 class of the model.
+      path: the file. Loading it can run arbitrary code, so it must come from a trusted source.
+      env: the environment to continue in.
+      **kwargs: fields of the model to change, such as `buffer_size`, which is raised to the size
+        of the stored buffer.
 
     Raises:
-      PolicyError: not a checkpoint that can be loaded.
+      PolicyError: the checkpoint cannot be loaded.
     """
     try:
         with zipfile.ZipFile(path) as members:
@@ -65,8 +65,8 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
             _refill(model.replay_buffer, replay)
     except Exception as error:
         raise PolicyError(
-            f"{path}: cannot be resumed from: {type(error).__name__}: {error}. "
-            "Begin anew with --force (in Python force=True), or in another folder."
+            f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
+            "(in Python, force=True), or in another folder."
         ) from error
     return model
 
@@ -75,8 +75,8 @@ def _refill(buffer: Any, replay: dict[str, Any]) -> None:
     filled = len(replay["rewards"])
     for name in _ARRAYS:
         getattr(buffer, name)[:filled] = replay[name]
-    # A buffer that was full and has grown since goes on behind what it holds, in another order
-    # than the ring it was; its samples are drawn at random, so the order does not matter.
+    # A buffer that was full and is now larger continues after its last row. This changes the order
+    # of the ring, which does not matter because batches are sampled at random.
     was_full = bool(replay["full"])
     buffer.full = was_full and filled >= buffer.buffer_size
     buffer.pos = filled if was_full and not buffer.full else int(replay["pos"])

@@ -1,6 +1,6 @@
-"""`episodes.csv`: one row for each finished episode, on disk as soon as it has ended.
+"""`episodes.csv`: one row for each finished episode, written as soon as it ends.
 
-A team's has a column more for each agent, `regret/<agent>`.
+That of a team has one more column for each agent, `regret/<agent>`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 
 FILE = "episodes.csv"
-_OF_AGENT = "regret/"
+_AGENT_PREFIX = "regret/"
 
 
 class Episode(NamedTuple):
@@ -23,17 +23,16 @@ class Episode(NamedTuple):
 
     Attributes:
       episode: its number, from 1.
-      step: environment steps of the whole run when it ended, over all environments; a step of a
-        team is one step of all its agents.
-      episode_return: the sum of its rewards, in [0, T]; the column is called `return`.
-      length: its steps.
-      regret: mean regret 1 − r over its steps, in [0, 1]; exact.
+      step: environment steps of the run over all environments when it ended; a step of a team is
+        one step of all its agents.
+      episode_return: sum of its rewards, in [0, T]; the column is `return`. For a team, this,
+        `regret` and `similarity` are means over its agents.
+      length: number of steps.
+      regret: mean of 1 − r over its steps, in [0, 1]; exact.
       similarity: mean r̃ over its steps, in [0, 1]; exact.
-      terminated: 1 where it ended by D, 0 where its time was up.
-      wall_seconds: of training, over all sessions, when it ended.
-      agents_regret: each agent's mean regret, in the team's order; empty where there is no
-        team. Of a team the numbers above (return, regret, similarity) are the mean over
-        its agents.
+      terminated: 1 if it ended by D, 0 if it reached the horizon.
+      wall_seconds: of training over all sessions when it ended.
+      agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
     """
 
     episode: int
@@ -52,7 +51,7 @@ _TYPES = (int, int, float, int, float, float, int, float)
 
 
 def read_episodes(path: Path) -> list[Episode]:
-    """Every whole row; one that a kill cut short is left out.
+    """All complete rows; one that was cut off by a kill is skipped.
 
     Raises:
       OptionError: the file has other columns, or cannot be read.
@@ -62,10 +61,11 @@ def read_episodes(path: Path) -> list[Episode]:
     except (OSError, UnicodeDecodeError) as error:
         raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
     head = rows[0] if rows else []
-    own, agents = tuple(head[: len(COLUMNS)]), head[len(COLUMNS) :]
-    if own != COLUMNS or not all(column.startswith(_OF_AGENT) for column in agents):
+    columns, agents = tuple(head[: len(COLUMNS)]), head[len(COLUMNS) :]
+    if columns != COLUMNS or not all(column.startswith(_AGENT_PREFIX) for column in agents):
         raise OptionError(
-            f"{path}: its columns must be {','.join(COLUMNS)}, and of a team {_OF_AGENT}<agent>."
+            f"{path}: the columns must be {','.join(COLUMNS)}, and for a team "
+            f"{_AGENT_PREFIX}<agent>."
         )
     episodes = []
     for row in rows[1:]:
@@ -81,27 +81,26 @@ def read_episodes(path: Path) -> list[Episode]:
 
 
 class EpisodeLog:
-    """Appends rows, each flushed as it is written: a killed run keeps all it has finished.
+    """Appends rows and flushes each, so that a killed run keeps all finished episodes.
 
     Args:
-      path: the file. Rows after `up_to_step`, which a resumed run will live through again, are
-        dropped; so is a row that a kill cut short.
-      up_to_step: the step of the checkpoint that the run goes on from; 0 begins anew.
-      agents: the agents of the team, each with a column; none where there is no team.
+      path: the file. Rows after `up_to_step` are dropped, because a resumed run repeats them.
+      up_to_step: the step of the checkpoint to continue from; 0 starts a new file.
+      agents: names of a team's agents, each with a column; empty for a single agent.
     """
 
     def __init__(self, path: Path, up_to_step: int = 0, agents: Sequence[str] = ()) -> None:
         kept = read_episodes(path) if up_to_step and path.exists() else []
         self.episodes = [episode for episode in kept if episode.step <= up_to_step]
         text = io.StringIO()
-        head = [*COLUMNS, *(f"{_OF_AGENT}{agent}" for agent in agents)]
+        head = [*COLUMNS, *(f"{_AGENT_PREFIX}{agent}" for agent in agents)]
         csv.writer(text, lineterminator="\n").writerows([head, *map(_row, self.episodes)])
         write_atomically(path, text.getvalue())
         self._stream = path.open("a", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream, lineterminator="\n")
 
     def add(self, episode: Episode) -> None:
-        """Write one row."""
+        """Append one row."""
         self.episodes.append(episode)
         self._writer.writerow(_row(episode))
         self._stream.flush()
@@ -112,5 +111,5 @@ class EpisodeLog:
 
 
 def _row(episode: Episode) -> list[int | str]:
-    *own, agents = episode
-    return [format(v, ".9g") if isinstance(v, float) else v for v in (*own, *agents)]
+    *values, agents = episode
+    return [format(v, ".9g") if isinstance(v, float) else v for v in (*values, *agents)]

@@ -1,9 +1,7 @@
-"""`run.json`: what was run, on what, with which versions; and how far it got."""
+"""`run.json`: the plan of a training run, its versions and its progress."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,27 +14,27 @@ from sme_registry.spec.document import Integer, Real, StrictModel
 
 FILE = "run.json"
 DEFAULTS = "stable-baselines3 defaults"
-_PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
+PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
 
 class RunRecord(StrictModel):
-    """A training run: its plan, and what came of it.
+    """A training run: its plan and its progress.
 
     Attributes:
-      status: "running" (or killed), then "finished".
-      spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which a resumption
-        must agree with.
-      hyperparameters: whose, and what is changed.
-      agents: of the task; more than 1 in a team. They share the one policy that is trained.
-      steps: environment steps asked for, over all environments. A step of a team is one step of
+      status: "running" (also after a kill), then "finished".
+      spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which must not change
+        when the run is resumed.
+      hyperparameters: whose defaults, and the changes to them.
+      agents: number of agents of the task; those of a team share the one policy that is trained.
+      steps: requested environment steps over all environments. A step of a team is one step of
         all its agents, so the algorithm learns from `agents` times as many transitions.
       steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their
-        last rollout, so it can be above `steps`.
+        last rollout, so it can exceed `steps`.
       checkpoint_every: steps between checkpoints.
-      episodes: finished episodes, all logged in episodes.csv.
-      sessions: 1, and one more for each resumption.
-      wall_seconds, steps_per_second: of the training, over all sessions, evaluation left out.
-      protocol, protocol_digest: of the evaluation at the end.
+      episodes: number of finished episodes, which episodes.csv lists.
+      sessions: 1 plus the number of times the run was resumed.
+      wall_seconds, steps_per_second: of the training over all sessions, without evaluation.
+      protocol, protocol_digest: of the final evaluation.
       versions: of Python and the packages that the numbers depend on.
     """
 
@@ -63,19 +61,19 @@ class RunRecord(StrictModel):
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:
-        """The record of a folder; None where it holds no run.
+        """The record of a folder; None if it contains no run.
 
         Raises:
-          MalformedDocumentError, SpecError: there is a file of that name and it is no record.
+          MalformedDocumentError, SpecError: the file exists but is not a valid record.
         """
         path = folder / FILE
         return cls.from_dict(read_json(path), str(path)) if path.exists() else None
 
     def write(self, folder: Path) -> None:
-        """Write it into the run's folder, whole or not at all.
+        """Write the record into the run's folder, completely or not at all.
 
         Raises:
-          OptionError: it cannot be written.
+          OptionError: the file cannot be written.
         """
         write_atomically(folder / FILE, to_json(self.to_dict()))
 
@@ -83,29 +81,16 @@ class RunRecord(StrictModel):
         """This record with some fields changed."""
         return self.model_copy(update=changes)
 
-    def refuse_other_plan(self, asked: RunRecord, folder: Path) -> None:
-        """Raise where the run in the folder is not the one that is to be resumed.
+    def check_same_plan(self, plan: RunRecord, folder: Path) -> None:
+        """Check that a run to be resumed has the same plan.
 
         Raises:
-          OptionError: names the field, both values, and the way out.
+          OptionError: names the field that differs, both values, and the remedy.
         """
         for field in ("spec_digest", "algorithm", "seed", "action_range", "num_envs"):
-            before, now = getattr(self, field), getattr(asked, field)
-            if before != now:
+            ours, theirs = getattr(self, field), getattr(plan, field)
+            if ours != theirs:
                 raise OptionError(
-                    f"{field}={now!r}: the run in {folder} has {before!r}. Resume it with what it "
-                    "was begun with, or train into another folder."
+                    f"{field}={theirs!r}: the run in {folder} has {ours!r}. Resume it with the "
+                    "same value, or train into another folder."
                 )
-
-
-def installed_versions() -> dict[str, str]:
-    """Versions of Python and of what the numbers depend on, where installed."""
-    from sme_registry.version import __version__
-
-    versions = {"sme_registry": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions

@@ -35,38 +35,38 @@ def test_a_set_is_trained_on_and_its_policy_evaluated(
     folder: Path, tmp_path: Path, algorithm: str
 ) -> None:
     out, task = tmp_path / "run", tmp_path / "tiny.json"
-    code, shown, error = sme(
+    code, stdout, stderr = sme(
         *("offline", "train", "tiny-v0", "-a", algorithm, "--datasets", str(folder)),
         *("--out", str(out), *SHORT),
     )
-    assert code == 0, error
-    assert "improvement" in shown
+    assert code == 0, stderr
+    assert "improvement" in stdout
     names = {path.name for path in out.iterdir()}
     assert names >= {"offline.json", "policy.npz", "evaluation.json"}
     from sme_registry import save
 
     save(TINY, task, name="Tiny")
-    code, shown, error = sme(
+    code, stdout, stderr = sme(
         "evaluate", str(out / "policy.npz"), str(task), "--protocol", "quick-v1", "--json"
     )
-    assert code == 0, error
-    assert json.loads(shown)["policy"] == "policy"
+    assert code == 0, stderr
+    assert json.loads(stdout)["policy"] == "policy"
 
 
 def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None:
-    code, shown, error = sme(
+    code, stdout, stderr = sme(
         *("offline", "train", str(folder / "tiny-v0"), "-a", "bc", "--json"),
         *("--out", str(tmp_path / "run"), *SHORT),
     )
-    assert code == 0, error
-    found = json.loads(shown)
-    assert found["training"]["algorithm"] == "bc"
-    assert found["training"]["hyperparameters"]["hidden"] == [8]
-    assert len(found["evaluation"]["regions"]) == 6
+    assert code == 0, stderr
+    output = json.loads(stdout)
+    assert output["training"]["algorithm"] == "bc"
+    assert output["training"]["hyperparameters"]["hidden"] == [8]
+    assert len(output["evaluation"]["regions"]) == 6
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["tiny-v1"], "is neither the id of a data set"),
         (["tiny-v0", "-a", "ddpg"], "algorithm='ddpg'"),
@@ -77,14 +77,14 @@ def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None
     ],
 )
 def test_bad_input_is_one_line_and_code_2(
-    folder: Path, tmp_path: Path, arguments: list[str], said: str
+    folder: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     out = tmp_path / "run"
-    code, shown, error = sme(
+    code, stdout, stderr = sme(
         "offline", "train", *arguments, "--datasets", str(folder), "--out", str(out)
     )
     assert code == 2
-    assert said in error
-    assert "Traceback" not in error
-    assert not shown
+    assert message in stderr
+    assert "Traceback" not in stderr
+    assert not stdout
     assert not out.exists()

@@ -108,7 +108,7 @@ def test_bc_imitates_the_optimum() -> None:
         optimal, steps=400, batch_size=128, hyperparameters={"hidden": [64], "learning_rate": 0.01}
     )
     assert result.record.behaviour.similarity == pytest.approx(1.0, abs=1e-7)  # float32 actions
-    assert result.record.score > 0.95
+    assert result.record.similarity > 0.95
     assert result.report.regions[0].similarity > 0.95
 
 
@@ -124,7 +124,7 @@ def test_iql_surpasses_random_behaviour() -> None:
     assert result.record.improvement > 0.1
 
 
-def test_the_behaviour_s_score_is_that_of_the_set(transitions: Transitions) -> None:
+def test_the_behaviour_quality_is_that_of_the_data_set(transitions: Transitions) -> None:
     behaviour = short(transitions).record.behaviour
     assert behaviour.similarity == transitions.similarities.mean()
     assert behaviour.similarity_sd == transitions.similarities.std()
@@ -143,11 +143,11 @@ def test_a_folder_holds_what_was_returned(transitions: Transitions, tmp_path: Pa
     assert {"torch", "numpy", "python"} <= result.record.versions.keys()
 
 
-def test_a_folder_with_a_training_is_replaced_only_when_told(
+def test_a_folder_with_a_training_is_replaced_only_with_force(
     transitions: Transitions, tmp_path: Path
 ) -> None:
     short(transitions, folder=tmp_path, steps=1, evaluations=1)
-    with pytest.raises(OptionError, match="holds a training"):
+    with pytest.raises(OptionError, match="already exists"):
         short(transitions, folder=tmp_path)
     assert short(transitions, folder=tmp_path, force=True).record.steps == 40
     (tmp_path / "notes.txt").write_text("mine")
@@ -165,7 +165,7 @@ def test_a_record_with_another_spec_s_digest_is_refused(
         OfflineRecord.read(path)
 
 
-def test_a_set_on_disk_brings_its_task_and_protocol(tmp_path: Path) -> None:
+def test_a_set_on_disk_provides_its_task_and_protocol(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     dataset = make_dataset(
         TINY, 0.5, transitions=100, protocol=PROTOCOL, name="sme/tiny-v0", folder=tmp_path
@@ -176,12 +176,12 @@ def test_a_set_on_disk_brings_its_task_and_protocol(tmp_path: Path) -> None:
         assert result.record.dataset == "sme/tiny-v0"
         assert result.record.recipe_digest == dataset.record.recipe_digest
         assert result.report.protocol.states_per_region == 50
-    with pytest.raises(OptionError, match="the set is of"):
+    with pytest.raises(OptionError, match=r"the data set.s task is"):
         short(dataset, spec=SMESpec())
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "said"),
+    ("changes", "error", "message"),
     [
         ({"algorithm": "iq"}, UnknownNameError, "Did you mean 'iql'"),
         ({"steps": 0}, OptionError, "steps=0"),
@@ -196,20 +196,20 @@ def test_a_set_on_disk_brings_its_task_and_protocol(tmp_path: Path) -> None:
         ({"hyperparameters": [1]}, OptionError, "hyperparameters"),
         ({"spec": None}, OptionError, "spec=None"),
         ({"spec": SMESpec()}, OptionError, "observations of shape"),
-        ({"spec": TINY.derive(seed=6)}, OptionError, "is not the task of the set"),
+        ({"spec": TINY.derive(seed=6)}, OptionError, "is not the task of the data set"),
         ({"spec": "Team2"}, SpecError, "team"),
         ({"spec": "Nowhere"}, UnknownNameError, "Nowhere"),
         ({"protocol": "papr-v1"}, UnknownNameError, "paper-v1"),
     ],
 )
 def test_bad_input_is_refused(
-    transitions: Transitions, changes: dict[str, Any], error: type[SMEError], said: str
+    transitions: Transitions, changes: dict[str, Any], error: type[SMEError], message: str
 ) -> None:
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         short(transitions, **changes)
 
 
-def test_what_is_no_data_set_is_refused() -> None:
+def test_other_data_is_refused() -> None:
     with pytest.raises(OptionError, match="must be a data set"):
         short([1, 2, 3])
     with pytest.raises(UnknownNameError, match="is neither the id of a data set"):
@@ -219,7 +219,7 @@ def test_what_is_no_data_set_is_refused() -> None:
 def test_numbers_that_are_not_finite_are_refused(transitions: Transitions) -> None:
     columns = transitions.columns()
     columns["rewards"] = np.where(np.arange(600) == 7, np.nan, columns["rewards"])
-    with pytest.raises(OptionError, match="rewards: has NaN"):
+    with pytest.raises(OptionError, match="rewards: contains NaN"):
         short(Transitions(**columns))
 
 
@@ -239,7 +239,7 @@ def test_without_torch_it_says_what_to_install(
 
 
 def test_progress_ends_at_the_last_step(transitions: Transitions) -> None:
-    told: list[tuple[int, int, str]] = []
-    short(transitions, progress=lambda *said: told.append(said))
-    assert told[-1][:2] == (40, 40)
-    assert told[-1][2].startswith("live r̃ 0.")
+    reports: list[tuple[int, int, str]] = []
+    short(transitions, progress=lambda *arguments: reports.append(arguments))
+    assert reports[-1][:2] == (40, 40)
+    assert reports[-1][2].startswith("r̃ 0.")

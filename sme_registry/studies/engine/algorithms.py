@@ -28,8 +28,8 @@ from sme_registry.training import ALGORITHMS
 from sme_registry.training.algorithms import (
     is_sb3,
     load_algorithm,
-    refuse_without_dependencies,
     replay_settings,
+    require_sb3,
     silence,
 )
 
@@ -91,7 +91,7 @@ def find_algorithm(uses: str) -> Any:
       OptionError: a module or entry point cannot be imported or called.
       MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
     """
-    refuse_without_dependencies()  # every learner gets their `VecEnv`
+    require_sb3()  # every learner gets their `VecEnv`
     if ":" in uses:
         algorithm = import_object(uses, "uses", OptionError)
     elif uses.casefold() in (known.casefold() for known in ALGORITHMS):

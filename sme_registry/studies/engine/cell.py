@@ -29,9 +29,9 @@ from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.task import materialize
 from sme_registry.training import ALGORITHMS
-from sme_registry.training.algorithms import one_thread, quiet, refuse_without_dependencies
+from sme_registry.training.algorithms import one_thread, quiet, require_sb3
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import installed_versions
+from sme_registry.training.record import PACKAGES
 
 ReportSteps = Callable[[int, int], None]
 
@@ -221,7 +221,7 @@ def _save(learner: Learner, path: Path) -> None:
 def versions_for(uses: str) -> dict[str, str]:
     """Installed versions that the numbers depend on, including the algorithm's own package."""
     package = uses.partition(":")[0].partition(".")[0]
-    return installed_versions() | versions([package])
+    return versions([*PACKAGES, package])
 
 
 def refuse_unknown_algorithm(uses: str) -> None:
@@ -236,6 +236,6 @@ def refuse_unknown_algorithm(uses: str) -> None:
     if reference_name(uses) is not None or offline_name(uses) is not None:
         return
     if uses.casefold() in (name.casefold() for name in ALGORITHMS):
-        refuse_without_dependencies()  # importing them takes seconds
+        require_sb3()  # importing them takes seconds
     else:
         find_algorithm(uses)

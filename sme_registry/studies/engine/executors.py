@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from sme_registry.io import parse_json, to_json
+from sme_registry.io import parse_json, to_json, versions
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.training.record import installed_versions
+from sme_registry.training.record import PACKAGES
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
 ReportProgress = Callable[[Cell, int, int], None]
@@ -109,7 +109,7 @@ def failure_message(cell: Cell, error: str, details: str = "") -> Message:
         cell=cell,
         error=error,
         traceback=details[-TRACEBACK_CHARACTERS:],
-        versions=installed_versions(),
+        versions=versions(PACKAGES),
     )
     return Message(True, to_json(failure.to_dict()))
 

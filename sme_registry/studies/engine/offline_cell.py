@@ -103,7 +103,7 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
             dataset_digest=record.dataset_digest,
             behaviour_similarity=record.behaviour.similarity,
             behaviour_similarity_sd=record.behaviour.similarity_sd,
-            similarity=record.score,
+            similarity=record.similarity,
             similarity_sd=record.evaluations[-1].similarity_sd,
         ),
         timing=Timing(

@@ -1,0 +1,101 @@
+"""`learn`: the gradient steps of BC or IQL, in sections that end where an evaluation is due."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sme_registry.datasets import Transitions
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation.policies.npz import Layer
+from sme_registry.offline.hyperparameters import BCHyperparameters, Hyperparameters
+from sme_registry.task import streams
+from sme_registry.training.algorithms import one_thread
+
+if TYPE_CHECKING:
+    from sme_registry.offline.networks import Learner
+
+_STEPS_PER_REPORT = 50
+
+
+class Section(NamedTuple):
+    """The state of a training where an evaluation is due.
+
+    Attributes:
+      step: gradient steps done.
+      losses: terms of the loss of the last batch, by name.
+      layers: of the policy.
+      cpu_seconds: of the steps since the previous section.
+    """
+
+    step: int
+    losses: dict[str, float]
+    layers: list[Layer]
+    cpu_seconds: float
+
+
+def learn(
+    hyperparameters: Hyperparameters,
+    transitions: Transitions,
+    batch_size: int,
+    seed: int,
+    evaluate_at: Sequence[int],
+    report: Callable[[int], None],
+) -> Iterator[Section]:
+    """Train up to each of some steps, in order.
+
+    PyTorch's number of threads and global generator are unchanged whenever this is suspended.
+
+    Args:
+      hyperparameters: of the learner, whose type they determine.
+      transitions: the data set.
+      batch_size: transitions in each step.
+      seed: of initial weights and shuffles.
+      evaluate_at: steps, increasing.
+      report: called every 50 steps and after each section with the steps done.
+
+    Raises:
+      PolicyError: weights or losses are no longer finite.
+    """
+    import torch
+
+    from sme_registry.offline.networks import Batches, weights
+
+    initial, shuffles = (streams.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(initial)
+        learner = _learner(hyperparameters, transitions)
+    batches = iter(Batches(transitions, batch_size, torch.Generator().manual_seed(shuffles)))
+    done = 0
+    for until in evaluate_at:
+        with one_thread():
+            start = time.process_time()
+            while done < until:
+                losses = learner.step(next(batches))
+                done += 1
+                if done % _STEPS_PER_REPORT == 0:
+                    report(done)
+            seconds = time.process_time() - start
+        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        layers = weights(learner.actor)
+        finite = all(np.isfinite(part).all() for layer in layers for part in layer)
+        if not finite or not np.isfinite(list(values.values())).all():
+            raise PolicyError(
+                f"training diverged before step {done}: weights or losses are no longer finite. "
+                "Give a smaller learning_rate."
+            )
+        yield Section(done, values, layers, seconds)
+        report(done)
+
+
+def _learner(hyperparameters: Hyperparameters, transitions: Transitions) -> Learner:
+    from sme_registry.offline.bc import BC
+    from sme_registry.offline.iql import IQL
+
+    dims = transitions.observations.shape[1], transitions.actions.shape[1]
+    if isinstance(hyperparameters, BCHyperparameters):
+        return BC(*dims, hyperparameters)
+    return IQL(*dims, hyperparameters)

@@ -1,0 +1,113 @@
+"""`offline.json`: what an offline training used, and its evaluations."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from sme_registry.errors import DigestMismatchError
+from sme_registry.io import read_json
+from sme_registry.spec import Integer, Real, SMESpec, StrictModel
+
+
+class Evaluation(StrictModel):
+    """Episodes of the policy in the task, played during training.
+
+    Attributes:
+      step: gradient steps before it.
+      similarity: mean r̃ over all steps of all episodes.
+      similarity_sd: standard deviation of r̃ over these steps.
+      episode_return: mean return of the episodes.
+      losses: terms of the loss of the last batch, by name.
+    """
+
+    step: Integer
+    similarity: Real
+    similarity_sd: Real
+    episode_return: Real
+    losses: dict[str, Real]
+
+
+class BehaviourQuality(StrictModel):
+    """Exact statistics of the data set's transitions.
+
+    Attributes:
+      similarity: mean r̃.
+      similarity_sd: standard deviation of r̃.
+      step_reward: mean r.
+    """
+
+    similarity: Real
+    similarity_sd: Real
+    step_reward: Real
+
+
+class OfflineRecord(StrictModel):
+    """The arguments, data, evaluations and cost of an offline training.
+
+    Attributes:
+      algorithm: "bc" or "iql".
+      hyperparameters: all of them, as used.
+      seed: of initial weights, shuffles, and starts of the evaluation episodes.
+      steps, batch_size: gradient steps, and transitions in each.
+      episodes: of each evaluation.
+      dataset: id of the data set; null if only its arrays were passed.
+      dataset_digest: of its arrays.
+      recipe_digest: of the data set's recipe; null if only its arrays were passed.
+      transitions: N, the size of the data set.
+      spec, spec_digest: the task.
+      behaviour: of the data set.
+      evaluations: in order; the last one is of the final policy.
+      wall_seconds, cpu_seconds: of the training and its evaluations.
+      cpu_ms_per_step: of a gradient step, without evaluations.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    schema_version: Literal[1] = 1
+    algorithm: Literal["bc", "iql"]
+    hyperparameters: dict[str, Any]
+    seed: Integer
+    steps: Integer
+    batch_size: Integer
+    episodes: Integer
+    dataset: str | None
+    dataset_digest: str
+    recipe_digest: str | None
+    transitions: Integer
+    spec: SMESpec
+    spec_digest: str
+    behaviour: BehaviourQuality
+    evaluations: Annotated[tuple[Evaluation, ...], Field(strict=False, min_length=1)]
+    wall_seconds: Real
+    cpu_seconds: Real
+    cpu_ms_per_step: Real
+    versions: dict[str, str]
+
+    @property
+    def similarity(self) -> float:
+        """Mean r̃ of the final policy's episodes."""
+        return self.evaluations[-1].similarity
+
+    @property
+    def improvement(self) -> float:
+        """The final policy's similarity minus the behaviour's."""
+        return self.similarity - self.behaviour.similarity
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> OfflineRecord:
+        """Read the record of an offline training.
+
+        Raises:
+          MalformedDocumentError: the file cannot be read or is not strict JSON.
+          SpecError: a field is invalid, missing or unknown.
+          DigestMismatchError: `spec_digest` does not match the spec.
+        """
+        record = cls.from_dict(read_json(path), str(path))
+        if record.spec.digest != record.spec_digest:
+            raise DigestMismatchError(
+                f"{os.fspath(path)}: spec_digest={record.spec_digest!r}: its spec has "
+                f"{record.spec.digest!r}. One of them was changed: train again."
+            )
+        return record

@@ -1,0 +1,224 @@
+"""Short real runs: their files, their numbers, and invalid arguments."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import EvaluationReport, SMESpec, evaluate
+from sme_registry.errors import (
+    MissingDependencyError,
+    OptionError,
+    ResourceLimitError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.training import RunRecord, TrainingResult, train
+from sme_registry.training.episodes import Episode, read_episodes
+from tests.training.runs import PROTOCOL, TINY, copy_files, short
+
+pytest.importorskip("stable_baselines3")
+
+
+def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
+    names = {path.name for path in run.folder.iterdir()}
+    assert names >= {"run.json", "episodes.csv", "checkpoint.zip", "model.zip", "evaluation.json"}
+    assert not [name for name in names if name.startswith(".")]
+    assert {path.name for path in run.figures} <= names
+    assert "similarity_map.png" in names
+
+
+def test_the_record_describes_the_run(run: TrainingResult) -> None:
+    record = RunRecord.read(run.folder)
+    assert record == run.record
+    assert record is not None
+    assert (record.status, record.steps_done, record.episodes) == ("finished", 150, 7)
+    assert record.spec == TINY
+    assert record.spec_digest == TINY.digest
+    assert {"torch", "stable_baselines3", "numpy", "python"} <= record.versions.keys()
+    assert record.steps_per_second == pytest.approx(150 / record.wall_seconds, rel=0.01)
+
+
+def test_the_logged_episodes_are_whole_and_their_regret_is_exact(run: TrainingResult) -> None:
+    rows = list(csv.DictReader(io.StringIO((run.folder / "episodes.csv").read_text())))
+    assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6, 7]
+    assert [int(row["step"]) for row in rows] == [20, 40, 60, 80, 100, 120, 140]
+    for row in rows:
+        # With k = 1 and r_min = 0 the return is the horizon less the sum of regrets.
+        expected = 20 * (1 - float(row["regret"]))
+        assert float(row["return"]) == pytest.approx(expected, abs=1e-4)
+        assert float(row["similarity"]) <= 1
+        assert row["terminated"] == "0"
+    assert read_episodes(run.folder / "episodes.csv") == [
+        Episode(*(pytest.approx(value) for value in episode)) for episode in run.episodes
+    ]
+
+
+def test_the_final_model_is_the_one_evaluated(run: TrainingResult) -> None:
+    report = EvaluationReport.read(run.folder / "evaluation.json")
+    assert report == run.report
+    again = evaluate(run.model_path, TINY, PROTOCOL, name="TD3")
+    assert again.regions == report.regions
+
+
+def test_the_same_seed_trains_the_same_model_and_another_one_does_not(
+    run: TrainingResult, tmp_path: Path
+) -> None:
+    same, other = short(tmp_path / "same"), short(tmp_path / "other", seed=1)
+    assert [e.regret for e in same.episodes] == [e.regret for e in run.episodes]
+    assert same.report.regions == run.report.regions
+    assert [e.regret for e in other.episodes] != [e.regret for e in run.episodes]
+
+
+def test_training_lowers_regret(tmp_path: Path) -> None:
+    # One second of TD3 on a task of one channel; the first 100 steps act at random.
+    spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
+    result = train(spec, steps=350, folder=tmp_path / "run", protocol=PROTOCOL, progress=False)
+    regrets = [episode.regret for episode in result.episodes]
+    assert np.mean(regrets[-4:]) < 0.7 * np.mean(regrets[:4])
+    reference = result.report.references["constant_half"][0]
+    assert result.report.regions[0].similarity > reference.similarity
+
+
+def test_an_episode_that_ends_by_D_is_logged_as_terminated(tmp_path: Path) -> None:
+    spec = TINY.derive(D=0.5, k=5)
+    result = train(spec, steps=60, folder=tmp_path / "run", protocol=PROTOCOL, progress=False)
+    died = [episode for episode in result.episodes if episode.terminated]
+    assert died
+    assert all(episode.length < 20 for episode in died)
+
+
+def test_on_policy_algorithms_finish_their_rollout_over_all_lanes(tmp_path: Path) -> None:
+    result = short(tmp_path / "run", algorithm="a2c", steps=31, num_envs=3)
+    assert result.record.algorithm == "A2C"
+    assert result.record.steps_done == 45  # rollouts of 5 steps in 3 lanes
+    assert [episode.step for episode in result.episodes] == []
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC", "DDPG"])
+def test_every_algorithm_trains_and_is_evaluated(algorithm: str, tmp_path: Path) -> None:
+    result = short(tmp_path / "run", algorithm=algorithm, steps=120, num_envs=2)
+    assert result.report.policy == algorithm
+    assert result.record.steps_done >= 120
+    assert result.report.regions[0].similarity > 0.4
+
+
+def test_the_thread_count_of_torch_is_restored(run: TrainingResult, tmp_path: Path) -> None:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        short(tmp_path / "run", steps=10)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_finished_run_is_refused_unless_forced(run: TrainingResult, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    copy_files(run.folder, folder)
+    for resume in (False, True):
+        with pytest.raises(OptionError, match="finished run"):
+            short(folder, resume=resume)
+    replaced = short(folder, seed=9, steps=30, force=True)
+    assert replaced.record.seed == 9
+    assert len(replaced.episodes) == 1
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_folder_with_other_files_is_never_touched(force: bool, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(OptionError, match=r"thesis\.tex"):
+        short(tmp_path, force=force)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
+        ({"steps": 0}, "steps=0"),
+        ({"steps": 10.5}, r"steps=10\.5"),
+        ({"steps": True}, "steps=True"),
+        ({"seed": -1}, "seed=-1"),
+        ({"seed": 2**32}, "seed="),
+        ({"num_envs": 0}, "num_envs=0"),
+        ({"num_envs": 5000}, "num_envs=5000"),
+        ({"checkpoint_every": 0}, "checkpoint_every=0"),
+        ({"action_range": "both"}, "action_range='both'"),
+        ({"protocol": "papr-v1"}, "Did you mean"),
+        ({"protocol": {"states": 4}}, "states=4"),
+    ],
+)
+def test_bad_input_is_a_typed_error_and_makes_no_folder(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SMEError, match=message):
+        short(tmp_path / "run", **change)
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_stable_baselines_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(MissingDependencyError, match=r"sme-registry\[train\]"):
+        short(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_matplotlib_a_run_has_no_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = short(tmp_path / "run", steps=30)
+    assert result.figures == ()
+    assert not list((tmp_path / "run").glob("*.png"))
+    assert result.record.status == "finished"
+
+
+def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("a file")
+    with pytest.raises(OptionError, match="is a file"):
+        short(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("task", "error"),
+    [
+        ("Defalt", UnknownNameError),
+        ({"state_dim": 2**20, "action_dim": 2**20}, ResourceLimitError),
+        ({"state_dim": 0}, SpecError),
+    ],
+)
+def test_a_task_that_cannot_be_drawn_makes_no_folder(
+    task: Any, error: type[Exception], tmp_path: Path
+) -> None:
+    with pytest.raises(error):
+        train(task, folder=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_importing_the_package_of_training_imports_no_torch() -> None:
+    code = "import sys, sme_registry.training; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_run_file_is_strict_json(run: TrainingResult) -> None:
+    plain = json.loads((run.folder / "run.json").read_text())
+    assert plain["hyperparameters"] == "stable-baselines3 defaults"
+    with zipfile.ZipFile(run.model_path) as archive:
+        assert "policy.pth" in archive.namelist()
+    assert os.access(run.model_path, os.R_OK)
