@@ -10,14 +10,15 @@
     P(X > Y)  mean over classes of the share of pairs (x, y) with x > y, ties counting ½
 
 Sources: IQM, optimality gap, performance profiles, probability of improvement and their stratified
-bootstrap, Agarwal et al. 2021 (θ is not their pooled IQM, which hardly moves when a method gives up
-a class); the factor, by which resampling n runs understates their spread, Hesterberg 2015
-("narrowness bias"). The longer of the two arms on both sides joins the percentile interval to its
-mirror image, the "basic" one of Davison and Hinkley 1997, section 5.2: of few runs that are skewed
-or two-humped, each of the two alone misses too often.
+bootstrap, Agarwal et al. 2021 (θ is not their pooled IQM, which hardly changes when a method fails
+on one class); the factor √(n/(n − 1)), which corrects that resampling n runs understates their
+spread, Hesterberg 2015 ("narrowness bias"). Using the longer arm on both sides combines the
+percentile interval with its mirror image, the "basic" interval of Davison and Hinkley 1997, section
+5.2: with few runs that are skewed or bimodal, either interval alone covers too rarely.
 
-The run is the unit: its evaluation episodes and states are no further evidence. Every interval is a
-function of its runs and of a seed, any text. Axis letters: `n` runs of a class, `K` columns.
+The run is the unit: its evaluation episodes and states are not independent evidence. Every interval
+is a function of its runs and a seed, which can be any text. Axis letters: `n` runs of a class, `K`
+columns.
 """
 
 from __future__ import annotations
@@ -92,11 +93,11 @@ def median(runs: npt.ArrayLike) -> Array:
 
 
 def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
-    """By how much runs miss a target on average; what lies above it makes up for nothing.
+    """The mean shortfall from a target; values above the target do not compensate.
 
     Args:
       scores: `[n, …]`, higher is better.
-      target: what is good enough, in the scores' units.
+      target: the target, in the scores' units.
 
     Returns:
       `[…]`, at least 0, in the scores' units.
@@ -105,11 +106,11 @@ def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
 
 
 def aggregate(classes: Mapping[str, Array], statistic: Statistic = iqm) -> Array:
-    """θ: classes count alike, however many runs each has.
+    """θ: the mean over classes, which have equal weight regardless of their number of runs.
 
     Args:
       classes: by name, `[n, K]` scores of its runs.
-      statistic: within a class.
+      statistic: applied within each class.
 
     Returns:
       `[K]`, in the scores' units.
@@ -120,19 +121,19 @@ def aggregate(classes: Mapping[str, Array], statistic: Statistic = iqm) -> Array
 def stratified_bootstrap(
     classes: Mapping[str, Array], draws: int, seed: str, statistic: Statistic = iqm
 ) -> tuple[Array, Array]:
-    """95 % intervals of `aggregate`, of all columns from the same resampled runs.
+    """95 % intervals of `aggregate`, with the same resampled runs for all columns.
 
-    A class of one run adds no spread: nothing is known of it.
+    A class with a single run adds no spread, since its spread is unknown.
 
     Args:
       classes: by name, `[n, K]` scores of its runs.
-      draws: how many samples of runs to take.
-      seed: any text; the intervals are a function of it and of the other arguments, since a class
-        reads its own stream of random bits, the same in every version of NumPy.
-      statistic: within a class.
+      draws: number of samples to draw.
+      seed: any text. The intervals depend only on it and the other arguments: each class has its
+        own stream of random bits, the same in every version of NumPy.
+      statistic: applied within each class.
 
     Returns:
-      The lower and the upper ends, `[K]` each, in the scores' units.
+      The lower and upper ends, `[K]` each, in the scores' units.
     """
     value = aggregate(classes, statistic)
     deviation = np.zeros((len(value), draws))
@@ -148,17 +149,17 @@ def stratified_bootstrap(
             part = deviation[:, first : first + rows]
             chosen = _resampled(bits, n, part.shape[1])
             if statistic is iqm:
-                found = _weighted_iqm(runs, _counts(chosen))
+                resampled = _weighted_iqm(runs, _counts(chosen))
             else:
-                found = statistic(runs[chosen.T]).T
-            part += widened * (found - centre)
+                resampled = statistic(runs[chosen.T]).T
+            part += widened * (resampled - centre)
     return _around(value, deviation)
 
 
 def performance_profile(
     classes: Mapping[str, Array], thresholds: npt.ArrayLike, draws: int, seed: str
 ) -> Estimate:
-    """The share of runs that score above each threshold, classes counting alike.
+    """The share of runs that score above each threshold, with equal weight for each class.
 
     Args:
       classes: by name, `[n]` scores of its runs, higher is better.
@@ -167,7 +168,7 @@ def performance_profile(
       seed: see `stratified_bootstrap`.
 
     Returns:
-      `[K]` shares in [0, 1] with intervals of each (not of all at once), never rising with τ.
+      `[K]` shares in [0, 1], which never rise with τ, with pointwise intervals.
     """
     tau = np.asarray(thresholds, dtype=np.float64)
     above = {name: (np.asarray(x)[:, None] > tau).astype(float) for name, x in classes.items()}
@@ -178,33 +179,33 @@ def performance_profile(
 def probability_of_improvement(
     x: Mapping[str, Array], y: Mapping[str, Array], draws: int, seed: str
 ) -> Estimate:
-    """How probably a run of one method scores above a run of another on a class drawn at random.
+    """The probability that a run of one method scores above a run of another on a random class.
 
-    Where all pairs agree, resampling has nothing to vary and would be certain after two runs. There
-    the far end is what N = Σ min(n_x, n_y) independent pairs that agree still allow,
-    ((1 − LEVEL)/2)^(1/N): the exact binomial bound of Clopper and Pearson 1934.
+    If all pairs agree, resampled values do not vary, and two runs would already give certainty.
+    The far end is then the exact binomial bound of Clopper and Pearson 1934 for
+    N = Σ min(n_x, n_y) independent pairs that agree, ((1 − LEVEL)/2)^(1/N).
 
     Args:
       x: by class, `[n]` scores of its runs, higher is better.
-      y: of the other method, the same classes.
-      draws: how many samples of runs to take, of the two methods independently.
+      y: the same for the other method, with the same classes.
+      draws: number of samples to draw, independently for the two methods.
       seed: any text.
 
     Returns:
-      `[1]`, in [0, 1]; ½ where neither is better.
+      `[1]`, in [0, 1]; ½ if neither is better.
     """
     value, deviation = np.zeros(1), np.zeros((1, draws))
     pairs, unanimous = 0, True
     for name in x:
-        ours, theirs = (np.asarray(runs, dtype=np.float64) for runs in (x[name], y[name]))
-        wins = (np.sign(ours[:, None] - theirs) + 1.0) / 2.0
+        ours, others = (np.asarray(runs, dtype=np.float64) for runs in (x[name], y[name]))
+        wins = (np.sign(ours[:, None] - others) + 1.0) / 2.0
         value += wins.mean() / len(x)
         fewer = min(wins.shape)
         pairs += fewer
         unanimous = unanimous and wins.min() == wins.max() != 0.5
         if fewer == 1:
             continue
-        # How often each run is drawn, times who beats whom, is the sample's share of wins.
+        # A sample's share of wins: the runs' counts in it, times who beats whom.
         counts = [
             _counts(_resampled(_stream(seed, f"{name}\n{side}"), n, draws)) / n
             for side, n in zip("xy", wins.shape, strict=True)
@@ -226,13 +227,13 @@ def _around(value: Array, deviation: Array) -> tuple[Array, Array]:
 
 
 def _stream(seed: str, name: str) -> np.random.PCG64:
-    """Random bits of a class; NumPy keeps these, unlike what `Generator` makes of them."""
+    """Random bits of a class, which every version of NumPy keeps, unlike `Generator`'s output."""
     key = hashlib.sha256(f"{seed}\n{name}".encode()).digest()
     return np.random.PCG64(int.from_bytes(key, "big"))
 
 
 def _resampled(bits: np.random.PCG64, n: int, draws: int) -> npt.NDArray[np.int64]:
-    """Which of n runs are in each sample of n, `[draws, n]`."""
+    """Indices of the runs in each sample of n, `[draws, n]`."""
     uniform = (bits.random_raw(draws * n) >> np.uint64(11)) * 2.0**-53
     return (uniform * n).astype(np.int64).reshape(draws, n)
 
@@ -246,10 +247,10 @@ def _counts(chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _weighted_iqm(runs: Array, counts: npt.NDArray[np.int64]) -> Array:
-    """IQM of samples that hold each run a number of times, without sorting any of them.
+    """IQM of samples given by the count of each run, without sorting each sample.
 
-    In order of their values, the runs take the places 0 … n of a sample by their counts; those
-    between the cuts make the mean.
+    The runs in order of their values occupy the ranks of a sample according to their counts; the
+    mean is over the ranks between the cuts.
 
     Args:
       runs: `[n, K]`.
@@ -260,9 +261,9 @@ def _weighted_iqm(runs: Array, counts: npt.NDArray[np.int64]) -> Array:
     """
     n = len(runs)
     cut = n // 4
-    found = np.empty((runs.shape[1], counts.shape[1]))
+    means = np.empty((runs.shape[1], counts.shape[1]))
     for column, order in enumerate(np.argsort(runs, axis=0, kind="stable").T):
-        places = np.clip(np.cumsum(counts[order], axis=0), cut, n - cut)
-        inside = np.diff(places, axis=0, prepend=cut)
-        found[column] = runs[order, column] @ inside
-    return found / (n - 2 * cut)
+        ranks = np.clip(np.cumsum(counts[order], axis=0), cut, n - cut)
+        inside = np.diff(ranks, axis=0, prepend=cut)
+        means[column] = runs[order, column] @ inside
+    return means / (n - 2 * cut)

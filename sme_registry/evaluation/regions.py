@@ -7,12 +7,13 @@ Source: METHOD, section 3. `B` batch, `S` state_dim, lo and hi = (1 + ε)/2 of a
     shell:  R = hi ((lo/hi)^S + u (1 − (lo/hi)^S))^(1/S),  u ~ U(0, 1)
             x ~ U(−R, R)^S, one coordinate of it, drawn at random, set to ±R;  s = ½ + x
 
-A policy sees float32 observations, so the states themselves lie on the float32 grid: the oracle
-answers for exactly the state that the policy saw. Rounding must not carry a state over a face, so
-R's face is kept between the first grid value outside the inner cube and the last inside the outer.
+A policy receives float32 observations, so the states lie on the float32 grid: the optimal action is
+computed for exactly the state that the policy received. Rounding must not move a state across a
+face, so the face at R is clamped between the first grid value outside the inner cube and the last
+one inside the outer cube.
 
-Each region has named streams of the protocol's seed and takes a fixed count of words from each for
-each state. So its states depend on neither the other regions nor the size of the batches.
+Each region has named streams of the protocol's seed and reads a fixed number of words per state
+from each. Its states therefore depend neither on other regions nor on the batch size.
 """
 
 from __future__ import annotations
@@ -29,37 +30,37 @@ from sme_registry.task.streams import bit_generator, to_uniform
 
 Observations = npt.NDArray[np.float32]
 
-BATCH_NUMBERS = 2**22  # of a batch of observations and actions, 32 MiB as float64
+BATCH_NUMBERS = 2**22  # in a batch of observations and actions, 32 MiB as float64
 BATCH_ROWS = 8192
 
 
 def region_name(region: int) -> str:
-    """What a region is called: `WD`, `OOD 1`, `OOD 2`, …"""
+    """The name of a region: `WD`, `OOD 1`, `OOD 2`, …"""
     return "WD" if region == 0 else f"OOD {region}"
 
 
 def batch_rows(spec: SMESpec) -> int:
-    """How many states are held at once; few where a state is large."""
+    """How many states are in memory at once; fewer if a state is large."""
     others = len(spec.team.agents) - 1 if spec.team is not None else 0
     width = spec.state_dim + spec.action_dim + spec.hidden_width + others
     return max(1, min(BATCH_ROWS, BATCH_NUMBERS // width))
 
 
 def expansion(s: Array) -> Array:
-    """E(s) of states `[B, S]`, `[B]`: 0 on the unit cube's face, −1 at its centre, else beyond."""
+    """E(s) of states `[B, S]`: `[B]`, −1 at the cube's centre, 0 on its faces, > 0 outside."""
     return np.asarray(2.0 * np.abs(s - 0.5).max(axis=-1) - 1.0)
 
 
 def observations(
     protocol: EvaluationProtocol, region: int, spec: SMESpec, rows: int | None = None
 ) -> Iterator[Observations]:
-    """The observations of a region, batch after batch.
+    """The observations of a region, batch by batch.
 
     Args:
-      protocol: which states.
+      protocol: the protocol.
       region: 0 for WD, m for OOD m.
       spec: the task, for state_dim and horizon.
-      rows: states in a batch; None takes `batch_rows`. The states do not depend on it.
+      rows: states per batch; None takes `batch_rows`. The states do not depend on it.
 
     Yields:
       `[B, S + 2]` float32: the state, then t/T in {0, …, T − 1}/T, then r_cum/k = 0.
@@ -84,7 +85,7 @@ def observations(
 
 
 class Uniform:
-    """Uniform numbers in (0, 1) of a named stream, read on at each call."""
+    """Uniform numbers in (0, 1) from a named stream, which each call advances."""
 
     def __init__(self, seed: int | str, name: str) -> None:
         self._bits = bit_generator(seed, name)
@@ -95,7 +96,7 @@ class Uniform:
 
 
 class _Shell:
-    """Samples a shell of nested cubes, reading its own streams for radius and face."""
+    """Samples the shell between two cubes, with its own streams for radius and face."""
 
     def __init__(self, protocol: EvaluationProtocol, region: int, state_dim: int) -> None:
         low, high = protocol.edges[region]
@@ -113,7 +114,7 @@ class _Shell:
         self._face = Uniform(protocol.seed, f"evaluation/{region}/face")
 
     def states(self, u: Array) -> Observations:
-        """States from the uniform numbers of their coordinates, `[B, S]` both."""
+        """States `[B, S]` from uniform numbers `[B, S]` for their coordinates."""
         count = len(u)
         volume = self._inner_share + self._radius(count) * (1.0 - self._inner_share)
         R = self._outer * volume ** (1.0 / self._dim)

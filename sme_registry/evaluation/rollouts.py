@@ -1,7 +1,7 @@
-"""`rollouts`: whole episodes of a policy, thousands side by side, with their exact regret.
+"""`rollouts`: thousands of whole episodes of a policy in parallel, with their exact regret.
 
-The same scores as `stable_baselines3.common.evaluation.evaluate_policy` gives on single
-environments that begin in the same states, at the price of one of them.
+The returns are those of `stable_baselines3.common.evaluation.evaluate_policy` on single
+environments that start in the same states, in about the time of one of them.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from sme_registry.envs.options import initial_states, single_agent
 from sme_registry.task import Task, streams
 
 LANES = 4096
-"""Episodes side by side at most, so that memory does not grow with their number."""
+"""Most episodes in parallel, so that memory does not grow with their number."""
 
 
 class Rollouts(NamedTuple):
-    """Episodes that have ended, `[n]` each.
+    """Completed episodes; each array is `[n]`.
 
     Attributes:
       episode_return: the sum of an episode's rewards, in [0, T].
-      discounted_return: the same, the i-th reward by γ^i.
-      length: its steps, in [1, T].
+      discounted_return: the sum of γ^i times the i-th reward.
+      length: number of steps, in [1, T].
       regret: mean of 1 − step reward over its steps, in [0, 1].
       similarity: mean r̃ over its steps, in [0, 1].
       similarity_square: mean r̃² over its steps, in [0, 1].
@@ -40,7 +40,7 @@ class Rollouts(NamedTuple):
     similarity_square: Array
 
     def per_step(self, values: Array) -> float:
-        """The mean over all steps of all episodes of what is given as each episode's mean."""
+        """The mean over all steps of all episodes, from the mean of each episode."""
         return float(np.average(values, weights=self.length))
 
     @property
@@ -51,14 +51,14 @@ class Rollouts(NamedTuple):
 
 
 def start_states(seed: int, evaluation: int, episodes: int, state_dim: int) -> Array:
-    """Where the episodes of an evaluation begin: new ones each time, from a stream of their own.
+    """The initial states of an evaluation's episodes, from a random stream of their own.
 
-    A function of its arguments alone, so two algorithms that are trained with the same seed are
-    evaluated from the same states, and evaluating moves no other random stream.
+    They depend only on the arguments: two algorithms trained with the same seed are evaluated from
+    the same states, and an evaluation does not advance any other random stream.
 
     Args:
       seed: of the run.
-      evaluation: its number, from 0.
+      evaluation: index of the evaluation, from 0.
       episodes: n.
       state_dim: S.
 
@@ -79,17 +79,17 @@ def rollouts(
     actions: Array | None = None,
     gamma: float = 1.0,
 ) -> Rollouts:
-    """An episode from each of the states, to its end.
+    """Run an episode from each of the states to its end.
 
     Args:
       policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, which are
-        clipped to it; B is at most `LANES`. It is asked for episodes that have ended too, until
-        the last beside them has.
+        clipped to it; B is at most `LANES`. It is also called for episodes that have ended, until
+        all of their batch have.
       task: the task, of a single agent.
       states: `[n, S]` in [0, 1].
-      t: `[n]` steps completed there, in [0, T); None for 0, where an episode begins.
-      r_cum: `[n]` the rewards since the last payout; None for 0.
-      actions: `[n, A]` of the first step, in place of the policy's; None for the policy's.
+      t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
+      r_cum: `[n]` accumulated reward since the last payout; None for 0.
+      actions: `[n, A]` actions of the first step; None for the policy's.
       gamma: γ of the discounted return, in [0, 1].
 
     Raises:
@@ -103,7 +103,7 @@ def rollouts(
     t = np.zeros(n, np.int64) if t is None else t
     r_cum = np.zeros(n) if r_cum is None else r_cum
     totals = np.empty((6, n))
-    # Neighbours end together, so that few lanes wait for the last of theirs.
+    # Sorted by t, the episodes of a batch end at about the same time, and few lanes idle.
     order = np.argsort(t, kind="stable")
     for begin in range(0, n, LANES):
         lanes = order[begin : begin + LANES]
@@ -113,8 +113,8 @@ def rollouts(
         sums, running, weight = np.zeros((6, len(lanes))), np.ones(len(lanes)), 1.0
         first = None if actions is None else actions[lanes]
         while running.any():
-            taken = policy(observation.copy()) if first is None else first
-            done = batch.advance(np.asarray(taken, np.float64))
+            a = policy(observation.copy()) if first is None else first
+            done = batch.advance(np.asarray(a, np.float64))
             similarity, _, regret, reward, _ = done.values[:, 0]
             step = (reward, weight * reward, 1.0, regret, similarity, similarity**2)
             for total, value in zip(sums, step, strict=True):
@@ -123,5 +123,5 @@ def rollouts(
             running[done.terminated | done.truncated] = 0.0
             observation, first = done.observation, None
         totals[:, lanes] = sums
-    paid, discounted, length, *means = totals
-    return Rollouts(paid, discounted, length, *(total / length for total in means))
+    returns, discounted, length, *means = totals
+    return Rollouts(returns, discounted, length, *(total / length for total in means))

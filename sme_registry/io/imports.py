@@ -1,4 +1,4 @@
-"""`import_object`: import what `module:function` names."""
+"""`import_object`: import an object by the name `module:attribute`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sme_registry.errors import SMEError, did_you_mean
 
 
 def import_object(name: str, field: str, error: type[SMEError]) -> Any:
-    """What `module:function` names; the module is looked for in this folder, too.
+    """Import an object by name. The working directory is searched first.
 
     Args:
-      name: `module:function`. Importing a module runs it.
-      field: what the name was given for, which a message begins with.
-      error: the kind of error to raise.
+      name: `module:attribute`. Importing a module runs its code.
+      field: the argument that holds the name, for error messages.
+      error: the type of error to raise.
 
     Raises:
-      SMEError: of that kind: the module or its function is not there, or fails when it is imported.
+      SMEError: of that type: the module or attribute does not exist, or importing it fails.
     """
     module_name, _, attribute = name.partition(":")
     folder, near = os.getcwd(), ""
@@ -33,7 +33,7 @@ def import_object(name: str, field: str, error: type[SMEError]) -> Any:
     except Exception as reason:
         raise error(
             f"{field}={name!r}: cannot be imported: {type(reason).__name__}: {reason}.{near} It "
-            "must be module:function, the module in this folder or installed."
+            "must be module:function, with the module in the working directory or installed."
         ) from reason
     finally:
         sys.path.remove(folder)

@@ -13,65 +13,64 @@ MAX_DOCUMENT_BYTES = 64 * 2**20
 
 
 def parse_json(text: str | bytes, source: str = "document") -> Any:
-    """Parse strict JSON: UTF-8, no NaN or infinity, no key given twice.
+    """Parse strict JSON: UTF-8, no NaN or infinity, no duplicate keys.
 
     Args:
       text: the JSON text.
-      source: what to call it in an error, such as its path.
+      source: what an error message calls it, such as its path.
 
     Returns:
       The parsed value.
 
     Raises:
-      MalformedDocumentError: with line and column where there is one.
+      MalformedDocumentError: it is not strict JSON; with line and column if they are known.
     """
 
-    def refuse_constant(name: str) -> NoReturn:
-        raise MalformedDocumentError(f"{source}: {name} is not JSON. Use a finite number.")
+    def reject_constant(name: str) -> NoReturn:
+        raise MalformedDocumentError(f"{source}: {name} is not valid JSON. Use a finite number.")
 
-    def refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        seen: dict[str, Any] = {}
+    def reject_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
         for key, value in pairs:
-            if key in seen:
+            if key in mapping:
                 raise MalformedDocumentError(
-                    f"{source}: the key {key!r} is given twice. Keep one of them."
+                    f"{source}: the key {key!r} occurs twice. Remove one of them."
                 )
-            seen[key] = value
-        return seen
+            mapping[key] = value
+        return mapping
 
     try:
         if isinstance(text, bytes):
             text = text.decode("utf-8")
-        return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_duplicates)
-    except UnicodeDecodeError as error:
-        raise MalformedDocumentError(
-            f"{source}: not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
-        ) from None
-    except json.JSONDecodeError as error:
-        raise MalformedDocumentError(
-            f"{source}: not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
-        ) from None
-    except RecursionError:
-        raise MalformedDocumentError(
-            f"{source}: nested too deeply. No document of ours is nested more than ten deep."
-        ) from None
+        return json.loads(text, parse_constant=reject_constant, object_pairs_hook=reject_duplicates)
     except MalformedDocumentError:
         raise
-    except ValueError as error:  # an integer of thousands of digits
-        raise MalformedDocumentError(f"{source}: not JSON that can be read: {error}.") from None
+    except (ValueError, RecursionError) as error:
+        raise MalformedDocumentError(f"{source}: {_reason(error)}") from None
+
+
+def _reason(error: ValueError | RecursionError) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return f"not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
+    if isinstance(error, json.JSONDecodeError):
+        return f"not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
+    if isinstance(error, RecursionError):
+        return "nested too deeply. Valid documents have at most ten levels."
+    return f"cannot be parsed: {error}."  # an integer of thousands of digits
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Read a strict JSON file.
 
     Raises:
-      MalformedDocumentError: the file is missing, unreadable, too large, or not strict JSON.
+      MalformedDocumentError: the file does not exist or cannot be read, is too large, or is not
+        strict JSON.
     """
     path = Path(path)
     try:
         if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
             raise MalformedDocumentError(
-                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB; no document of ours is."
+                f"{path}: larger than {MAX_DOCUMENT_BYTES // 2**20} MiB, the limit for documents."
             )
         text = path.read_bytes()
     except (OSError, ValueError) as error:
@@ -81,5 +80,5 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def to_json(value: Any) -> str:
-    """Readable JSON text (two spaces, final newline) of plain data; refuses NaN."""
+    """Plain data as indented JSON text with a final newline. Raises ValueError for NaN."""
     return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
