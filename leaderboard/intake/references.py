@@ -26,14 +26,7 @@ from sme_registry.spec import SMESpec
 
 
 class Reference(NamedTuple):
-    """A reference policy.
-
-    Attributes:
-      name: of the method.
-      knowledge: of the task, as submissions declare it.
-      onnx: the policy of a spec.
-      statement: what the board's page says of it.
-    """
+    """A reference policy; `onnx` makes its artefact for a spec."""
 
     name: str
     knowledge: Knowledge

@@ -163,14 +163,7 @@ def _entry_digest(text: str) -> str:
 
 
 class _Verifier:
-    """The checks of one board.
-
-    Args:
-      folder, document: the board's.
-      index: an empty index, which `follow_log` fills from the log.
-      rescore: number of submissions to be scored again, for the progress.
-      progress: as of `verify`.
-    """
+    """The checks of one board; `follow_log` fills its empty index from the log."""
 
     def __init__(
         self,

@@ -218,8 +218,7 @@ class Index:
             raise _contradiction(entry, "receives a submission twice")
         path = self.folder.submission(entry.subject)
         submission = read_document(self.folder, path, SignedSubmission, entry.document).submission
-        if submission.digest != entry.subject:
-            raise _contradiction(entry, "names a document of another submission")
+        _check_subject(entry, submission.digest)
         method, submitter = submission.method, submission.submitter
         self.connection.execute(
             f"INSERT INTO entry VALUES ({', '.join('?' * 21)})",
@@ -249,8 +248,7 @@ class Index:
             raise _contradiction(entry, "the submission was not waiting for a result")
         path = self.folder.result(entry.subject)
         result = read_document(self.folder, path, Result, entry.document)
-        if result.submission != entry.subject:
-            raise _contradiction(entry, "names a document of another submission")
+        _check_subject(entry, result.submission)
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
             "scores = ? WHERE id = ?",
@@ -268,8 +266,7 @@ class Index:
             raise _contradiction(entry, "the submission is unknown or already withdrawn")
         path = self.folder.withdrawal(entry.subject)
         signed = read_document(self.folder, path, SignedWithdrawal, entry.document)
-        if signed.withdrawal.submission != entry.subject:
-            raise _contradiction(entry, "names a document of another submission")
+        _check_subject(entry, signed.withdrawal.submission)
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",
             (entry.document, entry.subject),
@@ -361,6 +358,11 @@ def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) ->
 
 def _contradiction(entry: LogEntry, message: str) -> TamperedError:
     return TamperedError(f"log/{entry.sequence:08d}.json", f"event={entry.event}: {message}")
+
+
+def _check_subject(entry: LogEntry, submission: str) -> None:
+    if submission != entry.subject:
+        raise _contradiction(entry, "names a document of another submission")
 
 
 def _scores_text(scores: Scores) -> str:

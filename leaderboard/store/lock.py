@@ -23,11 +23,7 @@ BUSY_SECONDS = 60.0
 
 
 class FolderLock:
-    """A lock on a folder.
-
-    Args:
-      path: the folder.
-    """
+    """A lock on a folder."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

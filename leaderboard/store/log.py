@@ -73,12 +73,7 @@ class LogEntry(Document):
 
 
 class Log:
-    """The log of one board.
-
-    Args:
-      folder: the board's folder.
-      key: the board's public key.
-    """
+    """The log of one board, whose entries `key` verifies."""
 
     def __init__(self, folder: Folder, key: str) -> None:
         self.folder = folder

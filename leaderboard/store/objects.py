@@ -13,11 +13,7 @@ from leaderboard.store.files import durable_file, unwritable
 
 
 class Objects:
-    """The artefacts of one board.
-
-    Args:
-      folder: the board's folder.
-    """
+    """The artefacts of one board."""
 
     def __init__(self, folder: Folder) -> None:
         self.folder = folder

@@ -38,11 +38,7 @@ class Claim:
 
 
 class Queue:
-    """The queue of one board.
-
-    Args:
-      database: the board's.
-    """
+    """The queue of one board."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

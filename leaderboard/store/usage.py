@@ -6,11 +6,7 @@ from leaderboard.store.database import Database
 
 
 class Usage:
-    """The usage of one board.
-
-    Args:
-      database: the board's.
-    """
+    """The usage of one board."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

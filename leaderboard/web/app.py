@@ -36,22 +36,9 @@ from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
 from leaderboard.store import Store
-from leaderboard.web.errors import (
-    HTTP_CODES,
-    RequestError,
-    on_board_error,
-    on_http_error,
-    on_rejection,
-)
+from leaderboard.web import errors, limits
+from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
-from leaderboard.web.limits import (
-    UPLOAD_SECONDS,
-    UploadReservations,
-    body_chunks,
-    declared_length,
-    drain,
-    read_document,
-)
 from leaderboard.web.page_cache import PAGES_KEPT, PageCache
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import SMEError
@@ -66,7 +53,7 @@ def create_app(
     path: str | os.PathLike[str],
     *,
     score_workers: int = 0,
-    upload_seconds: float = UPLOAD_SECONDS,
+    upload_seconds: float = limits.UPLOAD_SECONDS,
     pages_kept: int = PAGES_KEPT,
 ) -> FastAPI:
     """The ASGI application of a board.
@@ -95,10 +82,10 @@ def create_app(
         redoc_url=None,
         openapi_url=None,
         exception_handlers={
-            Rejection: on_rejection,
-            RequestError: on_rejection,
-            HTTPException: on_http_error,
-            SMEError: on_board_error,
+            Rejection: errors.on_rejection,
+            RequestError: errors.on_rejection,
+            HTTPException: errors.on_http_error,
+            SMEError: errors.on_board_error,
         },
     )
     app.add_middleware(Guard)
@@ -126,7 +113,7 @@ class _Routes:
         self._store = store
         self._upload_seconds = upload_seconds
         self._admissions = CapacityLimiter(1)
-        self._reservations = UploadReservations(store)
+        self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
         self._pages = PageCache(store, pages_kept)
 
@@ -136,7 +123,7 @@ class _Routes:
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
         limit = self._store.document.limits.artefact_bytes
-        size = declared_length(request, limit)
+        size = limits.declared_length(request, limit)
         try:
             key = intake.uploader(request.headers.get("Authorization"), digest)
             async with self._reservations.reserve(key, size):
@@ -144,12 +131,12 @@ class _Routes:
                 with await _in_thread(
                     lambda: tempfile.TemporaryFile(dir=self._store.folder.path)
                 ) as spool:
-                    async for chunk in body_chunks(request, size, self._upload_seconds):
+                    async for chunk in limits.body_chunks(request, size, self._upload_seconds):
                         await _in_thread(spool.write, chunk)
                     new = await _in_thread(self._store_object, spool, digest, key)
         except Rejection:
             if size <= limit:
-                await drain(request, limit, self._upload_seconds)
+                await limits.drain(request, limit, self._upload_seconds)
             raise
         return JSONResponse({"digest": digest}, 201 if new else 200)
 
@@ -171,7 +158,7 @@ class _Routes:
         return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def post_submission(self, request: Request) -> Response:
-        text = await read_document(request, "submission")
+        text = await limits.read_document(request, "submission")
 
         def admit() -> tuple[str, bool]:
             signed = SignedSubmission.read(text)
@@ -191,7 +178,7 @@ class _Routes:
         return public_view(self._store, entry).to_dict()
 
     async def post_withdrawal(self, request: Request) -> Response:
-        text = await read_document(request, "withdrawal")
+        text = await limits.read_document(request, "withdrawal")
 
         def withdraw() -> str:
             return intake.withdraw(self._store, intake.read_withdrawal(text))

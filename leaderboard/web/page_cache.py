@@ -14,12 +14,7 @@ PAGES_KEPT = 256
 
 
 class CachedFile(NamedTuple):
-    """A rendered file.
-
-    Attributes:
-      content: its bytes.
-      tag: its ETag.
-    """
+    """A rendered file and its ETag."""
 
     content: bytes
     tag: str
@@ -29,11 +24,7 @@ class PageCache:
     """Rendered files, discarded when the log grows.
 
     One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
-    page that is not cached wait for one rendering of it.
-
-    Args:
-      store: the board's.
-      kept: the largest number of files; 0 renders each request.
+    page that is not cached wait for one rendering of it. It keeps at most `kept` files.
     """
 
     def __init__(self, store: Store, kept: int = PAGES_KEPT) -> None:
