@@ -1,0 +1,87 @@
+"""One name for one quantity: every number in a document is named in `tests/vocabulary.py`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel
+
+import leaderboard
+import sme_registry
+from sme_registry.spec import Real, StrictModel
+from tests.vocabulary import QUANTITIES, SYNONYMS
+
+
+def documents() -> list[type[StrictModel]]:
+    """Every document and part of one, in both packages."""
+    for package in (sme_registry, leaderboard):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+
+    def below(model: type[StrictModel]) -> Iterator[type[StrictModel]]:
+        for kind in model.__subclasses__():
+            yield kind
+            yield from below(kind)
+
+    ours = {
+        kind
+        for kind in below(StrictModel)
+        if kind.__module__.split(".")[0] in ("sme_registry", "leaderboard")
+    }
+    return sorted(ours, key=lambda kind: (kind.__module__, kind.__name__))
+
+
+def holds_numbers(annotation: Any) -> bool:
+    """Whether values of a type are numbers, estimates of numbers, or collections of either."""
+    if annotation in (int, float):
+        return True
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "value" in annotation.model_fields and "high" in annotation.model_fields
+    return any(holds_numbers(part) or type(part) is int for part in get_args(annotation))
+
+
+def numbers(model: type[BaseModel]) -> list[str]:
+    """The fields of a document that hold numbers."""
+    return [name for name, field in model.model_fields.items() if holds_numbers(field.annotation)]
+
+
+def unnamed(model: type[BaseModel]) -> list[str]:
+    """What is wrong with the names of a document's fields."""
+    return [
+        *(f"{name}: not in tests/vocabulary.py" for name in numbers(model)
+          if name not in QUANTITIES),
+        *(f"{name}: is {SYNONYMS[name]}" for name in model.model_fields
+          if name in SYNONYMS and name in numbers(model)),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("model", documents(), ids=lambda model: model.__qualname__)
+def test_every_number_in_a_document_has_the_name_of_its_quantity(model: type[StrictModel]) -> None:
+    assert unnamed(model) == []
+
+
+def test_a_new_synonym_is_noticed() -> None:
+    class Planted(BaseModel):
+        similarity: Real
+        decay: Real
+        profile: tuple[Real, ...]
+        mean_error: Real | None = None
+        note: str = ""
+
+    assert unnamed(Planted) == [
+        "decay: not in tests/vocabulary.py",
+        "profile: not in tests/vocabulary.py",
+        "mean_error: not in tests/vocabulary.py",
+        "decay: is ood_decay or similarity_decay",
+        "profile: is normalised_regret",
+    ]
+
+
+def test_the_vocabulary_has_no_name_that_no_document_uses() -> None:
+    used = {name for model in documents() for name in numbers(model)}
+    assert set(QUANTITIES) - used == set()
+    assert not QUANTITIES.keys() & SYNONYMS.keys()
