@@ -199,7 +199,7 @@ class TestShow:
         suite = catalogue.find(SuiteFile, "smoke").suite
         assert lines == [spec.digest for spec in suite.instances]
         for other in (("Default",), ("smoke", "--json")):
-            assert "--digests: is for a suite" in refused("show", *other, "--digests")
+            assert "--digests: applies to suites" in refused("show", *other, "--digests")
 
     def test_the_instances_of_a_suite_outside_the_catalogue_are_listed_too(
         self, tmp_path: Path
@@ -230,7 +230,7 @@ class TestShow:
             (("cor",), "Did you mean 'core'"),
             (("sha256:000000000000",), "no task"),
             (("nowhere.json",), "cannot be read"),
-            ((), "NAME: missing"),
+            ((), "Give a name"),
             (("Default", "--json-schema", "spec"), "one or the other"),
         ],
     )
@@ -312,8 +312,8 @@ class TestNew:
         ("options", "message"),
         [
             (("--complexity", "0"), "complexity=0: must be"),
-            (("--r-min", "1"), "r_min=1.0"),
-            (("--r-min", "nan"), "r_min=nan"),
+            (("--r-min", "1"), "r_min=1"),
+            (("--r-min", "nan"), "r_min='nan'"),
             (("--seed", "-3"), "seed=-3"),
             (("--seed", "abc"), "seed='abc'"),
             (("--policy-init", "haar"), "policy_init='haar'"),
@@ -322,13 +322,13 @@ class TestNew:
             (("--team", "two"), "got 'two'"),
             (("--team", "nowhere.json"), "cannot be read"),
             (("--team", "two", "--agents", "2"), "one or the other"),
-            (("--agents", "3"), "shared out"),
+            (("--agents", "3"), "shared equally"),
             (("--agents", "0"), "at least 1"),
             (("--agents", "1000000000", "--channels-each", "1"), "1024"),
             (("--agents", "2", "--channels-each", "0"), "action_dim=0"),
             (("--agents", "2", "--channels-each", "2", "--action-dim", "5"), "Leave it out"),
             (("--channels-each", "2"), "--agents"),
-            (("--team-reward", "team"), "of which team"),
+            (("--team-reward", "team"), "needs a team"),
             (("--agents", "2", "--team-reward", "both"), "reward='both'"),
             (("--from", "Defalt"), "Did you mean"),
             (("--name", "a b"), "name='a b'"),
@@ -386,7 +386,7 @@ class TestValidate:
         for name, words in expected.items():
             assert words in results[name]["error"]
             assert name in results[name]["error"]
-        assert "8 of 9 files are bad" in result.stderr
+        assert "8 of 9 files are invalid" in result.stderr
 
     def test_a_suite_with_a_wrong_digest_is_bad(self, tmp_path: Path) -> None:
         plain = catalogue.find(SuiteFile, "smoke").to_dict()
@@ -659,7 +659,7 @@ class TestDemo:
         assert linked <= names
         assert load("Default").digest in text
         assert "demo/report.md" in result.stdout
-        assert "Mean regret while training" in result.stdout
+        assert "Mean regret during training" in result.stdout
         again = sme("demo", "--quick", "--out", "demo")
         assert again.exit_code == 2
         assert "error: folder='demo': holds a finished run" in again.stderr

@@ -1,6 +1,6 @@
-"""The application: its commands, and what becomes of errors.
+"""The command `sme` and its subcommands.
 
-Exit codes: 0 done; 1 a task that `certify` refuses, or a study whose cells failed; 2 bad input;
+Exit codes: 0 success; 1 a task refused by `certify`, or failed cells of a study; 2 invalid input;
 130 interrupted.
 """
 
@@ -9,7 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated
 
-from sme_registry.cli import datasets, demo, diagnose, documents, offline, runs, studies
+from sme_registry.cli import (
+    certify,
+    dataset,
+    demo,
+    diagnose,
+    evaluate,
+    list,
+    new,
+    offline,
+    show,
+    study,
+    train,
+    validate,
+)
 from sme_registry.terminal import CommandGroup, application, version_option
 
 
@@ -28,27 +41,27 @@ def _top(
 ) -> None:
     """Synthetic Monitoring Environments: control tasks whose optimal policy is known exactly.
 
-    A first look:  **sme list**  ·  **sme show Default**  ·  **sme demo**
+    To start:  **sme list**  ·  **sme show Default**  ·  **sme demo**
 
     Your own task:  **sme new mine.json --complexity 10 --seed 3**
     """
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "list": documents.list_,
-    "show": documents.show,
-    "new": documents.new,
-    "validate": documents.validate,
-    "certify": documents.certify,
-    "evaluate": runs.evaluate,
-    "train": runs.train,
+    "list": list.list_,
+    "show": show.show,
+    "new": new.new,
+    "validate": validate.validate,
+    "certify": certify.certify,
+    "evaluate": evaluate.evaluate,
+    "train": train.train,
     "diagnose": diagnose.diagnose,
     "demo": demo.demo,
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)
-app.add_typer(studies.app, name="study")
-app.add_typer(datasets.app, name="dataset")
+app.add_typer(study.app, name="study")
+app.add_typer(dataset.app, name="dataset")
 app.add_typer(offline.app, name="offline")
 
 

@@ -1,4 +1,4 @@
-"""`sme demo`: the whole way once, from a task to a trained agent whose regret is known exactly."""
+"""`sme demo`: train an agent on one task, with its exact regret, and evaluate it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from sme_registry.cli.arguments import Force
 from sme_registry.io import write_atomically
-from sme_registry.terminal.output import err, out
+from sme_registry.terminal import err, out, table
 
 if TYPE_CHECKING:
     from sme_registry.training import TrainingResult
@@ -25,19 +26,20 @@ _STAGES = 10
 
 def demo(
     out_folder: Annotated[
-        Path, typer.Option("--out", "-o", help="Another folder must be new, or take --force.")
+        Path,
+        typer.Option("--out", "-o", help="Output folder; must be new, or use --force."),
     ] = FOLDER,
     steps: Annotated[
-        int | None, typer.Option("--steps", "-n", help=f"By default {_STEPS:,}.")
+        int | None, typer.Option("--steps", "-n", help=f"Training steps; default {_STEPS:,}.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help=f"A minute: {_QUICK_STEPS:,} steps, few states.")
+        bool, typer.Option("--quick", help=f"Take a minute: {_QUICK_STEPS:,} steps, few states.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the run in --out.")] = False,
+    force: Force = False,
 ) -> None:
-    """Train TD3 on SME/Default-v1, watch its regret fall, judge it in and out of distribution.
+    """Train TD3 on SME/Default-v1, show its regret falling, evaluate it in and out of distribution.
 
-    A few minutes on two cores. Writes figures and report.md, and says where.
+    Takes a few minutes on two cores. Writes figures and report.md, and lists them.
 
     Examples:
 
@@ -46,14 +48,14 @@ def demo(
       sme demo --quick --out demo
     """
     from sme_registry import training
-    from sme_registry.cli.runs import how_to_go_on
+    from sme_registry.cli.train import how_to_continue
     from sme_registry.training.run import REPORT
 
     if steps is None:
         steps = _QUICK_STEPS if quick else _STEPS
     err().print(
-        f"Training TD3 on SME/{TASK} for {steps:,} steps. The optimal action is known in every "
-        "state, so the regret below is exact."
+        f"Training TD3 on SME/{TASK} for {steps:,} steps. The optimal action of every state is "
+        "known, so the regret below is exact."
     )
     try:
         result = training.train(
@@ -66,9 +68,8 @@ def demo(
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            how_to_go_on(out_folder).replace(
-                "the same command with --resume",
-                f"sme train {TASK} --steps {steps} --out {out_folder} --resume",
+            how_to_continue(
+                out_folder, f"`sme train {TASK} --steps {steps} --out {out_folder} --resume`"
             )
         ) from None
     stages = regret_by_stage(result)
@@ -85,7 +86,7 @@ def demo(
 
 
 def regret_by_stage(result: TrainingResult) -> list[tuple[int, int, float]]:
-    """`(first step, last step, mean regret)` of each tenth of the training that ended episodes."""
+    """`(first step, last step, mean regret)` of each tenth of training in which episodes ended."""
     edges = np.linspace(0, result.record.steps_done, _STAGES + 1).astype(int)
     stages = []
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
@@ -96,13 +97,11 @@ def regret_by_stage(result: TrainingResult) -> list[tuple[int, int, float]]:
 
 
 def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
-    table = Table(title="Mean regret while training (0 is optimal)", title_justify="left")
-    table.add_column("steps", justify="right")
-    table.add_column("mean regret", justify="right")
-    table.add_column("", no_wrap=True)
+    columns = {"steps": "number", "regret": "number", "": "name"}
+    result = table("Mean regret during training (0 is optimal)", columns)
     for first, last, regret in stages:
-        table.add_row(f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
-    return table
+        result.add_row(f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
+    return result
 
 
 def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str:
@@ -111,22 +110,22 @@ def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str
         f"# {record.algorithm} on SME/{TASK}",
         "",
         f"{record.steps_done:,} steps in {record.wall_seconds / 60:.1f} minutes "
-        f"({record.steps_per_second:.0f} a second), seed {record.seed}, Stable-Baselines3's "
+        f"({record.steps_per_second:.0f} per second), seed {record.seed}, Stable-Baselines3's "
         f"default hyperparameters. Task `{report.spec_digest}`, protocol "
         f"`{report.protocol_digest}`.",
         "",
-        "## Regret while training",
+        "## Regret during training",
         "",
-        "Regret is 1 − step reward: what the optimal action would have earned beyond the one "
-        "taken. It is exact, in every step.",
+        "Regret is 1 − step reward: what the optimal action would have earned more than the "
+        "action taken. It is exact in every step.",
         "",
-        "| steps | mean regret |",
+        "| steps | regret |",
         "|---|---:|",
         *(f"| {first:,}–{last:,} | {regret:.3f} |" for first, last, regret in stages),
         "",
-        "## Within and out of distribution",
+        "## In and out of distribution",
         "",
-        f"{report.regions[0].states:,} states a region. r̃ is the similarity to the optimal "
+        f"{report.regions[0].states:,} states per region. r̃ is the similarity to the optimal "
         "action (1 is optimal); normalised regret is 0 for the optimum and 1 for the constant "
         "action ½; similarity decay is the share of r̃ lost since WD.",
         "",

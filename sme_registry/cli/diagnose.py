@@ -1,8 +1,7 @@
-"""`sme diagnose`: where the regret of a run sits, and what the evidence says about why."""
+"""`sme diagnose`: locate a policy's regret, and find likely causes."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +10,11 @@ import typer
 from rich.markup import escape
 
 from sme_registry import load
-from sme_registry.cli import names
+from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes
+from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
-from sme_registry.io import to_json, write_atomically
-from sme_registry.terminal.output import err, out, print_json
+from sme_registry.io import refuse_existing, to_json, write_atomically
+from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.diagnosis import Diagnosis, Subject
@@ -27,55 +27,50 @@ def diagnose(
         str,
         typer.Argument(
             metavar="RUN",
-            help="A folder of `sme train`; a study's with --cell; or any policy with --task.",
+            help="A folder of `sme train`; with --cell, of a study; with --task, any policy.",
         ),
     ],
     task: Annotated[
         str | None, typer.Option("--task", "-t", help="RUN is a policy, for this task.")
     ] = None,
     cell: Annotated[
-        str | None, typer.Option(help="RUN is a study's folder; the first digits of a cell's key.")
+        str | None,
+        typer.Option(help="RUN is a study's folder; the start of a cell's key."),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
             metavar="RUN2",
-            help="Another run, such as one with a single axis changed. Of the same form as RUN; "
-            "STUDY:KEY names a study's cell.",
+            help="Another run to compare with, for example with one field changed. Given like RUN; "
+            "STUDY:KEY is a study's cell.",
         ),
     ] = None,
     probe_capacity: Annotated[
         bool,
         typer.Option(
             "--probe-capacity",
-            help="Fit a network of the same layers to the optimal actions; tens of seconds.",
+            help="Fit a network of the same layers to the optimal actions; takes under a minute.",
         ),
     ] = False,
     out_folder: Annotated[
         Path | None, typer.Option("--out", "-o", help=f"Folder for {_JSON}, {_PAGE} and figures.")
     ] = None,
-    action_range: Annotated[
-        str | None, typer.Option(help="Of a policy: unit or symmetric; by default a model's own.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="Change a field of --task; repeatable."),
-    ] = None,
-    states: Annotated[int, typer.Option(help="Uniform states to ask it in.")] = 8192,
-    episodes: Annotated[int, typer.Option(help="Episodes to follow it through.")] = 64,
-    seed: Annotated[int, typer.Option(help="Of these states and starts.")] = 0,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a diagnosis that is in --out.")
-    ] = False,
-    json: Annotated[bool, typer.Option("--json", help="The diagnosis as JSON.")] = False,
+    action_range: ActionRange = None,
+    set_: SpecChanges = None,
+    states: Annotated[int, typer.Option(help="Uniform states to evaluate in.")] = 8192,
+    episodes: Annotated[int, typer.Option(help="Episodes to evaluate.")] = 64,
+    seed: Annotated[int, typer.Option(help="Seed of these states and start states.")] = 0,
+    force: Force = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the diagnosis as JSON.")] = False,
 ) -> None:
-    """Say where a run's regret sits, and what the evidence says about why. Seconds.
+    """Show where a policy's regret occurs and what most likely causes it. Takes seconds.
 
-    Where: by action channel, state region, shell, time in the episode, and what the error is made
-    of. Why: exploration, credit assignment (k), sparsity (r_min), capacity (L), dimension, survival
-    (D), budget. "cannot tell" where the evidence does not separate causes; --against and
-    --probe-capacity are what most often would. A model's .zip is code: open only those whose author
-    you trust.
+    Where: by action channel, state region, distance out of distribution, and time in the episode.
+    Likely causes: exploration, credit assignment (k), sparse reward (r_min), capacity (L),
+    dimension, survival (D), and budget. The answer is "cannot tell" if the evidence does not
+    separate causes; --against or --probe-capacity then often help.
+
+    Loading a model's .zip can run code: use only files whose author you trust.
 
     Examples:
 
@@ -88,26 +83,21 @@ def diagnose(
       sme diagnose runs/smoke --cell 3f2a91c4
     """
     from sme_registry import diagnosis
+    from sme_registry.diagnosis.render import terminal
 
-    if out_folder is not None and (out_folder / _JSON).exists() and not force:
-        raise OptionError(
-            f"{out_folder / _JSON}: is there already. Give another --out, or --force."
-        )
+    if out_folder is not None:
+        refuse_existing(out_folder / _JSON, force=force)
     if set_ and task is None:
-        raise OptionError("--set: changes the task of a policy, so it needs --task. Add it.")
+        raise OptionError("--set: changes the task of a policy. Add --task.")
     if action_range and task is None:
-        raise OptionError("--action-range: is of a policy with --task; a run's is in its record.")
+        raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
     subject = _subject(run, task, cell, set_, action_range)
     other = None
     if against is not None:
-        study, colon, key = against.rpartition(":")
-        if task is None and colon and not Path(against).exists():
-            other = diagnosis.load_cell(study, key)
-        elif task is None and cell is not None and not Path(against).exists():
-            other = diagnosis.load_cell(run, against)
-        else:
+        other = _other_cell(run, task, cell, against)
+        if other is None:
             other = _subject(against, task, None, set_, action_range)
-    found = diagnosis.diagnose(
+    result = diagnosis.diagnose(
         subject,
         against=other,
         probe_capacity=probe_capacity,
@@ -117,49 +107,61 @@ def diagnose(
         progress=lambda what: err().print(escape(what), style="dim", soft_wrap=True),
     )
     if json:
-        print_json(found.to_dict())
+        print_json(result.to_dict())
     else:
-        from sme_registry.diagnosis.render import terminal
-
-        for part in terminal(found):
+        for part in terminal(result):
             out().print(part)
     if out_folder is not None:
-        for path in _write(found, subject, out_folder):
-            err().print(f"wrote {escape(str(path))}", soft_wrap=True)
+        print_written(_write(result, subject, out_folder))
 
 
 def _subject(
     run: str, task: str | None, cell: str | None, set_: list[str] | None, action_range: str | None
 ) -> Subject:
+    """The run, cell or policy that the arguments name.
+
+    Raises:
+      OptionError: the arguments contradict each other, or RUN is not a folder.
+    """
     from sme_registry import diagnosis
 
     if cell is not None and task is not None:
-        raise OptionError("--cell: is of a study, and --task of a policy. Give one of them.")
+        raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
     if task is not None:
-        spec = load(task).derive(**names.overrides(set_ or []))
-        shown = run if os.sep not in run else None
-        return diagnosis.load_policy(run, spec, action_range=action_range, name=shown)
+        spec = load(task).derive(**changes(set_))
+        name = run if os.sep not in run else None
+        return diagnosis.load_policy(run, spec, action_range=action_range, name=name)
     if cell is not None:
         return diagnosis.load_cell(run, cell)
     if not Path(run).is_dir() and (Path(run).is_file() or ":" in run or os.sep not in run):
         raise OptionError(
-            f"run={run!r}: is no folder. Give one that `sme train` wrote, or with a policy the "
-            "task that it is for, as in --task Default."
+            f"run={run!r}: is not a folder. Give a folder of `sme train`; for a policy, add the "
+            "task it is for, such as --task Default."
         )
     return diagnosis.load_run(run)
 
 
-def _write(found: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
+def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> Subject | None:
+    """The cell that --against names, as STUDY:KEY or as a key of the same study; else None."""
+    from sme_registry import diagnosis
+
+    if task is not None or Path(against).exists():
+        return None
+    study, colon, key = against.rpartition(":")
+    if colon:
+        return diagnosis.load_cell(study, key)
+    return None if cell is None else diagnosis.load_cell(run, against)
+
+
+def _write(result: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
     from sme_registry.diagnosis.render import markdown
 
     figures: tuple[Path, ...] = ()
-    if importlib.util.find_spec("matplotlib") is None:
-        err().print("no figures: matplotlib is not installed (pip install 'sme-registry\\[plot]')")
-    else:
+    if can_draw():
         from sme_registry.diagnosis.figures import draw
 
-        figures = draw(found, folder, subject.log)
-    page = write_atomically(folder / _PAGE, markdown(found, [path.name for path in figures]))
-    # Last: whoever finds it finds all the others, too.
-    data = write_atomically(folder / _JSON, to_json(found.to_dict()))
+        figures = draw(result, folder, subject.log)
+    page = write_atomically(folder / _PAGE, markdown(result, [path.name for path in figures]))
+    # Last, so that the other files exist once it does.
+    data = write_atomically(folder / _JSON, to_json(result.to_dict()))
     return [*figures, page, data]

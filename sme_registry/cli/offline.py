@@ -1,4 +1,4 @@
-"""`sme offline train`: BC or IQL on a data set."""
+"""`sme offline`: train on a data set."""
 
 from __future__ import annotations
 
@@ -10,61 +10,61 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli import names
-from sme_registry.terminal.output import err, out, print_json
+from sme_registry.cli.arguments import Force, changes
+from sme_registry.terminal import Progress, err, out, print_json, table
 
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Learners that see a data set and never the environment.",
+    help="Offline reinforcement learning: train on a data set, never in the environment.",
 )
 
 
 @app.callback()
 def _group() -> None:
-    """Learners that see a data set and never the environment."""
+    """Offline reinforcement learning: train on a data set, never in the environment."""
 
 
 @app.command()
 def train(
     dataset: Annotated[
-        str, typer.Argument(metavar="DATASET", help="An id of `sme dataset list`, or a path.")
+        str, typer.Argument(metavar="DATASET", help="An id from `sme dataset list`, or a path.")
     ],
     algorithm: Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")] = "iql",
     steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000,
-    batch_size: Annotated[int, typer.Option(help="Transitions in each step.")] = 256,
-    seed: Annotated[int, typer.Option(help="Of weights, shuffles and live episodes.")] = 0,
+    batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256,
+    seed: Annotated[int, typer.Option(help="Seed of weights, shuffling and episodes.")] = 0,
     evaluations: Annotated[
-        int, typer.Option(help="Live evaluations on the way, of 10 episodes each.")
+        int, typer.Option(help="Evaluations during training, of 10 episodes each.")
     ] = 20,
     protocol: Annotated[
         str | None,
-        typer.Option(help="Where it is judged at the end; by default the data set's own."),
+        typer.Option(help="Protocol of the final evaluation; default the data set's."),
     ] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter; repeatable."),
+        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option("--datasets", help="Where data sets lie; by default Minari's folder."),
+        typer.Option("--datasets", help="Folder of data sets; default Minari's."),
     ] = None,
     out_folder: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="By default `runs/<dataset>-<algorithm>-seed<seed>`."),
+        typer.Option("--out", "-o", help="Output folder; default runs/DATASET-ALGORITHM-seedN."),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace the training in the folder.")
+    force: Force = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the record and the report as JSON.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Record and report as JSON.")] = False,
 ) -> None:
-    """Train behaviour cloning (bc) or implicit Q-learning (iql) on a data set, and judge it.
+    """Train behaviour cloning (bc) or implicit Q-learning (iql) on a data set, and evaluate it.
 
-    The policy never acts while it learns. At intervals 10 episodes are played in the task: the
-    score is mean r̃, beside that of the data set itself. Some minutes for 20,000 steps on one core.
-    The folder holds policy.npz, offline.json, evaluation.json and a figure.
+    The policy learns from the data alone. Every evaluation runs 10 episodes in the task and
+    compares their mean similarity r̃ with the data set's. 20,000 steps take a few minutes on one
+    core. The output folder contains policy.npz, offline.json, evaluation.json and a figure.
 
-    Hyperparameters: hidden, learning_rate; of iql also discount, expectile, inverse_temperature,
+    Hyperparameters: hidden, learning_rate; for iql also discount, expectile, inverse_temperature,
     max_weight, target_rate.
 
     Examples:
@@ -80,7 +80,6 @@ def train(
     from sme_registry import offline
     from sme_registry.datasets import open_dataset
     from sme_registry.offline.hyperparameters import known_algorithm
-    from sme_registry.terminal.progress import Progress
 
     algorithm = known_algorithm(algorithm)
     opened = open_dataset(dataset, folder)
@@ -94,7 +93,7 @@ def train(
             batch_size=batch_size,
             seed=seed,
             evaluations=min(evaluations, max(1, steps)),
-            hyperparameters=names.overrides(set_ or []),
+            hyperparameters=changes(set_),
             protocol=protocol,
             folder=out_folder,
             force=force,
@@ -108,25 +107,25 @@ def train(
         return
     out().print(_scores(result.record))
     out().print(result.report.table())
-    out().print(f"everything is in {escape(str(out_folder))}{os.sep}", soft_wrap=True)
+    out().print(f"All files are in {escape(str(out_folder))}{os.sep}", soft_wrap=True)
 
 
 def _scores(record: Any) -> Table:
     behaviour, last = record.behaviour, record.evaluations[-1]
-    table = Table(
-        title=f"{record.algorithm.upper()} on {escape(record.dataset)}", title_justify="left"
+    algorithm = record.algorithm.upper()
+    result = table(
+        f"{algorithm} on {escape(record.dataset)}",
+        {"": "text", "r̃": "number", "SD over steps": "number"},
     )
-    for heading in ("", "r̃", "SD over steps"):
-        table.add_column(heading, justify="right" if heading else "left")
-    table.add_row(
+    result.add_row(
         f"behaviour, {record.transitions:,} transitions",
         f"{behaviour.similarity:.3f}",
         f"{behaviour.similarity_sd:.3f}",
     )
-    table.add_row(
-        f"{record.algorithm.upper()}, {record.episodes} live episodes",
+    result.add_row(
+        f"{algorithm}, {record.episodes} episodes",
         f"{last.similarity:.3f}",
         f"{last.similarity_sd:.3f}",
     )
-    table.add_row("improvement", f"{record.improvement:+.3f}", "")
-    return table
+    result.add_row("improvement", f"{record.improvement:+.3f}", "")
+    return result

@@ -3,7 +3,7 @@
 from sme_registry.terminal.commands import CommandGroup, application, version_option
 from sme_registry.terminal.latex import escape_latex
 from sme_registry.terminal.numbers import duration, duration_range, fixed
-from sme_registry.terminal.output import err, failure, mark, out, print_json, print_pairs
+from sme_registry.terminal.output import err, failure, mark, out, print_json, print_pairs, table
 from sme_registry.terminal.progress import Progress
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "out",
     "print_json",
     "print_pairs",
+    "table",
     "version_option",
 ]

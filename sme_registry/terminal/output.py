@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -60,3 +61,27 @@ def print_pairs(title: str, pairs: dict[str, object]) -> None:
 def mark(outcome: str) -> str:
     """An outcome in its colour."""
     return _MARKS[outcome]
+
+
+def table(title: str, columns: Mapping[str, str], *, caption: str = "") -> Table:
+    """An empty table.
+
+    Args:
+      title: above it.
+      columns: heading → "name" (never wrapped), "number" (to the right) or "text" (wrapped).
+      caption: below it.
+    """
+    result = Table(
+        title=title or None,
+        caption=caption or None,
+        title_justify="left",
+        caption_justify="left",
+    )
+    for heading, kind in columns.items():
+        result.add_column(
+            heading,
+            justify="right" if kind == "number" else "left",
+            no_wrap=kind == "name",
+            overflow="fold" if kind == "text" else "ellipsis",
+        )
+    return result

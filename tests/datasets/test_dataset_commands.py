@@ -129,7 +129,7 @@ def test_a_trained_policys_onnx_acts_as_its_zip_does(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--nu", "1.5"], "nu=1.5: must be a finite number or null in [0, 1]"),
+        (["--nu", "1.5"], "nu=1.5: must be a finite number in [0, 1] or null"),
         (["--nu", "nan"], "nu=nan: must be"),
         (["--mix", "nu=0.5:0.7", "--mix", "random:0.2"], "0.7 + 0.2 = 0.9: must add up to 1"),
         (["--mix", "half:1"], "--mix 'half:1': must be nu=NU:WEIGHT"),
@@ -188,7 +188,7 @@ def test_a_copy_under_another_name_is_not_listed_and_not_valid(tmp_path):
     listed = good("list")
     assert listed.stdout.count(own) == 1
     stderr = " ".join(listed.stderr.split())
-    assert "not listed:" in stderr
+    assert "invalid:" in stderr
     back = tmp_path / "minari" / own
     assert f"sme/Copy-v0: contains the data set {own}. Move or copy it back to {back}, or" in stderr
     assert [found["id"] for found in json.loads(good("list", "--json").stdout)] == [own]
@@ -205,5 +205,5 @@ def test_a_broken_set_is_told_of_beside_the_list(tmp_path):
     result = good("list")
     assert "sme/one-v0" in result.stdout
     assert "two-v0" not in result.stdout
-    assert "not listed:" in result.stderr
+    assert "invalid:" in result.stderr
     assert "two-v0" in result.stderr

@@ -320,7 +320,7 @@ def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path: Path) 
     assert result.exit_code == 0
     assert json.loads(result.stdout)["algorithms"] == ["constant", "one", "other"]
     (line,) = result.stderr.splitlines()
-    assert line.startswith("could not be run here: uses='theirs:make': cannot be imported")
+    assert line.startswith("cannot run here: uses='theirs:make': cannot be imported")
     assert sme("plan", "p.json", "--only", "algorithm=constant").stderr == ""
     assert "theirs:make" in refused("run", "p.json", "-f", "s")
     assert "theirs:make" in refused("new", "n.json", "--from", "p.json")
@@ -332,7 +332,7 @@ def test_a_plan_is_written_where_the_learners_are_not_installed(
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     result = sme("new", "n.json", "-t", "Default", "-a", "PPO", "-a", "TD3")
     assert result.exit_code == 0
-    told = "could not be run here: training: Stable-Baselines3 is not installed"
+    told = "cannot run here: training: Stable-Baselines3 is not installed"
     assert result.stderr.count(told) == 1
     assert [one.uses for one in StudyFile.read("n.json").plan.algorithms] == ["PPO", "TD3"]
 
@@ -387,7 +387,7 @@ class TestEdited:
     @pytest.mark.parametrize(
         ("option", "words"),
         [
-            (("--seeds", "10"), "--seeds: the plan of --from has its own"),
+            (("--seeds", "10"), "--seeds: the plan of --from already sets it"),
             (("--action-range", "unit"), "--action-range: the plan of --from"),
             (("--name", "a b"), "name='a b'"),
         ],

@@ -1,9 +1,11 @@
-"""From what a user types to a document: a name, a path, or a digest of any kind."""
+"""Arguments and options that several commands share, and how their text is read."""
 
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from sme_registry.errors import (
     MalformedDocumentError,
@@ -17,8 +19,26 @@ from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFi
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.resolve import is_path, refuse_bare_spec, resolve
 
-# The first of a name is what is meant by it: `smoke` is a suite, and the study of that name is what
-# `sme study` takes.
+TaskName = Annotated[
+    str, typer.Argument(metavar="TASK", help="The task: a name, a path or a digest.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print plain JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
+SpecChanges = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="FIELD=VALUE", help="Change a field of the task. Repeatable."),
+]
+Protocol = Annotated[
+    str, typer.Option(help="Evaluation protocol: a name from `sme list`, or a path.")
+]
+ActionRange = Annotated[
+    str | None,
+    typer.Option(
+        help="Range of the policy's actions: unit or symmetric. Default: as saved, else unit."
+    ),
+]
+
+# A name stands for the first kind that has it: `smoke` is a suite here, and a study in `sme study`.
 KINDS: dict[str, type[Envelope]] = {
     "env": EnvFile,
     "suite": SuiteFile,
@@ -27,11 +47,16 @@ KINDS: dict[str, type[Envelope]] = {
 }
 
 
+def kind_of(file: Envelope) -> str:
+    """The kind of a file: `env`, `suite`, `protocol` or `study`."""
+    return next(kind for kind, model in KINDS.items() if isinstance(file, model))
+
+
 def read_any(path: str | os.PathLike[str]) -> Envelope:
-    """Read a file of any kind; its kind is the document that it carries.
+    """Read a file of any kind, which follows from the document in it.
 
     Raises:
-      MalformedDocumentError: not strict JSON, or no file of ours.
+      MalformedDocumentError: not strict JSON, or not one of these files.
       SpecError, DigestMismatchError: see `Envelope.from_dict`.
     """
     data = read_json(path)
@@ -44,43 +69,42 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
 
 
 def find_any(name: str) -> Envelope | SMESpec:
-    """The file of a name, path or digest; a spec alone where it has no file of its own.
+    """The file of a name, path or digest; a spec alone if it has no file of its own.
 
     Raises:
       UnknownNameError: no environment, suite, protocol or study has this name or digest.
     """
     if is_path(name):
         return read_any(name)
-    every = [(kind, file) for kind in KINDS.values() for file in catalogue.entries(kind)]
-    for _, file in every:
+    files = [file for kind in KINDS.values() for file in catalogue.entries(kind)]
+    for file in files:
         if name in (file.name, file.versioned_name, file.digest):
             return file
     try:
         spec = resolve(name).spec
     except UnknownNameError as error:
-        short = name.rsplit("/", 1)[-1]
-        hint = did_you_mean(short, [file.name for _, file in every])
+        hint = did_you_mean(name.rsplit("/", 1)[-1], [file.name for file in files])
         if hint and "Did you mean" not in str(error):
             raise UnknownNameError(
                 f"{name!r}: nothing in the catalogue has this name.{hint}"
             ) from None
         raise
-    files = [file for kind, file in every if kind is EnvFile and file.digest == spec.digest]
-    return files[0] if len(files) == 1 else spec
+    same = [file for file in files if isinstance(file, EnvFile) and file.digest == spec.digest]
+    return same[0] if len(same) == 1 else spec
 
 
-def overrides(pairs: list[str]) -> dict[str, Any]:
-    """`field=value` pairs as spec fields; a value is read as JSON where it is JSON.
+def changes(pairs: list[str] | None) -> dict[str, Any]:
+    """The `field=value` pairs of `--set`; see `json_or_text` for values.
 
     Raises:
       OptionError: a pair has no `=`, or a field is given twice.
     """
     fields: dict[str, Any] = {}
-    for pair in pairs:
+    for pair in pairs or ():
         name, equals, text = pair.partition("=")
         name = name.strip().replace("-", "_")
         if not equals or not name:
-            raise OptionError(f"--set {pair!r}: must be field=value, as in --set complexity=10.")
+            raise OptionError(f"--set {pair!r}: must be field=value, such as --set complexity=10.")
         if name in fields:
             raise OptionError(f"--set {pair!r}: {name} is set twice. Remove one.")
         fields[name] = json_or_text(text.strip())
@@ -88,7 +112,7 @@ def overrides(pairs: list[str]) -> dict[str, Any]:
 
 
 def json_or_text(text: str) -> Any:
-    """A value as JSON (`10`, `0.5`, `{"agents": …}`), else as the text it is (`0x1f`)."""
+    """A value as JSON (`10`, `0.5`, `{"agents": …}`), or as the text itself (`0x1f`)."""
     try:
         return parse_json(text)
     except SMEError:

@@ -1,4 +1,4 @@
-"""`sme dataset make · list · show · validate`: data sets for offline RL."""
+"""`sme dataset`: make, list, show and validate data sets for offline RL."""
 
 from __future__ import annotations
 
@@ -8,18 +8,40 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry import load
-from sme_registry.cli import names
+from sme_registry.cli.arguments import (
+    ActionRange,
+    Force,
+    Json,
+    Protocol,
+    SpecChanges,
+    TaskName,
+    changes,
+)
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import catalogue
-from sme_registry.terminal.output import err, failure, out, print_json, print_pairs
+from sme_registry.terminal import (
+    Progress,
+    err,
+    failure,
+    out,
+    print_json,
+    print_pairs,
+    table,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Data sets for offline RL, of a chosen quality, with the exact regret of every step.",
+    help="""Data sets for offline RL, of a chosen quality, with the exact regret of every step.
+
+    Examples:
+
+      sme dataset make Default --nu 0.5
+
+      sme dataset list
+    """,
 )
 
 Folder = Annotated[
@@ -27,59 +49,53 @@ Folder = Annotated[
     typer.Option(
         "--out",
         "-o",
-        help="Folder of data sets; by default Minari's: MINARI_DATASETS_PATH, or "
-        "~/.minari/datasets.",
+        help="Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets.",
     ),
 ]
-Name = Annotated[str, typer.Argument(metavar="ID|PATH", help="A set's id, or its folder.")]
-Json = Annotated[bool, typer.Option("--json", help="Plain JSON on standard output.")]
+Name = Annotated[
+    str, typer.Argument(metavar="ID|PATH", help="The id of a data set, or its folder.")
+]
 
 
 @app.command("make")
 def make(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A name, a path, or a digest.")],
+    task: TaskName,
     nu: Annotated[
         float | None,
-        typer.Option(help="ν of the mixture that acts, in [0, 1]: 0 optimal, 1 worst; 0.5."),
+        typer.Option(help="Quality ν of the behaviour, from 0, optimal, to 1, worst; default 0.5."),
     ] = None,
     mix: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="WHO:WEIGHT",
-            help="In place of --nu, repeatable: nu=0.5:0.7, random:0.1, policy=model.zip:0.2 "
-            "(or an .onnx). The weights add up to 1.",
+            metavar="POLICY:WEIGHT",
+            help="Instead of --nu, a mixture: nu=0.5:0.7, random:0.1, policy=model.zip:0.2 (or "
+            ".onnx). Repeatable; the weights must add up to 1.",
         ),
     ] = None,
     transitions: Annotated[
-        int, typer.Option("--transitions", "-n", help="Exactly so many.")
+        int, typer.Option("--transitions", "-n", help="Number of transitions.")
     ] = 50_000,
-    seed: Annotated[int, typer.Option(help="Of the data, not of the task.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the data, not of the task.")] = 0,
     coverage: Annotated[
         float | None,
-        typer.Option(help="ε in (-1, 0]: only states of the sub-cube of half side (1 + ε)/2."),
+        typer.Option(help="ε in (-1, 0]: keep only states in the central cube of side 1 + ε."),
     ] = None,
-    protocol: Annotated[
-        str, typer.Option(help="Where policies that learn from it are to be judged.")
-    ] = "paper-v1",
-    action_range: Annotated[
-        str | None, typer.Option(help="unit or symmetric, of a policy's actions; its own.")
-    ] = None,
+    protocol: Protocol = "paper-v1",
+    action_range: ActionRange = None,
     name: Annotated[
-        str | None, typer.Option(help="Minari's id, such as sme/mine-v0; by default descriptive.")
+        str | None, typer.Option(help="Minari id, such as sme/mine-v0; default from the settings.")
     ] = None,
     out_folder: Folder = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="FIELD=VALUE", help="Change a spec field; repeatable."),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
+    set_: SpecChanges = None,
+    force: Force = False,
     json: Json = False,
 ) -> None:
-    """Make a data set of a chosen quality, as Minari's HDF5; the same command, the same bits.
+    """Make a data set of a chosen quality in Minari's HDF5 format.
 
-    The behaviour policy is a = (1 − α) a* + α ã, α ~ U(0, ν) at each step, ã another network of the
-    shape of the optimal policy. Every transition has its optimal action, similarity and regret;
-    the metadata have the exact scores of the constant action, the behaviour and the optimum.
+    The behaviour policy is `a = (1 − α) a* + α ã`, where α is uniform in (0, ν) at each step and ã
+    comes from another network of the same shape as the optimal policy. Every transition records its
+    optimal action, similarity and exact regret. The metadata contain the exact scores of the
+    constant action, the behaviour and the optimum. The same command makes the same bits.
 
     Examples:
 
@@ -90,9 +106,8 @@ def make(
       sme dataset make Plane1 --nu 0.25 --coverage -0.2 --name sme/inner-v0 --out data
     """
     from sme_registry.datasets import make_dataset
-    from sme_registry.terminal.progress import Progress
 
-    spec = load(task).derive(**names.overrides(set_ or []))
+    spec = load(task).derive(**changes(set_))
     with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
         made = make_dataset(
             spec,
@@ -106,7 +121,7 @@ def make(
             name=name,
             folder=out_folder,
             force=force,
-            progress=lambda done, total: progress.update(done),
+            progress=progress.update_of,
         )
     if json:
         print_json(_summary(made))
@@ -116,31 +131,31 @@ def make(
 
 
 def _weighted(text: str) -> tuple[Any, float]:
-    """`nu=0.5:0.7`, `random:0.1` or `policy=model.zip:0.2` as who acts and its weight.
+    """Read `nu=0.5:0.7`, `random:0.1` or `policy=model.zip:0.2` as a policy and its weight.
 
     Raises:
       OptionError: it is none of these.
     """
-    who, _, weight = text.rpartition(":")
-    kind, _, value = who.partition("=")
+    policy, _, weight = text.rpartition(":")
+    kind, _, value = policy.partition("=")
     try:
         if kind == "nu":
             return float(value), float(weight)
         if kind == "policy" and value:
             return Path(value), float(weight)
-        if who == "random":
-            return who, float(weight)
+        if policy == "random":
+            return policy, float(weight)
     except ValueError:
         pass
     raise OptionError(
-        f"--mix {text!r}: must be nu=NU:WEIGHT, random:WEIGHT or policy=FILE:WEIGHT, as in "
+        f"--mix {text!r}: must be nu=NU:WEIGHT, random:WEIGHT or policy=FILE:WEIGHT, such as "
         "--mix nu=0.5:0.7."
     )
 
 
 @app.command("list")
 def list_(out_folder: Folder = None, json: Json = False) -> None:
-    """The data sets in a folder.
+    """List the data sets in a folder.
 
     Examples:
 
@@ -150,23 +165,20 @@ def list_(out_folder: Folder = None, json: Json = False) -> None:
     """
     from sme_registry.datasets import datasets_folder, list_datasets
 
-    found, broken = list_datasets(out_folder)
+    datasets, broken = list_datasets(out_folder)
     if json:
-        print_json([_summary(dataset) for dataset in found])
-    elif found:
-        table = Table(
-            title="Data sets",
-            title_justify="left",
-            caption="r̃ similarity of the behaviour, and of the constant action ½, on the set's "
-            "own states",
-            caption_justify="left",
+        print_json([_summary(dataset) for dataset in datasets])
+    elif datasets:
+        numbers = ("transitions", "trajectories", "r̃", "r̃ of ½", "MB")
+        result = table(
+            "Data sets",
+            {"id": "text", **dict.fromkeys(numbers, "number")},
+            caption="r̃: similarity of the behaviour, and of the constant action ½, in the states "
+            "of the data set",
         )
-        table.add_column("id", overflow="fold")
-        for column in ("transitions", "trajectories", "r̃", "r̃ of ½", "MB"):
-            table.add_column(column, justify="right")
-        for dataset in found:
+        for dataset in datasets:
             record = dataset.record
-            table.add_row(
+            result.add_row(
                 dataset.id,
                 f"{record.recipe.transitions:,}",
                 f"{record.trajectories:,}",
@@ -174,20 +186,20 @@ def list_(out_folder: Folder = None, json: Json = False) -> None:
                 f"{record.scores.constant.similarity:.3f}",
                 f"{dataset.size_bytes / 1e6:.1f}",
             )
-        out().print(table)
+        out().print(result)
     else:
         err().print(
-            f"no data sets in {escape(str(datasets_folder(out_folder)))}. "
-            "`sme dataset make --help` shows how to make one.",
+            f"There are no data sets in {escape(str(datasets_folder(out_folder)))}. "
+            "To make one, see `sme dataset make --help`.",
             soft_wrap=True,
         )
     for reason in broken.values():
-        err().print(f"[yellow]not listed:[/] {escape(reason)}", soft_wrap=True)
+        err().print(f"[yellow]invalid:[/] {escape(reason)}", soft_wrap=True)
 
 
 @app.command("show")
 def show(name: Name, out_folder: Folder = None, json: Json = False) -> None:
-    """One data set: its recipe, its scores, its digests.
+    """Show a data set: its recipe, scores and digests.
 
     Examples:
 
@@ -206,17 +218,17 @@ def show(name: Name, out_folder: Folder = None, json: Json = False) -> None:
 
 @app.command("validate")
 def validate(
-    sets: Annotated[list[str], typer.Argument(metavar="ID|PATH…", help="Sets to check.")],
+    sets: Annotated[list[str], typer.Argument(metavar="ID|PATH…", help="Data sets to check.")],
     out_folder: Folder = None,
     json: Json = False,
 ) -> None:
-    """Check sets to the last bit: place, digests, and every transition again through the task.
+    """Check data sets bit for bit: location, digests, and every transition recomputed by the task.
 
     Examples:
 
       sme dataset validate sme/Default-v1-nu50-seed7-v0
 
-      sme dataset validate data/sme/*
+      sme dataset validate data/sme/inner-v0
     """
     from sme_registry.datasets import check_location, open_dataset, replay
     from sme_registry.task import materialize
@@ -252,30 +264,28 @@ def _summary(dataset: Any) -> dict[str, Any]:
 
 
 def _print(dataset: Any) -> None:
-    """A set's facts, then its scores as a table."""
+    """Print a data set's facts, then its scores."""
     record = dataset.record
     recipe = record.recipe
-    kept = "all" if recipe.coverage is None else f"E(s) ≤ {recipe.coverage:g}"
+    states = "all" if recipe.coverage is None else f"E(s) ≤ {recipe.coverage:g}"
     pairs: dict[str, object] = {
         "task": f"{catalogue.title(recipe.spec)}  {record.spec_digest}",
         "transitions": f"{recipe.transitions:,} in {record.trajectories:,} trajectories",
-        "states": kept,
+        "states": states,
         "seeds": f"task {record.seeds.task}, data {record.seeds.data}",
         "protocol": record.protocol_digest,
         "recipe": record.recipe_digest,
         "arrays": record.arrays_digest,
     }
     if recipe.expected_similarity is not None:
-        pairs["r̃ if ã and a* were uniform"] = f"{recipe.expected_similarity:.4f}"
+        pairs["expected r̃ for uniform ã and a*"] = f"{recipe.expected_similarity:.4f}"
     print_pairs(f"[bold]{escape(dataset.id)}[/]", pairs)
-    table = Table(
-        title="Scores",
-        title_justify="left",
-        caption="r̃, r on the set's own states · return over whole episodes, ± standard error",
-        caption_justify="left",
+    result = table(
+        "Scores",
+        {"policy": "text", **dict.fromkeys(("weight", "r̃", "r", "return"), "number")},
+        caption="similarity r̃ and step reward r in the states of the data set · return of whole "
+        "episodes, ± standard error",
     )
-    for column in ("who", "weight", "r̃", "r", "return"):
-        table.add_column(column, justify="left" if column == "who" else "right")
     scores = record.scores
     rows = [("constant ½", "", scores.constant), ("behaviour", "", scores.behaviour)]
     if len(recipe.behaviours) > 1:
@@ -283,11 +293,11 @@ def _print(dataset: Any) -> None:
             (f"  {behaviour.label}", f"{behaviour.weight:g}", score)
             for behaviour, score in zip(recipe.behaviours, scores.behaviours, strict=True)
         ]
-    for who, weight, score in [*rows, ("optimum", "", scores.optimum)]:
+    for policy, weight, score in [*rows, ("optimum", "", scores.optimum)]:
         rollouts = score.rollouts
-        played = "" if rollouts is None else f"{rollouts.mean_return:.2f}"
+        returns = "" if rollouts is None else f"{rollouts.mean_return:.2f}"
         if rollouts is not None and rollouts.episodes:
-            played += f" ± {rollouts.standard_error:.2f}"
+            returns += f" ± {rollouts.standard_error:.2f}"
         numbers = f"{score.similarity:.4f}", f"{score.step_reward:.4f}"
-        table.add_row(escape(who), weight, *numbers, played)
-    out().print(table)
+        result.add_row(escape(policy), weight, *numbers, returns)
+    out().print(result)

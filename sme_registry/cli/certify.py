@@ -1,0 +1,106 @@
+"""`sme certify`: check a drawn task."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli.arguments import Json, find_any
+from sme_registry.errors import UnknownNameError
+from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile
+from sme_registry.terminal import err, mark, out, print_json, table
+
+if TYPE_CHECKING:
+    from sme_registry.task.certify import Certificate
+
+
+def certify(
+    tasks: Annotated[
+        list[str], typer.Argument(metavar="NAME|PATH...", help="Tasks or suites to check.")
+    ],
+    seed: Annotated[int, typer.Option(help="Seed of the states and actions used.")] = 0,
+    json: Json = False,
+) -> None:
+    """Draw a task and check that it is sound, before training on it.
+
+    A broken or trivial task is refused. A warning marks a valid but easy one, such as a
+    semi_orthogonal policy of 2 to 5 layers, whose target stays near the middle. Exit code 1 if any
+    task is refused.
+
+    Examples:
+
+      sme certify mine.json
+
+      sme certify core smoke
+    """
+    from sme_registry.task.certify import certify as certify_task
+
+    specs = [entry for name in tasks for entry in _tasks(name)]
+    certificates: list[tuple[str, Certificate]] = []
+    for label, spec in specs:
+        certificates.append((label, certify_task(spec, seed=seed)))
+        if not json and len(specs) > 1:
+            _print_line(*certificates[-1])
+    if json:
+        print_json([{"task": label, **each.to_dict()} for label, each in certificates])
+    elif len(specs) == 1:
+        _print_certificate(*certificates[0])
+    if not all(each.passed for _, each in certificates):
+        raise typer.Exit(1)
+
+
+def _tasks(name: str) -> list[tuple[str, SMESpec]]:
+    """The label and spec of each task that a name stands for."""
+    from sme_registry.task import materialize
+
+    document = find_any(name)
+    if isinstance(document, SMESpec):
+        return [(name, document)]
+    if isinstance(document, EnvFile):
+        materialize(document.spec, document.fingerprint)
+        return [(name, document.spec)]
+    if isinstance(document, SuiteFile):
+        return [
+            (f"{document.name}/{member.name} seed {spec.seed}", spec)
+            for member in document.suite.classes
+            for spec in member.instances
+        ]
+    assert isinstance(document, ProtocolFile | StudyFile)
+    kind = "protocol" if isinstance(document, ProtocolFile) else "study"
+    raise UnknownNameError(f"{name!r}: is a {kind}. Give a task or a suite.")
+
+
+def _print_line(label: str, certificate: Certificate) -> None:
+    notable = [*certificate.of("refused"), *certificate.of("warning")]
+    reasons = ", ".join(
+        check.name if check.value is None else f"{check.name} {check.value:.3g}"
+        for check in notable
+    )
+    outcome = mark(certificate.outcome)
+    out().print(f"{outcome}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True)
+
+
+def _print_certificate(label: str, certificate: Certificate) -> None:
+    columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
+    result = table(f"Certificate of {escape(label)}", columns)
+    for check in certificate.checks:
+        low = "" if check.low is None else f"≥ {check.low:.3g}"
+        high = "" if check.high is None else f"≤ {check.high:.3g}"
+        value = "" if check.value is None else f"{check.value:.3g}"
+        bounds = ", ".join(filter(None, (low, high)))
+        result.add_row(mark(check.outcome), f"[bold]{check.name}[/]", value, bounds)
+    out().print(result)
+    out().print()
+    for check in certificate.checks:
+        out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")
+    out().print()
+    refused = certificate.of("refused")
+    if refused:
+        reasons = ", ".join(check.name for check in refused)
+        err().print(f"[red]refused[/] for {reasons}. Use another seed, or change a field.")
+    elif certificate.outcome == "warning":
+        err().print("[yellow]valid, but easy[/]: see the warnings above.")
+    else:
+        err().print("[green]passed[/]")

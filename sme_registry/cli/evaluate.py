@@ -1,0 +1,101 @@
+"""`sme evaluate`: evaluate a policy in and out of distribution."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sme_registry import load
+from sme_registry.cli.arguments import (
+    ActionRange,
+    Force,
+    Protocol,
+    SpecChanges,
+    TaskName,
+    changes,
+)
+from sme_registry.cli.files import can_draw, print_written
+from sme_registry.evaluation.references import POLICIES
+from sme_registry.io import refuse_existing
+from sme_registry.terminal import Progress, err, out, print_json
+
+
+def evaluate(
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help=f"A .zip, .onnx or .npz file, module:function, or {', '.join(POLICIES)}.",
+        ),
+    ],
+    task: TaskName,
+    protocol: Protocol = "paper-v1",
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json and the figures.")
+    ] = None,
+    action_range: ActionRange = None,
+    set_: SpecChanges = None,
+    force: Force = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Evaluate a policy in and out of distribution, compared with reference policies.
+
+    A function takes observations `[B, S + 2]` and returns actions `[B, A]`, in [0, 1] unless
+    --action-range is symmetric; so does an .onnx network. A .zip of Stable-Baselines3 can run code
+    when it is loaded: use only files whose author you trust.
+
+    For a team, give the one policy that all agents share. It is called for each agent with the
+    shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T, the
+    agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that an
+    agent owns. The report then includes each agent.
+
+    Examples:
+
+      sme evaluate linear Complexity10
+
+      sme evaluate runs/demo/model.zip Default --out runs/demo-again
+
+      sme evaluate actor.onnx Default --action-range symmetric
+
+      sme evaluate mypolicy:act Default --protocol quick-v1 --json
+
+      sme evaluate runs/Team4-PPO-seed0/model.zip Team4
+    """
+    from sme_registry import evaluation
+
+    spec = load(task).derive(**changes(set_))
+    resolved = evaluation.resolve_protocol(protocol)
+    target = None if out_folder is None else out_folder / "evaluation.json"
+    if target is not None:
+        refuse_existing(target, force=force)
+    prepared = evaluation.as_policy(policy, spec, action_range=action_range)
+    states = resolved.states_per_region * len(resolved.edges)
+    with Progress("evaluating", states, unit="states", console=err()) as progress:
+        report = evaluation.evaluate(prepared, spec, resolved, progress=progress.update_of)
+    files = [] if target is None else [report.write(target), *_figures(report, prepared, target)]
+    if json:
+        print_json(report.to_dict())
+    else:
+        out().print(report.table())
+    print_written(files)
+
+
+def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
+    if not can_draw():
+        return []
+    from sme_registry import plots
+
+    figures = [plots.decay_curve(report, target.with_name("decay_curve.png"))]
+    if report.spec.state_dim == 2 and report.spec.team is None:
+        figures.append(
+            plots.similarity_map(
+                policy,
+                report.spec,
+                target.with_name("similarity_map.png"),
+                action_range=report.action_range,
+                name=report.policy,
+            )
+        )
+    return figures

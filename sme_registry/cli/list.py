@@ -1,0 +1,149 @@
+"""`sme list`: the catalogue."""
+
+from __future__ import annotations
+
+import enum
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.cli.arguments import KINDS, Json, kind_of
+from sme_registry.errors import UnknownNameError
+from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
+from sme_registry.spec.envelope import Envelope
+from sme_registry.terminal import out, print_json, table
+
+
+class Kind(enum.StrEnum):
+    """What `sme list` shows."""
+
+    env = "env"
+    suite = "suite"
+    protocol = "protocol"
+    study = "study"
+
+
+def list_(
+    kind: Annotated[Kind | None, typer.Option("--kind", "-k", help="Only this kind.")] = None,
+    tag: Annotated[
+        list[str] | None,
+        typer.Option("--tag", "-t", help="Only entries with this tag. Repeatable: with all tags."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """List the catalogue: environments, suites, protocols and studies.
+
+    Examples:
+
+      sme list
+
+      sme list --kind env --tag paper
+
+      sme list --json | jq '.[].id'
+    """
+    tags = set(tag or ())
+    files = {
+        name: [file for file in catalogue.entries(model) if tags <= set(file.tags)]
+        for name, model in KINDS.items()
+        if kind in (None, name)
+    }
+    if json:
+        print_json([summary(file) for group in files.values() for file in group])
+        return
+    if not any(files.values()):
+        known = sorted(
+            {tag for model in KINDS.values() for f in catalogue.entries(model) for tag in f.tags}
+        )
+        raise UnknownNameError(
+            f"--tag {' --tag '.join(sorted(tags))}: nothing in the catalogue has "
+            f"{'this tag' if len(tags) == 1 else 'all of these tags'}. Tags: {', '.join(known)}."
+        )
+    for name, group in files.items():
+        if group:
+            out().print(_TABLES[name](group))
+
+
+def summary(file: Envelope) -> dict[str, Any]:
+    """A file's entry in the JSON output."""
+    entry: dict[str, Any] = {
+        "kind": kind_of(file),
+        "name": file.versioned_name,
+        "digest": file.digest,
+        "tags": list(file.tags),
+        "description": file.description,
+    }
+    if isinstance(file, EnvFile):
+        entry["id"] = f"{catalogue.NAMESPACE}/{file.versioned_name}"
+        entry["spec"] = file.spec.to_dict()
+    return entry
+
+
+def _env_table(files: list[EnvFile]) -> Table:
+    numbers = ("n", "S", "A", "L", "k", "r_min", "D", "T")
+    result = table(
+        "Environments",
+        {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
+        caption="n agents · S state channels, A action channels · L layers of π* · k reward "
+        "interval · T horizon",
+    )
+    for file in files:
+        spec = file.spec
+        values = (
+            1 if spec.team is None else len(spec.team.agents), spec.state_dim, spec.action_dim,
+            spec.complexity, spec.k, spec.r_min, spec.D, spec.horizon,
+        )  # fmt: skip
+        result.add_row(
+            f"{catalogue.NAMESPACE}/{file.versioned_name}",
+            *(f"{value:g}" for value in values),
+            " ".join(file.tags),
+        )
+    return result
+
+
+def _suite_table(files: list[SuiteFile]) -> Table:
+    result = table(
+        "Suites", {"name": "name", "classes": "number", "tasks": "number", "description": "text"}
+    )
+    for file in files:
+        counts = len(file.suite.classes), len(file.suite.instances)
+        result.add_row(file.versioned_name, *map(str, counts), escape(file.description))
+    return result
+
+
+def _protocol_table(files: list[ProtocolFile]) -> Table:
+    columns = {"name": "name", "regions": "number", "states each": "number", "description": "text"}
+    result = table("Protocols", columns)
+    for file in files:
+        protocol = file.protocol
+        counts = str(len(protocol.edges)), f"{protocol.states_per_region:,}"
+        result.add_row(file.versioned_name, *counts, escape(file.description))
+    return result
+
+
+def study_table(files: list[StudyFile]) -> Table:
+    """The plans of studies: how many classes, algorithms, seeds and cells."""
+    columns = {"name": "name", "classes": "number", "algorithms": "text"}
+    result = table(
+        "Studies", {**columns, "seeds": "number", "cells": "number", "description": "text"}
+    )
+    for file in files:
+        plan = file.plan
+        result.add_row(
+            file.versioned_name,
+            str(len(plan.classes)),
+            escape(", ".join(algorithm.name for algorithm in plan.algorithms)),
+            str(plan.seeds),
+            f"{len(plan.classes) * len(plan.algorithms) * plan.seeds:,}",
+            escape(file.description),
+        )
+    return result
+
+
+_TABLES: dict[str, Any] = {
+    "env": _env_table,
+    "suite": _suite_table,
+    "protocol": _protocol_table,
+    "study": study_table,
+}

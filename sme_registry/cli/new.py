@@ -1,0 +1,184 @@
+"""`sme new`: write a task's file."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from sme_registry import load
+from sme_registry.cli.arguments import Force, json_or_text
+from sme_registry.cli.files import check_document_path
+from sme_registry.errors import OptionError
+from sme_registry.io import integer_in, read_json
+from sme_registry.spec import SMESpec
+from sme_registry.terminal import err, out
+
+_MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
+_NO_OPTION = ("schema_version", "team")
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT"}
+_HELP = {  # where the field's description is too short or missing
+    "k": "Reward interval: steps between payouts",
+    "r_min": "Reward threshold: step rewards at or below it are set to 0",
+    "D": "Survival threshold: an episode ends below this step reward",
+    "horizon": "T, steps of an episode",
+    "hidden_width": "H, width of the inner layers of the optimal policy",
+    "policy_init": "'semi_orthogonal', or 'unit_variance', which also suits layers that widen",
+    "seed": "Seed of the draw: an integer, or hexadecimal 0x… for a sealed task",
+}
+
+
+def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each field of a spec that has a single value.
+
+    The command receives the fields that were given as a dict `fields`, values as `json_or_text`
+    reads them, so that the spec itself checks them, as it does for `--set`.
+    """
+    options = {}
+    for name, field in SMESpec.model_fields.items():
+        if name not in _NO_OPTION:
+            about = _HELP.get(name) or field.description
+            options[name] = inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=None,
+                annotation=Annotated[
+                    str | None,
+                    typer.Option(
+                        f"--{name.replace('_', '-')}",
+                        metavar=_METAVARS[type(field.default)],
+                        help=f"{about}; default {field.default}.",
+                    ),
+                ],
+            )
+    hints = typing.get_type_hints(command, include_extras=True)
+    own = [
+        parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(command).parameters.items()
+        if name != "fields"
+    ]
+
+    @functools.wraps(command)
+    def with_options(**values: Any) -> None:
+        texts = {name: values.pop(name) for name in options}
+        given = {name: json_or_text(text) for name, text in texts.items() if text is not None}
+        command(fields=given, **values)
+
+    parameters = [own[0], *options.values(), *own[1:]]
+    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_options.__annotations__ = {each.name: each.annotation for each in parameters}
+    return with_options
+
+
+@_with_field_options
+def new(
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    fields: dict[str, Any],
+    team: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON|FILE",
+            help='Agents of a team, as a .json file or as JSON: \'{"agents": [{"action_dim": 2, '
+            '"observes": \\[0, 1]}, {"action_dim": 2}]}\'.',
+        ),
+    ] = None,
+    agents: Annotated[
+        int | None, typer.Option(help="A team of this many equal agents that observe all.")
+    ] = None,
+    channels_each: Annotated[
+        int | None,
+        typer.Option(help="Action channels of each of --agents; by default an equal share."),
+    ] = None,
+    team_reward: Annotated[
+        str | None,
+        typer.Option(
+            help="individual, or team: each agent is rewarded for its own or for all channels."
+        ),
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option("--from", metavar="NAME|PATH", help="The task to start from.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
+    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    tag: Annotated[list[str] | None, typer.Option(help="A keyword. Repeatable.")] = None,
+    force: Force = False,
+) -> None:
+    """Write a task's file: its spec, its digest, and a fingerprint of the numbers drawn from it.
+
+    Fields left out have their default, or the value of the --from task. Everyone who has the file
+    has the same task.
+
+    Examples:
+
+      sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
+
+      sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
+
+      sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
+
+      sme new team.json --agents 4 --channels-each 2 --team-reward team
+    """
+    import sme_registry
+
+    check_document_path(path, force=force)
+    start = SMESpec() if base is None else load(base)
+    if team is not None and agents is not None:
+        raise OptionError("--agents: --team already lists the agents. Give one or the other.")
+    if channels_each is not None and agents is None:
+        raise OptionError(f"--channels-each {channels_each}: needs --agents. Add it.")
+    if team is not None:
+        fields["team"] = read_json(team) if team.endswith(".json") else json_or_text(team)
+    elif agents is not None:
+        fields |= _equal_team(start, fields.get("action_dim"), agents, channels_each)
+    if team_reward is not None:
+        fields["team"] = _with_reward(start, fields.get("team"), team_reward)
+    spec = start.derive(**fields)
+    sme_registry.save(spec, path, name, description=description, tags=tuple(tag or ()))
+    out().print(f"{escape(str(path))}  {spec.digest}", soft_wrap=True)
+    err().print(f"[dim]To check the draw: sme certify {escape(str(path))}[/]", soft_wrap=True)
+
+
+def _equal_team(
+    start: SMESpec, action_dim: Any, agents: int, channels_each: int | None
+) -> dict[str, Any]:
+    """The fields `team` and `action_dim` of a team of equal agents.
+
+    Raises:
+      OptionError: the channels cannot be shared equally, or contradict --action-dim.
+    """
+    integer_in("--agents", agents, 1)
+    if channels_each is None:
+        A = start.action_dim if action_dim is None else action_dim
+        channels_each, remainder = divmod(A, agents) if isinstance(A, int) else (0, 0)
+        if remainder or not channels_each:
+            raise OptionError(
+                f"--agents {agents}: action_dim={A} cannot be shared equally. Give "
+                "--channels-each, or --team for unequal agents."
+            )
+    total = agents * channels_each
+    if action_dim not in (None, total):
+        raise OptionError(
+            f"--agents {agents} --channels-each {channels_each}: give {total} action channels, "
+            f"but --action-dim is {action_dim}. Leave it out."
+        )
+    members = [{"action_dim": channels_each}] * min(agents, _MOST_AGENTS)
+    return {"team": {"agents": members}, "action_dim": total}
+
+
+def _with_reward(start: SMESpec, team: Any, reward: str) -> dict[str, Any]:
+    """A team, given or of the task to start from, with another reward.
+
+    Raises:
+      OptionError: there is no team.
+    """
+    if team is None and start.team is not None:
+        team = start.team.to_dict()
+    if not isinstance(team, dict):
+        raise OptionError(f"--team-reward {reward}: needs a team. Add --agents or --team.")
+    return {**team, "reward": reward}

@@ -1,0 +1,262 @@
+"""`sme show`: one task, suite, protocol or study plan."""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.cli.arguments import Json, find_any
+from sme_registry.cli.list import study_table, summary
+from sme_registry.errors import OptionError
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    StudyFile,
+    StudyPlan,
+    Suite,
+    SuiteFile,
+    TeamSpec,
+    catalogue,
+)
+from sme_registry.spec.envelope import Envelope
+from sme_registry.spec.protocol import EvaluationProtocol
+from sme_registry.spec.resolve import known_specs
+from sme_registry.terminal import out, print_json, print_pairs, table
+
+
+class Schema(enum.StrEnum):
+    """The document whose JSON Schema `sme show --json-schema` prints."""
+
+    spec = "spec"
+    env_file = "env-file"
+    suite = "suite"
+    suite_file = "suite-file"
+    protocol = "protocol"
+    protocol_file = "protocol-file"
+    study = "study"
+    study_file = "study-file"
+
+
+_SCHEMAS: dict[Schema, type[BaseModel]] = {
+    Schema.spec: SMESpec,
+    Schema.env_file: EnvFile,
+    Schema.suite: Suite,
+    Schema.suite_file: SuiteFile,
+    Schema.protocol: EvaluationProtocol,
+    Schema.protocol_file: ProtocolFile,
+    Schema.study: StudyPlan,
+    Schema.study_file: StudyFile,
+}
+_SHORT = len("sha256:") + 12  # characters of a digest that name a task
+
+
+def show(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME|PATH|DIGEST", help="What to show.")
+    ] = None,
+    json: Json = False,
+    json_schema: Annotated[
+        Schema | None,
+        typer.Option("--json-schema", help="Print the JSON Schema of a kind of document instead."),
+    ] = None,
+    digests: Annotated[
+        bool,
+        typer.Option("--digests", help="Print only the digests of a suite's tasks, one per line."),
+    ] = False,
+) -> None:
+    """Show a task, suite, protocol or study plan: its fields, its digest, and derived facts.
+
+    For a suite, it lists the task of each class and seed; `sme train` takes their digests.
+
+    Examples:
+
+      sme show Default
+
+      sme show mine.json --json
+
+      sme show sha256:66e9b7a9a266
+
+      for task in $(sme show smoke --digests); do sme train $task; done
+
+      sme show --json-schema env-file > env-file.schema.json
+    """
+    if json_schema is not None:
+        if name is not None:
+            raise OptionError(f"{name!r}: --json-schema takes no name. Give one or the other.")
+        schema = _SCHEMAS[json_schema].model_json_schema()
+        print_json({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema})
+        return
+    if name is None:
+        raise OptionError("Give a name, a path or a digest, as in `sme show Default`.")
+    document = find_any(name)
+    if digests and (json or not isinstance(document, SuiteFile)):
+        raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
+    if isinstance(document, SMESpec | EnvFile):
+        _show_task(document, json)
+    elif isinstance(document, SuiteFile):
+        if digests:
+            tasks = document.suite.instances
+            out().print("\n".join(spec.digest for spec in tasks), soft_wrap=True)
+        else:
+            _show_suite(document, json)
+    elif json:
+        print_json(document.to_dict())
+    elif isinstance(document, StudyFile):
+        out().print(study_table([document]))
+        out().print(f"{document.digest}\nTo see its runs and times: sme study plan {escape(name)}")
+    elif isinstance(document, ProtocolFile):
+        fields = {**document.protocol.to_dict(), "digest": document.digest}
+        print_pairs(_title(document), fields)
+
+
+def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
+    spec = document if isinstance(document, SMESpec) else document.spec
+    facts = _facts(spec)
+    agents = _agents(spec)
+    if json:
+        if agents:
+            facts["agents"] = agents
+        head = {} if isinstance(document, SMESpec) else summary(document)
+        print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": facts})
+        return
+    fields = spec.to_dict()
+    if spec.team is not None:
+        fields["team"] = _team_summary(spec.team)
+    print_pairs(spec.content_name if isinstance(document, SMESpec) else _title(document), fields)
+    if agents:
+        out().print()
+        out().print(_agents_table(agents))
+    out().print()
+    print_pairs("Derived", {"digest": spec.digest, **facts})
+
+
+def _facts(spec: SMESpec) -> dict[str, Any]:
+    """What follows from a spec without drawing its task."""
+    from sme_registry.task.memory import parameter_bytes
+
+    facts: dict[str, Any] = {
+        "id": _env_id(spec),
+        **_spaces(spec),
+        "parameters": parameter_bytes(spec) // 8,
+        "parameter_memory_bytes": parameter_bytes(spec),
+        "largest_return": spec.horizon,  # of each agent in a team
+        "payouts_in_a_full_episode": math.ceil(spec.horizon / spec.k),
+        "largest_payout": min(spec.k, spec.horizon),
+    }
+    if spec.D > 0:
+        facts["episode_ends_below_step_reward"] = max(spec.D, spec.r_min)
+    return facts
+
+
+def _env_id(spec: SMESpec) -> str:
+    """The environment's id: its released name, or its name by content."""
+    from sme_registry.envs.naming import content_id
+
+    title = catalogue.title(spec)
+    return content_id(spec) if title.endswith(spec.content_name) else title
+
+
+def _spaces(spec: SMESpec) -> dict[str, str]:
+    """Descriptions of the observation and action spaces."""
+    if spec.team is None:
+        return {
+            "observation": f"[{spec.state_dim + 2}] float32 in [0, 1]: state, t/T, r_cum/k",
+            "action": f"[{spec.action_dim}] float32 in [0, 1]",
+        }
+    n, widest = len(spec.team.agents), max(agent.action_dim for agent in spec.team.agents)
+    return {
+        "observation": "per agent, float32 in [0, 1]: its state channels, t/T, its r_cum/k",
+        "action": "per agent, float32 in [0, 1]: its action channels",
+        "shared_observation": f"[{spec.state_dim + 2 + n}] for one policy shared by all agents: "
+        "state with unobserved channels set to 0, t/T, the agent's r_cum/k, its one-hot index",
+        "shared_action": f"[{widest}]; an agent uses as many channels as it owns",
+    }
+
+
+def _team_summary(team: TeamSpec) -> str:
+    n = len(team.agents)
+    return f"{n} agent{'s' * (n > 1)}, {team.reward} reward"
+
+
+def _agents(spec: SMESpec) -> list[dict[str, Any]]:
+    """Each agent's action channels, observed channels and reward; empty without a team."""
+    if spec.team is None:
+        return []
+    agents, first = [], 0
+    for agent in spec.team.agents:
+        observed = range(spec.state_dim) if agent.observes == "all" else agent.observes
+        agents.append(
+            {
+                "name": agent.name,
+                "action_channels": list(range(first, first + agent.action_dim)),
+                "observed_channels": list(observed),
+                "observation_dim": len(observed) + 2,
+                "rewarded_for": "all channels" if spec.team.reward == "team" else "own channels",
+            }
+        )
+        first += agent.action_dim
+    return agents
+
+
+def _agents_table(agents: list[dict[str, Any]]) -> Table:
+    wrapped = ("action channels", "observed state channels", "observation", "rewarded for")
+    result = table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")})
+    for agent in agents:
+        result.add_row(
+            escape(agent["name"]),
+            _ranges(agent["action_channels"]),
+            _ranges(agent["observed_channels"]),
+            escape(f"[{agent['observation_dim']}]"),
+            agent["rewarded_for"],
+        )
+    return result
+
+
+def _ranges(channels: list[int]) -> str:
+    """Increasing channels as ranges: `0–3, 6`."""
+    runs: list[list[int]] = []
+    for channel in channels:
+        if runs and channel == runs[-1][-1] + 1:
+            runs[-1].append(channel)
+        else:
+            runs.append([channel])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+
+
+def _show_suite(file: SuiteFile, json: bool) -> None:
+    if json:
+        instances = [
+            {"class": member.name, "seed": spec.to_dict()["seed"], "digest": spec.digest}
+            for member in file.suite.classes
+            for spec in member.instances
+        ]
+        print_json({**file.to_dict(), "derived": {"instances": instances}})
+        return
+    default = SMESpec().to_dict()
+    columns = {"class": "name", "differs from the default in": "text", "seed": "number"}
+    result = table(_title(file), {**columns, "task": "name"}, caption=file.digest)
+    for member in file.suite.classes:
+        changed = {k: v for k, v in member.setting.to_dict().items() if v != default[k]}
+        if member.setting.team is not None:
+            changed["team"] = _team_summary(member.setting.team)
+        result.add_row(
+            member.name,
+            escape(", ".join(f"{k}={v}" for k, v in changed.items())),
+            "\n".join(str(seed) for seed in member.seeds),
+            "\n".join(spec.digest[:_SHORT] for spec in member.instances),
+        )
+    out().print(result)
+    first = file.suite.instances[0].digest
+    if first in known_specs():  # tasks of a file outside the catalogue have no name to train by
+        out().print(f"To train on a task: sme train {first[:_SHORT]}", soft_wrap=True)
+
+
+def _title(file: Envelope) -> str:
+    return f"[bold]{file.versioned_name}[/]  {escape(file.description)}"

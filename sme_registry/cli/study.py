@@ -1,0 +1,259 @@
+"""`sme study`: plan, run, inspect and report studies."""
+
+from __future__ import annotations
+
+import enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli import study_new, study_plan
+from sme_registry.cli.arguments import Json
+from sme_registry.cli.study_plan import (
+    Evaluations,
+    Jobs,
+    Only,
+    Seeds,
+    Steps,
+    find_plan,
+    scaled_plan,
+    unique,
+)
+from sme_registry.errors import OptionError
+from sme_registry.terminal import duration_range, err, out, print_json, table
+
+if TYPE_CHECKING:
+    from sme_registry.studies.engine.status import CellStatus, StudyStatus
+
+_FAILURES_SHOWN = 20
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="""Studies: algorithms × classes of tasks × seeds, resumable, on a laptop or a cluster.
+
+    Examples:
+
+      sme study run smoke --folder runs/smoke
+
+      sme study plan paper-ablations --cores 64
+
+      sme study status runs/smoke
+
+      sme study report runs/smoke
+    """,
+)
+app.command("new")(study_new.new)
+app.command("plan")(study_plan.plan)
+
+
+class ExecutorName(enum.StrEnum):
+    """Where cells run."""
+
+    processes = "processes"
+    in_process = "in-process"
+    ray = "ray"
+
+
+@app.command("run")
+def run(
+    plan: Annotated[
+        str, typer.Argument(metavar="PLAN", help="A name from `sme study plan`, or a path.")
+    ],
+    folder: Annotated[
+        Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")
+    ],
+    executor: Annotated[
+        ExecutorName | None, typer.Option(help="Default processes; with --ray, ray.")
+    ] = None,
+    jobs: Jobs = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="local|ADDRESS", help="Run on Ray, started here or at host:port."),
+    ] = None,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Also run the cells that failed before.")
+    ] = False,
+    keep_models: Annotated[
+        bool,
+        typer.Option("--keep-models", help="Keep the models trained now, in FOLDER/models."),
+    ] = False,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    only: Only = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the final status as JSON.")] = False,
+) -> None:
+    """Run the cells of a plan that have no result in the folder.
+
+    A cell is one run: an algorithm, a class and a seed. Stop the study at any time, even with
+    kill -9, and run the same command to continue: only the cells that were running start again.
+    Several commands may share a folder, also from several machines, and divide the cells. With
+    another plan, or other --steps, --seeds or --evaluations, cells with the same content are
+    reused. Failed cells are listed; --retry runs them again.
+
+    A cluster needs this package and Ray in the same versions on every node, and no shared folder.
+
+    Examples:
+
+      sme study run smoke --folder runs/smoke
+
+      sme study run paper-ablations -f runs/k --only "class=k-*" --only class=default --seeds 3
+
+      sme study run paper-ablations -f runs/short --steps 20000 --steps PPO=100000 --jobs 8
+
+      sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
+    """
+    from sme_registry.studies.engine.runner import run_study
+
+    if ray is not None and executor not in (None, ExecutorName.ray):
+        raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
+    status = run_study(
+        scaled_plan(find_plan(plan), steps, seeds, evaluations),
+        folder,
+        executor=executor or ("processes" if ray is None else "ray"),
+        jobs=jobs,
+        ray=ray or "local",
+        retry_failed=retry,
+        keep_models=keep_models,
+        only=only or (),
+        console=err(),
+    )
+    if json:
+        print_json(status.to_dict())
+    else:
+        _print_status(status)
+    if status.failed:
+        err().print(
+            f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] Add --retry "
+            "to run them again.",
+            soft_wrap=True,
+        )
+        raise typer.Exit(1)
+
+
+@app.command("status")
+def status(
+    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    only: Only = None,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    json: Json = False,
+) -> None:
+    """Show how many cells are done, running, failed and waiting, and the time left.
+
+    It changes nothing and may be used while the study runs. --steps, --seeds and --evaluations
+    show the status of the plan with these budgets.
+
+    Examples:
+
+      sme study status runs/smoke
+
+      sme study status runs/all --only "class=k-*" --json
+    """
+    from sme_registry.studies.engine.status import study_status
+
+    result = study_status(
+        folder, only or (), lambda file: scaled_plan(file, steps, seeds, evaluations)
+    )
+    if json:
+        print_json(result.to_dict())
+    else:
+        _print_status(result)
+
+
+@app.command("report")
+def report(
+    folder: Annotated[Path, typer.Argument(help="The study's folder.")],
+    out_folder: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output folder; default FOLDER/report.")
+    ] = None,
+    formats: Annotated[
+        str,
+        typer.Option("--format", metavar="FORMATS", help="Any of these, separated by commas."),
+    ] = "html,png,pdf,csv,latex",
+) -> None:
+    """Report which property of the task breaks an algorithm, and how certain that is.
+
+    It writes a self-contained page index.html, the figures as PNG and PDF, every number as CSV, and
+    LaTeX tables. It uses the cells finished so far, so it may be run during the study.
+
+    Maps of tasks with two state channels need the models kept by `sme study run --keep-models`.
+    Loading a model can run code: use only models whose author you trust.
+
+    Examples:
+
+      sme study report runs/smoke
+
+      sme study report runs/all --out paper/study --format pdf,latex
+    """
+    from sme_registry.studies import write_report
+
+    chosen = [name.strip() for name in formats.split(",") if name.strip()]
+    files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)))
+    others = [path for path in files if path.name != "index.html"]
+    for path in files:
+        if path.name == "index.html":
+            out().print(escape(str(path)), soft_wrap=True)
+    for parent in dict.fromkeys(path.parent for path in others):
+        count = sum(path.parent == parent for path in others)
+        out().print(f"{escape(str(parent))}  {count} files", soft_wrap=True)
+
+
+def _print_status(status: StudyStatus) -> None:
+    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.status import STATES
+
+    algorithms = unique(cell.planned.algorithm for cell in status.cells)
+    result = table(
+        f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}",
+        {"class": "name", **{escape(name): "number" for name in algorithms}},
+        caption="done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]",
+    )
+    counts = status.counts
+    for class_name in unique(cell.planned.class_name for cell in status.cells):
+        row = [counts.get((class_name, name)) for name in algorithms]
+        result.add_row(class_name, *("" if each is None else _counts(each) for each in row))
+    out().print(result)
+    parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
+    out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
+    if status.seconds_left.high > 0:
+        here = available_cores()
+        one = duration_range(*status.seconds_left)
+        all_here = duration_range(*(bound / here for bound in status.seconds_left))
+        out().print(f"Time left: {one} on one core, {all_here} on the {here} cores here")
+    if status.other_results:
+        out().print(f"[dim]{status.other_results:,} results in the folder belong to other plans[/]")
+    for cell in status.failed[:_FAILURES_SHOWN]:
+        _print_failure(status, cell)
+    if len(status.failed) > _FAILURES_SHOWN:
+        out().print(f"… and {len(status.failed) - _FAILURES_SHOWN} more; --json lists them all")
+
+
+def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
+    from sme_registry.studies.engine.ledger import Ledger
+    from sme_registry.studies.engine.status import label
+
+    failure = cell.failure
+    if failure is None:
+        return
+    times = f" ({failure.attempts} times)" if failure.attempts > 1 else ""
+    path = Ledger(status.folder).failure_path(failure.key).as_posix()
+    out().print(
+        f"[red]failed{times}[/] {escape(label(cell.planned))}: {escape(failure.error)}\n"
+        f"  [dim]{escape(path)}[/]",
+        soft_wrap=True,
+    )
+
+
+def _counts(counts: Any) -> str:
+    """`7 +2 !1 / 10`: done, running, failed, all."""
+    text = f"{counts['done']}"
+    if counts["running"]:
+        text += f" [cyan]+{counts['running']}[/]"
+    if counts["failed"]:
+        text += f" [red]!{counts['failed']}[/]"
+    return f"{text} [dim]/ {counts.total()}[/]"

@@ -1,0 +1,233 @@
+"""`sme study plan`: list plans, and estimate how long one takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from sme_registry.cli.arguments import Json
+from sme_registry.cli.list import study_table
+from sme_registry.errors import OptionError, SMEError
+from sme_registry.spec import PlannedCell, StudyFile, catalogue
+from sme_registry.spec.resolve import is_path
+from sme_registry.terminal import duration_range, err, out, print_json, table
+
+Steps = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--steps",
+        "-n",
+        metavar="N|ALGORITHM=N",
+        help="Steps of each training, or of one algorithm's. Repeatable.",
+    ),
+]
+Seeds = Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")]
+Evaluations = Annotated[int | None, typer.Option(help="Evaluations during each training.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND=GLOB",
+        help="Only cells that match class=GLOB or algorithm=GLOB. Repeatable: a cell must "
+        "match one pattern of each kind given.",
+    ),
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=1, help="Cells at once; default one per core.")
+]
+
+
+def plan(
+    plan: Annotated[
+        str | None,
+        typer.Argument(metavar="PLAN", help="A name or a path; without it, list the catalogue."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--folder", "-f", help="Use and count the results in this study's folder."),
+    ] = None,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Also estimate for a cluster with this many cores.")
+    ] = None,
+    jobs: Jobs = None,
+    steps: Steps = None,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    only: Only = None,
+    json: Json = False,
+) -> None:
+    """Show what a study runs and how long it takes, before anything runs.
+
+    Times come from finished cells of the same algorithm in --folder. Without any, they are a range
+    from a fast core to a slow one.
+
+    Examples:
+
+      sme study plan
+
+      sme study plan paper-ablations --cores 64
+
+      sme study plan paper-ablations --steps 20000 --seeds 3 --only algorithm=PPO --only "class=k-*"
+
+      sme study plan smoke --folder runs/smoke --json
+    """
+    from sme_registry.studies.engine.estimate import Estimator, Span, makespan
+    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.ledger import Ledger
+    from sme_registry.studies.engine.scaling import selected
+
+    if plan is None:
+        _list_plans(json)
+        return
+    file = scaled_plan(find_plan(plan), steps, seeds, evaluations)
+    planned = selected(file.plan.cells, only or ())
+    cells = {cell.cell.digest: cell.cell for cell in planned}
+    results = {} if folder is None else Ledger(folder).results()
+    warn_of_unavailable((cell.cell.uses for cell in planned), SMEError)
+    estimator = Estimator(results.values())
+    waiting = [cell for key, cell in cells.items() if key not in results]
+    spans = [estimator.seconds(cell) for cell in waiting]
+
+    def seconds(workers: int) -> Span:
+        return Span(*(makespan([span[i] for span in spans], workers) for i in (0, 1)))
+
+    here = jobs or available_cores()
+    times = {"one core": seconds(1), f"this machine, {here} at once": seconds(here)}
+    if cores is not None:
+        times[f"a cluster, {cores} cores"] = seconds(cores)
+    done = len(cells) - len(waiting)
+    if json:
+        print_json(
+            {
+                "study": file.versioned_name,
+                "digest": file.digest,
+                "cells": len(cells),
+                "done": done,
+                "classes": unique(cell.class_name for cell in planned),
+                "algorithms": unique(cell.algorithm for cell in planned),
+                "seeds": file.plan.seeds,
+                "estimated_from_results": sorted(
+                    {cell.uses for cell in waiting if estimator.knows(cell)}
+                ),
+                "seconds": [
+                    {"cores": n, **seconds(n)._asdict()}
+                    for n in dict.fromkeys([1, here, *([] if cores is None else [cores])])
+                ],
+            }
+        )
+        return
+    out().print(_plan_table(file, planned, estimator.seconds))
+    finished = f", {done:,} of them finished" if results else ""
+    out().print(f"{len(cells):,} cells{finished}. Estimated time:")
+    for place, span in times.items():
+        out().print(f"  {place + ':':32}{duration_range(*span)}")
+    unmeasured = sorted({cell.uses for cell in waiting if not estimator.knows(cell)})
+    if unmeasured:
+        out().print(
+            f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]",
+            soft_wrap=True,
+        )
+
+
+def _list_plans(json: bool) -> None:
+    files = catalogue.entries(StudyFile)
+    if not json:
+        out().print(study_table(files))
+        return
+    print_json(
+        [
+            {
+                "name": file.versioned_name,
+                "digest": file.digest,
+                "cells": len(file.plan.cells),
+                "description": file.description,
+            }
+            for file in files
+        ]
+    )
+
+
+def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:
+    classes = unique(cell.class_name for cell in planned)
+    numbers = ("classes", "runs each", "steps", "evaluations", "cells", "time per run")
+    result = table(
+        f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
+        {"algorithm": "name", **dict.fromkeys(numbers, "number")},
+        caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
+    )
+    for name in unique(cell.algorithm for cell in planned):
+        cells = [cell for cell in planned if cell.algorithm == name]
+        first = cells[0].cell
+        spans = [seconds(each.cell) for each in cells]
+        result.add_row(
+            escape(name),
+            str(len({each.class_name for each in cells})),
+            str(len({each.run for each in cells})),
+            f"{first.steps:,}",
+            f"{first.evaluations:,} × {first.evaluation_episodes}",
+            f"{len(cells):,}",
+            duration_range(min(span.low for span in spans), max(span.high for span in spans)),
+        )
+    return result
+
+
+def find_plan(name: str) -> StudyFile:
+    """A plan by its name or path.
+
+    Raises:
+      UnknownNameError, SpecError: there is none, or it is not a valid plan.
+    """
+    return StudyFile.read(name) if is_path(name) else catalogue.find(StudyFile, name)
+
+
+def scaled_plan(
+    file: StudyFile, steps: list[str] | None, seeds: int | None, evaluations: int | None
+) -> StudyFile:
+    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`.
+
+    Raises:
+      OptionError: `--steps` is not a number, or is given twice for an algorithm.
+      UnknownNameError, SpecError: see `scaling.scaled`.
+    """
+    from sme_registry.studies.engine.scaling import scaled
+
+    budgets: dict[str, int] = {}
+    for text in steps or ():
+        name, _, number = text.rpartition("=")
+        if not number.replace("_", "").isdigit():
+            raise OptionError(
+                f"--steps {text!r}: must be N or ALGORITHM=N, such as --steps PPO=100000."
+            )
+        if name in budgets:
+            raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
+        budgets[name] = int(number)
+    every = budgets.pop("", None)
+    return scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
+
+
+def warn_of_unavailable(uses: Iterable[str], errors: type[SMEError]) -> None:
+    """Warn about the algorithms of a plan that cannot run here.
+
+    Args:
+      uses: of the plan's algorithms.
+      errors: those that become a warning; others are raised.
+    """
+    from sme_registry.studies.engine.cell import refuse_unknown_algorithm
+
+    messages: dict[str, None] = {}
+    for name in dict.fromkeys(uses):
+        try:
+            refuse_unknown_algorithm(name)
+        except errors as error:
+            messages[str(error)] = None  # one message for several algorithms is printed once
+    for message in messages:
+        err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
+
+
+def unique(values: Iterable[str]) -> list[str]:
+    """The different values, in order of appearance."""
+    return list(dict.fromkeys(values))
