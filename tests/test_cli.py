@@ -662,7 +662,7 @@ class TestDemo:
         assert "Mean regret during training" in result.stdout
         again = sme("demo", "--quick", "--out", "demo")
         assert again.exit_code == 2
-        assert "error: folder='demo': holds a finished run" in again.stderr
+        assert "demo: contains a finished run" in again.stderr
 
 
 def test_the_installed_command_answers_in_pure_json_on_standard_output() -> None:
