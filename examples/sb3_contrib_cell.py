@@ -1,17 +1,17 @@
-"""Put an algorithm that is not in Stable-Baselines3 itself beside one that is, in a study's cells.
+"""Compare algorithms from other packages with Stable-Baselines3's, as cells of a study.
 
     pip install 'sme-registry[fast,train]' sb3-contrib
     python examples/sb3_contrib_cell.py --env Default --steps 8192 --seeds 0 1 2
 
-An algorithm of a study is named by `uses`. A class of Stable-Baselines3's kind is named as it is,
-here `sb3_contrib:TRPO`. Where it needs what JSON cannot say, name a function that makes the
-learner, here `sb3_contrib_cell:wide_trpo` of this very file. In a plan, for `sme study run` in this
-folder, the same reads
+The field `uses` names the algorithm of a cell. It can be a class with the interface of
+Stable-Baselines3, such as `sb3_contrib:TRPO`, or a function that creates the learner, such as
+`sb3_contrib_cell:wide_trpo` in this file, for settings that JSON cannot express. In a study plan,
+for `sme study run` in this folder, write
 
     {"name": "TRPO", "uses": "sb3_contrib:TRPO"}
     {"name": "TRPO (wide)", "uses": "sb3_contrib_cell:wide_trpo", "hyperparameters": {"width": 128}}
 
-and `sme study new PLAN.json --from EDITED.json` makes a plan of a file that was edited so.
+After editing a plan, run `sme study new PLAN.json --from EDITED.json`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ import sys
 from typing import Any
 
 from sme_registry import SMEError, load
-from sme_registry.spec import EvaluationProtocol
-from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.cell import run_cell
+from sme_registry.spec import Cell, EvaluationProtocol
+from sme_registry.studies import run_cell
 
 ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
     "PPO": ("PPO", {}),
@@ -34,12 +33,12 @@ ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def wide_trpo(env: Any, *, seed: int, width: int) -> Any:
-    """TRPO with wider layers, and an activation function that only Python can name.
+    """TRPO with wider layers and ReLU, which is a Python class that JSON cannot express.
 
     Args:
-      env: the environment that the cell counts the steps of.
+      env: the environment, whose steps the cell counts.
       seed: of the cell.
-      width: of both hidden layers; from the cell's hyperparameters.
+      width: of both hidden layers, from the cell's hyperparameters.
     """
     import torch
     from sb3_contrib import TRPO
@@ -49,18 +48,18 @@ def wide_trpo(env: Any, *, seed: int, width: int) -> Any:
 
 
 def main() -> int:
-    """Run every algorithm under every seed, and say what each of them reached."""
+    """Run all algorithms with all seeds, and print their results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--env", default="Default", help="an environment's name, file or digest")
-    parser.add_argument("--steps", type=int, default=8192, help="of training, of each cell")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="a cell for each")
-    asked = parser.parse_args()
-    if asked.steps < 1:
+    parser.add_argument("--env", default="Default", help="a task: an id, a path or a digest")
+    parser.add_argument("--steps", type=int, default=8192, help="training steps of each cell")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="one cell for each")
+    arguments = parser.parse_args()
+    if arguments.steps < 1:
         parser.error("--steps must be at least 1")
     try:
-        spec = load(asked.env)
+        spec = load(arguments.env)
         print(f"{'algorithm':12}{'seed':>5}{'return':>9}{'regret':>9}{'WD r̃':>8}{'steps/s':>9}")
-        for seed in asked.seeds:
+        for seed in arguments.seeds:
             for name, (uses, hyperparameters) in ALGORITHMS.items():
                 cell = Cell(
                     spec=spec,
@@ -68,17 +67,17 @@ def main() -> int:
                     hyperparameters=hyperparameters,
                     action_range="symmetric",
                     seed=seed,
-                    steps=asked.steps,
+                    steps=arguments.steps,
                     evaluations=4,
                     evaluation_episodes=20,
                     protocol=EvaluationProtocol(states_per_region=5000),
                 )
-                done = run_cell(cell)
-                online = "" if done.online_regret is None else f"{done.online_regret:.3f}"
-                rate = done.timing.steps_per_second
+                result = run_cell(cell)
+                online = "" if result.online_regret is None else f"{result.online_regret:.3f}"
+                rate = result.timing.steps_per_second
                 print(
-                    f"{name:12}{seed:5}{done.curve.episode_return[-1]:9.1f}{online:>9}"
-                    f"{done.report.regions[0].similarity:8.3f}{f'{rate:,.0f}' if rate else '':>9}"
+                    f"{name:12}{seed:5}{result.curve.episode_return[-1]:9.1f}{online:>9}"
+                    f"{result.report.regions[0].similarity:8.3f}{f'{rate:,.0f}' if rate else '':>9}"
                 )
     except SMEError as error:
         print(error, file=sys.stderr)

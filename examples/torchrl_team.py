@@ -1,16 +1,16 @@
-"""Train a team with TorchRL, and see what each of its agents still loses, exactly.
+"""Train a team with TorchRL, and print the exact regret of each agent.
 
     pip install torchrl 'sme-registry[fast]'
     python examples/torchrl_team.py --env Team4 --seeds 0
 
-`make_parallel` gives a PettingZoo environment and TorchRL's `PettingZooWrapper` takes it as it is.
-The rest is TorchRL's own multi-agent PPO: an actor for each agent, critics that see what all
-agents see (MAPPO), its collector and its loss. Two things are particular to these tasks:
+`make_parallel` returns a PettingZoo environment, which TorchRL's `PettingZooWrapper` accepts
+directly. The rest is TorchRL's multi-agent PPO: an actor for each agent, critics that see all
+observations (MAPPO), a collector and a loss. Two details are specific to these tasks:
 
-- Each agent has its own network (`share_params=False`). In Team4 all agents observe the same and
-  should act differently, so a shared network would need the agent's index among its inputs.
-- The wrapper keeps only those infos that are there at reset, where this environment's are empty.
-  So it hands out the state (`return_state=True`), and the task says what actions lost in it.
+- Each agent has its own network (`share_params=False`). In Team4 all agents have the same
+  observations and different optimal actions, so a shared network would also need the agent's index.
+- The wrapper keeps only the infos present at reset, which are empty here. With `return_state=True`
+  it returns the state instead, from which the task computes the regret of the actions.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ else:
     missing = None
 
 ENVS, ROLLOUT, EPOCHS, MINIBATCH = 8, 128, 10, 256
-GROUP = "team"  # the wrapper stacks the agents of a group: [..., agent, channel]
+GROUP = "team"  # the wrapper stacks the agents of a group, [..., agent, channel]
 
 
 def make(spec: sme_registry.SMESpec) -> PettingZooWrapper:
-    """The team as a TorchRL environment, its agents stacked in one group."""
+    """The team as a TorchRL environment, with its agents stacked in one group."""
     team = sme_registry.make_parallel(spec)
     return PettingZooWrapper(team, return_state=True, group_map={GROUP: team.possible_agents})
 
 
 def regret(task: sme_registry.Task, steps: TensorDict) -> np.ndarray:
-    """Each agent's mean regret, `[n]` in [0, 1]: of its own channels, whatever it is paid for."""
+    """Mean regret `[n]` in [0, 1] of each agent on its own channels, even if the team is paid."""
     states = steps["state"].flatten(0, -2).numpy()
     actions = steps[GROUP, "action"].flatten(-2).flatten(0, -2).numpy()
     similarities = task.similarities_of(actions, task.optimal_action(states))
@@ -60,7 +60,7 @@ def regret(task: sme_registry.Task, steps: TensorDict) -> np.ndarray:
 def networks(
     task: sme_registry.Task, envs: SerialEnv
 ) -> tuple[ProbabilisticActor, TensorDictModule]:
-    """An actor for each agent on what it sees, and a critic for each on what all see."""
+    """An actor for each agent on its observation, and a critic on all observations."""
     sizes = {"n_agents": len(task.names), "share_params": False, "num_cells": 64, "depth": 2}
     inputs, outputs = len(task.observed[0]) + 2, task.owned[0].stop
     actor = ProbabilisticActor(
@@ -88,10 +88,10 @@ def networks(
 
 
 def train(spec: sme_registry.SMESpec, seed: int, steps: int) -> None:
-    """Train for so many team steps; print each agent's regret on the way, before and after."""
+    """Train for a number of team steps; print each agent's regret before, during and after."""
     torch.manual_seed(seed)
     task = sme_registry.materialize(spec)
-    envs, judges = (SerialEnv(ENVS, lambda: make(spec)) for _ in range(2))
+    envs, evaluation_envs = (SerialEnv(ENVS, lambda: make(spec)) for _ in range(2))
     envs.set_seed(seed)
     actor, critic = networks(task, envs)
     loss = ClipPPOLoss(
@@ -99,60 +99,60 @@ def train(spec: sme_registry.SMESpec, seed: int, steps: int) -> None:
         critic,
         entropy_coeff=0.0,
         normalize_advantage=True,
-        normalize_advantage_exclude_dims=(-2,),  # each agent by itself
+        normalize_advantage_exclude_dims=(-2,),  # for each agent separately
     )
     loss.set_keys(
         **{key: (GROUP, key) for key in ("reward", "action", "done", "terminated")},
         value=(GROUP, "state_value"),
         sample_log_prob=(GROUP, "action_log_prob"),
     )
-    # With k = 1 and D = 0 the optimum earns 1 in every state, so that a step's own reward says
-    # most of what there is to know; a short horizon spares the rest. Larger k or D need a longer.
+    # With k = 1 and D = 0 the optimum earns 1 in every state, so a short horizon is enough: the
+    # reward of a step measures its action. Larger k or D need a longer horizon.
     loss.make_value_estimator(ValueEstimators.GAE, gamma=0.5, lmbda=0.9)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
 
-    def row(label: str, steps_taken: TensorDict) -> None:
+    def print_row(label: str, steps_taken: TensorDict) -> None:
         values = regret(task, steps_taken)
         print(f"{label:>20}" + "".join(f"{value:10.3f}" for value in values), flush=True)
 
     def episodes_of_mean_actions() -> TensorDict:
-        judges.set_seed(seed)  # from the same states each time
+        evaluation_envs.set_seed(seed)  # always from the same states
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            return judges.rollout(spec.horizon, actor)
+            return evaluation_envs.rollout(spec.horizon, actor)
 
     print(f"seed {seed}: regret of each agent, 0 at its optimum")
     print(f"{'team steps':>20}" + "".join(f"{name:>10}" for name in task.names))
-    row("0, mean actions", episodes_of_mean_actions())
-    begun, done = time.perf_counter(), 0
+    print_row("0, mean actions", episodes_of_mean_actions())
+    start, done = time.perf_counter(), 0
     batches = max(1, steps // (ENVS * ROLLOUT))
     collector = Collector(
         envs,
         actor,
         frames_per_batch=ENVS * ROLLOUT,
         total_frames=batches * ENVS * ROLLOUT,
-        auto_register_policy_transforms=False,  # nothing here is recurrent
+        auto_register_policy_transforms=False,  # no recurrent networks
     )
     for batch in collector:
         with torch.no_grad():
             loss.value_estimator(batch)
         flat = batch.reshape(-1)
         for _ in range(EPOCHS):
-            for chosen in torch.randperm(len(flat)).split(MINIBATCH):
-                losses = loss(flat[chosen])
+            for indices in torch.randperm(len(flat)).split(MINIBATCH):
+                losses = loss(flat[indices])
                 optimiser.zero_grad()
                 (losses["loss_objective"] + losses["loss_critic"]).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimiser.step()
         done += len(flat)
-        row(f"{done}, exploring", batch)
-    seconds = time.perf_counter() - begun
-    row(f"{done}, mean actions", episodes_of_mean_actions())
-    judges.close()
+        print_row(f"{done}, exploring", batch)
+    seconds = time.perf_counter() - start
+    print_row(f"{done}, mean actions", episodes_of_mean_actions())
+    evaluation_envs.close()
     print(f"{seconds:.0f} s, {done / seconds:.0f} team steps per second, training included\n")
 
 
 def main() -> None:
-    """The command line."""
+    """Run the example from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="Team4", help="a team: an id, a path or a digest")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="one training for each")
@@ -171,11 +171,12 @@ def main() -> None:
     owned = {own.stop - own.start for own in task.owned}
     if len(observed) > 1 or len(owned) > 1:
         parser.error(
-            f"--env {arguments.env}: its agents differ in what they observe or own, and one stack "
-            "holds equals. Give each its own group (MarlGroupMapType.ONE_GROUP_PER_AGENT)."
+            f"--env {arguments.env}: its agents observe or own different numbers of channels, "
+            "so they cannot be stacked. Use one group for each agent "
+            "(MarlGroupMapType.ONE_GROUP_PER_AGENT)."
         )
     warnings.filterwarnings("ignore", message="PettingZoo in TorchRL is tested using version")
-    torch.set_num_threads(1)  # networks this small lose more to waiting than they gain
+    torch.set_num_threads(1)  # networks this small are slower on several threads
     for seed in arguments.seeds:
         train(spec, seed, arguments.steps)
 

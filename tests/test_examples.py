@@ -1,4 +1,4 @@
-"""The examples say what they do, and what they lack, whether or not their library is installed."""
+"""The examples run, and name the packages that they lack."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-# As on a machine without TorchRL: None in sys.modules makes an import fail as an absent module.
+# None in sys.modules makes an import fail as if TorchRL were not installed.
 WITHOUT_TORCHRL = (
     "import runpy, sys; sys.modules['tensordict'] = sys.modules['torchrl'] = None; "
     "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
@@ -28,26 +28,26 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
-def test_an_example_explains_itself_without_its_library(example: Path) -> None:
+def test_help_works_without_optional_packages(example: Path) -> None:
     done = run("-c", WITHOUT_TORCHRL, example, "--help")
     assert done.returncode == 0, done.stderr
     assert "--seeds" in done.stdout
 
 
-def test_without_torchrl_its_example_names_what_to_install() -> None:
+def test_a_missing_torchrl_is_named_with_the_command_that_installs_it() -> None:
     done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py")
     assert done.returncode == 2
     assert "tensordict is not installed. Run `pip install torchrl`." in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_the_torchrl_example_refuses_bad_options_before_all_else() -> None:
+def test_the_torchrl_example_rejects_invalid_options_first() -> None:
     done = run("-c", WITHOUT_TORCHRL, ROOT / "examples" / "torchrl_team.py", "--steps", "0")
     assert done.returncode == 2
     assert "--steps must be at least 1" in done.stderr
 
 
-def test_the_torchrl_example_trains_where_torchrl_is_installed() -> None:
+def test_the_torchrl_example_trains() -> None:
     pytest.importorskip("torchrl")
     done = run(ROOT / "examples" / "torchrl_team.py", "--env", "Team2", "--steps", "4096")
     assert done.returncode == 0, done.stderr
@@ -60,7 +60,7 @@ def test_the_torchrl_example_trains_where_torchrl_is_installed() -> None:
     assert all(end < 0.7 * start for start, end in zip(before, after, strict=True))
 
 
-def test_the_sb3_contrib_example_trains_all_it_names() -> None:
+def test_the_sb3_contrib_example_trains_all_algorithms() -> None:
     pytest.importorskip("sb3_contrib")
     done = run(ROOT / "examples" / "sb3_contrib_cell.py", "--env", "Plane1", "--steps", "64")
     assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ arrays = to_d3rlpy(dataset.transitions())
 """
 
 from sme_registry.datasets.arrays import Transitions, to_d3rlpy
+from sme_registry.datasets.collect import collect
 from sme_registry.datasets.make import make_dataset
 from sme_registry.datasets.recipe import Behaviour, DatasetRecipe
 from sme_registry.datasets.record import DatasetRecord
@@ -27,6 +28,7 @@ __all__ = [
     "ExactReturn",
     "Transitions",
     "check_location",
+    "collect",
     "datasets_folder",
     "exact_return",
     "list_datasets",

@@ -13,6 +13,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sme_registry.studies.engine.cell import run_cell
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
     from sme_registry.studies.engine.status import StudyStatus, study_status
@@ -24,6 +25,7 @@ __all__ = [
     "StudyFrames",
     "StudyStatus",
     "load",
+    "run_cell",
     "run_study",
     "study_status",
     "write_report",
@@ -34,6 +36,7 @@ _LAZY = {
     "StudyFrames": "report.frames",
     "StudyStatus": "engine.status",
     "load": "report.frames",
+    "run_cell": "engine.cell",
     "run_study": "engine.runner",
     "study_status": "engine.status",
     "write_report": "report.write",
