@@ -1,7 +1,7 @@
 """`Engine`: the step of a task, by machine code where Numba is installed, else by NumPy.
 
-Both have the same functions with the same arguments (those of `kernels`), so that an environment
-does not know which it has. States are bit-equal between them; oracle and rewards to 1e-12.
+Both have the same functions with the same arguments, so an environment works with either. States
+are bit-equal between them; oracle and rewards agree to 1e-12.
 """
 
 from __future__ import annotations
@@ -12,11 +12,19 @@ import os
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    REGRET,
+    REWARD,
+    ROWS,
+    SIMILARITY,
+    STEP_REWARD,
+)
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array
@@ -26,7 +34,43 @@ BACKEND_VARIABLE = "SME_BACKEND"
 _SMALL = 8192  # numbers of a packed task that each lane may hold a copy of: 64 KiB
 _ROWS = 4096  # states per block of the oracle: 2 MiB a layer at the default width
 
-_StepOne = Callable[..., tuple[float, ...]]
+Observation: TypeAlias = npt.NDArray[np.float32]
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+
+class StepLane(Protocol):
+    """One step of one lane of a single agent; see `kernels.step_lane`."""
+
+    def __call__(
+        self, buffer: Array, action: npt.NDArray[Any], optimal: Array, observation: Observation, /
+    ) -> tuple[float, float, float, float, float, float]:
+        """Advance `buffer`, and write `optimal` `[A]` and `observation` `[S + 2]`.
+
+        Returns:
+          Similarity, step reward, regret, reward, r_cum, and the end: 1 for terminated plus 2 for
+          truncated, or −1 where the action was refused and nothing has moved.
+        """
+        ...
+
+
+class StepMany(Protocol):
+    """One step of `B` lanes of a team of n agents; see `kernels.step_many`."""
+
+    def __call__(
+        self,
+        s: Array,
+        t: npt.NDArray[np.int64],
+        accumulated: Array,
+        action: Array,
+        moved: Array,
+        observation: Observation,
+        optimal: Array,
+        values: Array,
+        ends: Mask,
+        /,
+    ) -> bool:
+        """Advance `t` and `accumulated`, write what follows `action`; False: action refused."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +79,19 @@ class Engine:
 
     Attributes:
       backend: what runs it, "numba" or "numpy".
-      params: the first argument of `step_many`.
-      new_lane: makes what a single lane needs, at t = 0: a buffer to pass to the step, and the
-        view of it that holds t, r_cum and s, `[2 + S]`.
-      step_float32: `(buffer, action [A] float32, optimal, observation)`, one step of one lane.
-      step_float64: the same for a float64 action.
-      step_many: one step of a batch of lanes, as `kernels.step_many`.
+      new_lane: makes a buffer for a single lane at t = 0, to pass to its steps, and the view of
+        that buffer that holds t, r_cum and s, `[2 + S]`.
+      step_float32: one step of one lane, for float32 actions.
+      step_float64: the same for float64 actions.
+      step_many: one step of a batch of lanes.
       optimal_action: π* of `[B, S]` states, any number of them, in blocks.
     """
 
     backend: Backend
-    params: Any
     new_lane: Callable[[], tuple[Array, Array]]
-    step_float32: _StepOne
-    step_float64: _StepOne
-    step_many: Callable[..., bool]
+    step_float32: StepLane
+    step_float64: StepLane
+    step_many: StepMany
     optimal_action: Callable[[Array], Array]
 
 
@@ -111,7 +153,7 @@ def _numba_engine(task: Task) -> Engine:
     # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
     # must be given arrays of exactly these types and dimensions.
     packed = _packed[task]
-    steps: list[_StepOne]
+    steps: list[StepLane]
     if packed.size <= _SMALL:
         prefix = packed
         signatures = kernels.PACKED_LANE_FLOAT32, kernels.PACKED_LANE_FLOAT64
@@ -126,8 +168,8 @@ def _numba_engine(task: Task) -> Engine:
         buffer = np.concatenate([prefix, np.zeros(kernels.lane_size(packed))])
         return buffer, buffer[prefix.size : prefix.size + 2 + task.spec.state_dim]
 
-    step_many = kernels.step_many.get_overload(kernels.STEP_MANY)
-    return Engine("numba", packed, new_lane, steps[0], steps[1], step_many, optimal_action)
+    step_many = functools.partial(kernels.step_many.get_overload(kernels.STEP_MANY), packed)
+    return Engine("numba", new_lane, steps[0], steps[1], step_many, optimal_action)
 
 
 def _numpy_engine(task: Task) -> Engine:
@@ -141,33 +183,32 @@ def _numpy_engine(task: Task) -> Engine:
         lane: Array,
         action: npt.NDArray[Any],
         optimal: Array,
-        observation: npt.NDArray[np.float32],
-    ) -> tuple[float, ...]:
-        rewards, ends = np.empty((5, 1, 1)), np.empty((2, 1), dtype=bool)
+        observation: Observation,
+    ) -> tuple[float, float, float, float, float, float]:
+        values, ends = np.empty((ROWS, 1, 1)), np.empty((2, 1), dtype=bool)
         s, moved = lane[2:, None], np.empty((S, 1))
         t = lane[:1].astype(np.int64)
         if action.size != task.spec.action_dim or not step_many(
-            None, s, t, lane[1:2, None], action.astype(np.float64)[None], moved,
-            observation[None], optimal[None], rewards, ends,
+            s, t, lane[1:2, None], action.astype(np.float64)[None], moved,
+            observation[None], optimal[None], values, ends,
         ):  # fmt: skip
             return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
         lane[0] += 1.0
-        lane[1] = rewards[4, 0, 0]
         lane[2:] = moved[:, 0]
+        similarity, step_reward, regret, reward, accumulated = values[:, 0, 0].tolist()
         end = float(ends[0, 0] + 2 * ends[1, 0])
-        return (*rewards[:, 0, 0].tolist(), end)
+        return similarity, step_reward, regret, reward, accumulated, end
 
     def step_many(
-        params: None,
         s: Array,
         t: npt.NDArray[np.int64],
         accumulated: Array,
         action: Array,
         moved: Array,
-        observation: npt.NDArray[np.float32],
+        observation: Observation,
         optimal: Array,
-        rewards: Array,
-        ends: npt.NDArray[np.bool_],
+        values: Array,
+        ends: Mask,
     ) -> bool:
         if not np.isfinite(action).all():
             return False
@@ -175,15 +216,11 @@ def _numpy_engine(task: Task) -> Engine:
         moved[:] = done.state.T
         observation[:] = observe(task.spec, done.state, t + 1, done.accumulated_reward)
         optimal[:] = done.optimal_action
-        values = (
-            done.similarity,
-            done.step_reward,
-            1.0 - done.step_reward,
-            done.reward,
-            done.accumulated_reward,
-        )
-        for row, value in zip(rewards, values, strict=True):
-            row[:] = value.T
+        values[SIMILARITY] = done.similarity.T
+        values[STEP_REWARD] = done.step_reward.T
+        values[REGRET] = 1.0 - done.step_reward.T
+        values[REWARD] = done.reward.T
+        values[ACCUMULATED_REWARD] = accumulated[:] = done.accumulated_reward.T
         ends[:] = done.terminated, done.truncated
         t += 1
         return True
@@ -192,4 +229,4 @@ def _numpy_engine(task: Task) -> Engine:
         blocks = [task.policy(s[first : first + _ROWS]) for first in range(0, len(s), _ROWS)]
         return np.concatenate(blocks) if blocks else np.empty((0, task.spec.action_dim))
 
-    return Engine("numpy", None, new_lane, step_one, step_one, step_many, optimal_action)
+    return Engine("numpy", new_lane, step_one, step_one, step_many, optimal_action)

@@ -24,6 +24,13 @@ import numpy.typing as npt
 from numba import boolean, float32, float64, int64, njit, types, void
 
 from sme_registry.compiled.normal_cdf import normal_cdf
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    REGRET,
+    REWARD,
+    SIMILARITY,
+    STEP_REWARD,
+)
 from sme_registry.task import Task
 
 BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
@@ -231,6 +238,161 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
             y[o, lane] = normal_cdf(y[o, lane])
 
 
+@njit(error_model="numpy")
+def _block_policy(p, s, first, count, x, y, optimal, owner, owned):  # type: ignore[no-untyped-def]
+    """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers.
+
+    Writes `optimal` `[A, lanes]`, the agent of each action channel (`owner` `[A]`), and how many
+    channels each agent owns (`owned` `[n]`).
+    """
+    at = _HEADER + int(p[1]) * int(p[0]) + int(p[0])  # behind the header, W and b
+    channel = 0
+    for agent in range(owned.size):
+        inputs, layers = int(p[at]), int(p[at + 1])
+        at += 2
+        for j in range(inputs):
+            observed = np.uint64(p[at + j])
+            for lane in range(count):
+                x[j, lane] = s[observed, first + lane]
+        at += inputs
+        outputs = 0
+        for _ in range(layers):
+            inputs, outputs = int(p[at]), int(p[at + 1])
+            at += 2
+            b = at + inputs * outputs
+            W = p[at:b].reshape(inputs, outputs)
+            _block_layer(W, p[b : b + outputs], x, y, count)
+            at = b + outputs
+            x, y = y, x
+        for o in range(outputs):
+            for lane in range(count):
+                optimal[channel, lane] = x[o, lane]
+            owner[channel] = agent
+            channel += 1
+        owned[agent] = outputs
+
+
+@njit(error_model="numpy")
+def _block_distance(action, first, count, best, owner, distance, acted, optimal):  # type: ignore[no-untyped-def]
+    """‖a − π*‖₁ of each agent, `distance` `[n, lanes]`, NaN where its action is not finite.
+
+    Also writes the actions that the transition takes, clipped and rounded to float32 (`acted`
+    `[A, lanes]`), and π* of the block's lanes into `optimal` `[B, A]`.
+    """
+    distance[:] = 0.0
+    for i in range(owner.size):
+        agent = owner[i]
+        for lane in range(count):
+            unclipped = action[first + lane, i]
+            a = unclipped if unclipped > 0.0 else 0.0
+            a = a if a < 1.0 else 1.0
+            # The last term is 0, but NaN for NaN and for infinities, which clipping hides.
+            distance[agent, lane] += abs(a - best[i, lane]) + (unclipped - unclipped)
+            acted[i, lane] = float64(float32(a))
+            optimal[first + lane, i] = best[i, lane]
+
+
+@njit(error_model="numpy")
+def _block_transition(W, b, s, first, count, acted, moved, observation):  # type: ignore[no-untyped-def]
+    """ψ(s + a W + b) of a block of lanes, into `moved` `[S, B]` and `observation` `[B, …]`.
+
+    The sum runs over the action channels in ascending order, four at a time.
+    """
+    A, S = W.shape
+    for j in range(S):
+        offset = b[j]
+        for lane in range(first, first + count):
+            moved[j, lane] = s[j, lane] + offset
+        i = 0
+        while i + 4 <= A:
+            i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
+            w0, w1, w2, w3 = W[i0, j], W[i1, j], W[i2, j], W[i3, j]
+            for lane in range(count):
+                y = moved[j, first + lane] + w0 * acted[i0, lane]
+                y = y + w1 * acted[i1, lane]
+                y = y + w2 * acted[i2, lane]
+                moved[j, first + lane] = y + w3 * acted[i3, lane]
+            i += 4
+        while i < A:
+            i0 = np.uint64(i)
+            w = W[i0, j]
+            for lane in range(count):
+                moved[j, first + lane] = moved[j, first + lane] + w * acted[i0, lane]
+            i += 1
+        for lane in range(first, first + count):
+            folded = 2.0 * abs(moved[j, lane] - np.rint(moved[j, lane]))
+            moved[j, lane] = folded
+            observation[lane, j] = folded
+
+
+@njit(error_model="numpy")
+def _block_rewards(p, first, count, distance, owned, team_distance, values, ends):  # type: ignore[no-untyped-def]
+    """Similarity, step reward and regret of each agent, and whether a lane is terminated.
+
+    Returns:
+      False where a similarity is NaN: an action was not finite.
+    """
+    A, r_min, D, pays_the_team = p[1], p[4], p[5], p[9] == 1.0
+    finite = True
+    for lane in range(count):
+        ends[0, first + lane] = False
+    if pays_the_team:
+        team_distance[:] = 0.0
+        for agent in range(owned.size):
+            for lane in range(count):
+                team_distance[lane] += distance[agent, lane]
+    for agent in range(owned.size):
+        for lane in range(count):
+            i = first + lane
+            similarity = 1.0 - distance[agent, lane] / owned[agent]
+            finite &= similarity == similarity
+            paid_for = 1.0 - team_distance[lane] / A if pays_the_team else similarity
+            graded = 4.0 * (paid_for - 0.75)
+            graded = graded if graded > 0.0 else 0.0
+            step_reward = graded if graded > r_min else 0.0
+            values[SIMILARITY, agent, i] = similarity
+            values[STEP_REWARD, agent, i] = step_reward
+            values[REGRET, agent, i] = 1.0 - step_reward
+            ends[0, i] |= step_reward < D
+    return finite
+
+
+@njit(error_model="numpy")
+def _block_payout(p, first, count, t, accumulated, column, values, ends, observation):  # type: ignore[no-untyped-def]
+    """What is paid and what stays in r_cum; whether a lane is truncated; t/T and r_cum/k observed.
+
+    Short loops rather than one long one: those that divide write to `column` `[lanes]`, which is
+    contiguous, and so fill vector registers; a column of `observation` is not.
+    """
+    S, k, T = int(p[0]), p[2], p[3]
+    for agent in range(accumulated.shape[0]):
+        if k == 1.0:  # paid at every step, without a division
+            for lane in range(count):
+                i = first + lane
+                values[REWARD, agent, i] = accumulated[agent, i] + values[STEP_REWARD, agent, i]
+                values[ACCUMULATED_REWARD, agent, i] = 0.0
+                column[lane] = 0.0
+        else:
+            for lane in range(count):
+                i = first + lane
+                steps = float64(t[i] + 1)
+                total = accumulated[agent, i] + values[STEP_REWARD, agent, i]
+                # Exact: no quotient of integers below 2³¹ rounds to a whole number it is not.
+                paid = (steps >= T) | (np.floor(steps / k) * k == steps)
+                kept = 0.0 if paid else total
+                values[REWARD, agent, i] = total if paid else 0.0
+                values[ACCUMULATED_REWARD, agent, i] = kept
+                column[lane] = kept / k
+        for lane in range(count):
+            observation[first + lane, S + 1 + agent] = column[lane]
+    for lane in range(count):
+        steps = float64(t[first + lane] + 1)
+        ends[1, first + lane] = steps >= T
+        column[lane] = steps / T
+    for lane in range(count):
+        observation[first + lane, S] = column[lane]
+
+
 STEP_MANY = boolean(
     _PACKED,
     float64[:, ::1],
@@ -246,152 +408,50 @@ STEP_MANY = boolean(
 
 
 @njit(STEP_MANY, error_model="numpy", cache=True)
-def step_many(p, s, t, accumulated, action, moved, observation, optimal, rewards, ends):  # type: ignore[no-untyped-def]
+def step_many(p, s, t, accumulated, action, moved, observation, optimal, values, ends):  # type: ignore[no-untyped-def]
     """One step of `B` lanes of a team of n agents; a single agent is a team of one.
+
+    The lanes are stepped in blocks that fit in cache: π*, its distance from the action, the
+    transition, the rewards, then what is paid.
 
     Args:
       p: the packed task.
       s: `[S, B]` states, channel by channel.
-      t: `[B]` steps done before this one; advanced in place.
-      accumulated: `[n, B]` each agent's r_cum before this step.
+      t: `[B]` steps completed before this one; advanced in place.
+      accumulated: `[n, B]` each agent's r_cum; advanced in place.
       action: `[B, A]`, clipped here.
       moved: `[S, B]`, written: the next states.
       observation: `[B, S + 1 + n]`, written: s, t/T, and each agent's r_cum/k.
       optimal: `[B, A]`, written: π* of the states acted in.
-      rewards: `[5, n, B]`, written: similarity, step reward, regret, reward, r_cum after a
-        payout.
+      values: `[5, n, B]`, written: the rows of `compiled.values`.
       ends: `[2, B]`, written: terminated, truncated.
 
     Returns:
-      False where an action was not finite; nothing has advanced then.
+      False where an action was not finite; `t` and `accumulated` are unchanged then.
     """
-    S, A, k, T = int(p[0]), int(p[1]), p[2], p[3]
-    r_min, D, agents, widest = p[4], p[5], int(p[6]), int(p[7])
-    pays_the_team = p[9] == 1.0
+    S, A, agents, widest = int(p[0]), int(p[1]), int(p[6]), int(p[7])
     W = p[_HEADER : _HEADER + A * S].reshape(A, S)
     b = p[_HEADER + A * S : _HEADER + A * S + S]
     lanes = max(32, min(128, BLOCK_NUMBERS // widest))
+    # Room for one block; each is contiguous along the lanes.
     x, y = np.empty((widest, lanes)), np.empty((widest, lanes))
-    best, state = np.empty((A, lanes)), np.empty((S, lanes))
-    acted = np.empty((A, lanes))
-    missed, total_missed = np.empty((agents, lanes)), np.empty(lanes)
-    owner, owned = np.empty(A, np.int64), np.zeros(agents)
-    batch = t.size
+    best, acted = np.empty((A, lanes)), np.empty((A, lanes))
+    distance, team_distance = np.empty((agents, lanes)), np.empty(lanes)
+    column = np.empty(lanes)
+    owner, owned = np.empty(A, np.int64), np.empty(agents)
     finite = True
-    for first in range(0, batch, lanes):
-        count = min(lanes, batch - first)
-        at = _HEADER + A * S + S
-        done = 0
-        for agent in range(agents):
-            channels, layers = int(p[at]), int(p[at + 1])
-            at += 2
-            for j in range(channels):
-                channel = np.uint64(p[at + j])
-                for lane in range(count):
-                    x[j, lane] = s[channel, first + lane]
-            at += channels
-            outputs = 0
-            for _ in range(layers):
-                inputs, outputs = int(p[at]), int(p[at + 1])
-                at += 2
-                end = at + inputs * outputs
-                _block_layer(
-                    p[at:end].reshape(inputs, outputs), p[end : end + outputs], x, y, count
-                )
-                at = end + outputs
-                x, y = y, x
-            for o in range(outputs):
-                for lane in range(count):
-                    best[done, lane] = x[o, lane]
-                owner[done] = agent
-                done += 1
-            owned[agent] = outputs
-
-        missed[:] = 0.0
-        for i in range(A):
-            agent = owner[i]
-            for lane in range(count):
-                given = action[first + lane, i]
-                a = given if given > 0.0 else 0.0
-                a = a if a < 1.0 else 1.0
-                # The last term is 0, but NaN for NaN and for infinities, which clipping hides.
-                missed[agent, lane] += abs(a - best[i, lane]) + (given - given)
-                acted[i, lane] = float64(float32(a))
-                optimal[first + lane, i] = best[i, lane]
-
-        for j in range(S):
-            offset = b[j]
-            for lane in range(count):
-                state[j, lane] = s[j, first + lane] + offset
-            i = 0
-            while i + 4 <= A:
-                i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
-                w0, w1, w2, w3 = W[i0, j], W[i1, j], W[i2, j], W[i3, j]
-                for lane in range(count):
-                    z = state[j, lane] + w0 * acted[i0, lane]
-                    z = z + w1 * acted[i1, lane]
-                    z = z + w2 * acted[i2, lane]
-                    state[j, lane] = z + w3 * acted[i3, lane]
-                i += 4
-            while i < A:
-                i0 = np.uint64(i)
-                w = W[i0, j]
-                for lane in range(count):
-                    state[j, lane] = state[j, lane] + w * acted[i0, lane]
-                i += 1
-            for lane in range(count):
-                z = 2.0 * abs(state[j, lane] - np.rint(state[j, lane]))
-                moved[j, first + lane] = z
-                observation[first + lane, j] = z
-
-        # Short loops rather than one long one: all but the last fill vector registers.
-        for lane in range(count):
-            ends[0, first + lane] = False
-        if pays_the_team:
-            total_missed[:] = 0.0
-            for agent in range(agents):
-                for lane in range(count):
-                    total_missed[lane] += missed[agent, lane]
-        for agent in range(agents):
-            for lane in range(count):
-                i = first + lane
-                similarity = 1.0 - missed[agent, lane] / owned[agent]
-                finite &= similarity == similarity
-                paid_for = 1.0 - total_missed[lane] / float64(A) if pays_the_team else similarity
-                graded = 4.0 * (paid_for - 0.75)
-                graded = graded if graded > 0.0 else 0.0
-                step_reward = graded if graded > r_min else 0.0
-                rewards[0, agent, i] = similarity
-                rewards[1, agent, i] = step_reward
-                rewards[2, agent, i] = 1.0 - step_reward
-                ends[0, i] |= step_reward < D
-            if k == 1.0:  # paid at every step, without a division
-                for lane in range(count):
-                    i = first + lane
-                    rewards[3, agent, i] = accumulated[agent, i] + rewards[1, agent, i]
-                    rewards[4, agent, i] = 0.0
-                    missed[agent, lane] = 0.0
-            else:
-                for lane in range(count):
-                    i = first + lane
-                    steps = float64(t[i] + 1)
-                    total = accumulated[agent, i] + rewards[1, agent, i]
-                    # Exact: no quotient of integers below 2³¹ rounds to a whole number it is not.
-                    paid = (steps >= T) | (np.floor(steps / k) * k == steps)
-                    rewards[3, agent, i] = total if paid else 0.0
-                    kept = 0.0 if paid else total
-                    rewards[4, agent, i] = kept
-                    missed[agent, lane] = kept / k
-            for lane in range(count):
-                observation[first + lane, S + 1 + agent] = missed[agent, lane]
-        for lane in range(count):
-            steps = float64(t[first + lane] + 1)
-            ends[1, first + lane] = steps >= T
-            best[0, lane] = steps / T
-        for lane in range(count):
-            observation[first + lane, S] = best[0, lane]
+    for first in range(0, t.size, lanes):
+        count = min(lanes, t.size - first)
+        _block_policy(p, s, first, count, x, y, best, owner, owned)
+        _block_distance(action, first, count, best, owner, distance, acted, optimal)
+        _block_transition(W, b, s, first, count, acted, moved, observation)
+        finite &= _block_rewards(p, first, count, distance, owned, team_distance, values, ends)
+        _block_payout(p, first, count, t, accumulated, column, values, ends, observation)
     if finite:
-        for i in range(batch):
+        for agent in range(agents):
+            for i in range(t.size):
+                accumulated[agent, i] = values[ACCUMULATED_REWARD, agent, i]
+        for i in range(t.size):
             t[i] += 1
     return finite
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled import engine
+from sme_registry.compiled.values import ROWS
 from sme_registry.envs.actions import not_finite
 from sme_registry.envs.initial_states import InitialStates
 from sme_registry.errors import ActionError
@@ -27,15 +28,14 @@ Observation = npt.NDArray[np.float32]
 _FLOAT64 = np.dtype(np.float64)
 
 
-class Advanced(NamedTuple):
-    """What one step of all lanes gives; every array is fresh, unless the batch reuses them.
-
-    The batch goes on from `values[4]`: copy it before handing it to whoever might write into it.
+class BatchStep(NamedTuple):
+    """The result of one step of all lanes; every array is fresh, unless the batch reuses them.
 
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
       optimal: `[B, A]` π* of the states acted in, in the unit range.
-      values: `[5, n, B]` similarity, step reward, regret, reward, and r_cum after a payout.
+      values: `[5, n, B]` the rows of `compiled.values`: similarity, step reward, regret, reward,
+        and r_cum after a payout.
       terminated: `[B]`.
       truncated: `[B]`.
     """
@@ -62,7 +62,7 @@ class Batch:
 
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
-        self._shapes = (S, lanes), (lanes, S + 1 + n), (lanes, A), (5, n, lanes), (2, lanes)
+        self._shapes = (S, lanes), (lanes, S + 1 + n), (lanes, A), (ROWS, n, lanes), (2, lanes)
         refuse_above_limit(
             lanes * 8 * (4 * S + 4 * A + 16 * n + 48),
             f"num_envs={lanes}: a batch this large",
@@ -77,28 +77,27 @@ class Batch:
         self._reuse = reuse
         self._load_engine()
 
-    def _allocate(self) -> tuple[Array, Mask, Advanced]:
-        """What a step writes: next states, ends, and what it gives (with the ends as its last)."""
+    def _allocate(self) -> tuple[Array, Mask, BatchStep]:
+        """What a step writes: next states, ends, and its result, which includes the ends."""
         state, observation, optimal, values, ends = self._shapes
         ended = np.empty(ends, bool)
-        given = Advanced(
+        result = BatchStep(
             np.empty(observation, np.float32),
             np.empty(optimal),
             np.empty(values),
             terminated=ended[0],
             truncated=ended[1],
         )
-        return np.empty(state), ended, given
+        return np.empty(state), ended, result
 
     def _load_engine(self) -> None:
-        made = engine(self.task)
-        self._params, self._step_many = made.params, made.step_many
+        self._step_many = engine(self.task).step_many
         # Two sets in turn: a step reads the state from the one that it does not write.
         self._arrays = (self._allocate(), self._allocate()) if self._reuse else None
 
-    # Machine code cannot be pickled or copied, nor can views: both are made anew with the copy.
+    # Neither machine code nor views can be pickled or copied: the copy recreates both.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_params", "_step_many", "_arrays")
+        dropped = ("_step_many", "_arrays")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -143,7 +142,7 @@ class Batch:
         self._t[:] = t
         self._accumulated[:] = accumulated.T
 
-    def advance(self, actions: Array) -> Advanced:
+    def advance(self, actions: Array) -> BatchStep:
         """One step of every lane.
 
         Args:
@@ -164,12 +163,11 @@ class Batch:
         else:
             arrays, other = self._arrays
             self._arrays = other, arrays
-        moved, ended, given = arrays
+        moved, ended, result = arrays
         if not self._step_many(
-            self._params, self._s, self._t, self._accumulated, actions,
-            moved, given.observation, given.optimal, given.values, ended,
+            self._s, self._t, self._accumulated, actions,
+            moved, result.observation, result.optimal, result.values, ended,
         ):  # fmt: skip
             raise not_finite()
         self._s = moved
-        self._accumulated = given.values[4]
-        return given
+        return result

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
 from sme_registry.envs import actions as action_ranges
-from sme_registry.envs.batch import Advanced, Array, Batch, Observation
+from sme_registry.envs.batch import Array, Batch, BatchStep, Observation
 from sme_registry.envs.options import checked_seed, initial_states
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import SMESpec
@@ -219,7 +219,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         )
 
     def _infos(self, optimal: Array, values: list[float]) -> dict[str, dict[str, Any]]:
-        """Each agent's info, of the values `[5 · n]` of `Advanced`."""
+        """Each agent's info, of the values `[5 · n]` of `BatchStep`."""
         if self._rescaled:
             optimal = action_ranges.to_range(optimal, self._rescaled)
         n = len(self.possible_agents)
@@ -309,7 +309,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             )
         return agent
 
-    def _frame(self, last: tuple[Array, Advanced] | None) -> None:
+    def _frame(self, last: tuple[Array, BatchStep] | None) -> None:
         """Draw the team as one: all channels, and the mean over the agents of their numbers."""
         if self._renderer is None:
             from sme_registry.envs.rendering import Renderer

@@ -200,7 +200,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             "similarity": similarity,
             "step_reward": step_reward,
             "regret": regret,
-            "accumulated_reward": accumulated.copy(),  # the batch goes on from the original
+            "accumulated_reward": accumulated,
         }
         live = None
         if any_resting:

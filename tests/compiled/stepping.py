@@ -61,7 +61,7 @@ def step_batch(
     )
     values, ends = np.empty((5, n, B)), np.empty((2, B), bool)
     if not engine.step_many(
-        engine.params, np.ascontiguousarray(states.T), t.copy(), np.ascontiguousarray(r_cum.T),
+        np.ascontiguousarray(states.T), t.copy(), r_cum.T.copy(),
         actions, moved, observation, optimal, values, ends,
     ):  # fmt: skip
         return None
