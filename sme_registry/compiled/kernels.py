@@ -238,8 +238,8 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
             y[o, lane] = normal_cdf(y[o, lane])
 
 
-# The steps of `step_many`, in its order. Inlined, so that the compiler sees that the room of a block
-# overlaps no other array; as calls they took a tenth longer.
+# The parts of `step_many`, in its order. Inlined, so that the compiler sees that the arrays of a
+# block overlap no other array.
 @njit(inline="always", error_model="numpy")
 def _block_policy(p, s, first, count, x, y, optimal, owner, owned):  # type: ignore[no-untyped-def]
     """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers.
