@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -17,6 +17,9 @@ from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, Suite, SuiteFile
 from sme_registry.terminal import err, out
+
+if TYPE_CHECKING:
+    from sme_registry.training import RunRecord
 
 _FOLDERS = ("bundle", "site", "board")  # removed in this order: the board identifies the others
 _TITLE, _SUITE = "Demonstration", "demo"
@@ -40,9 +43,6 @@ def demo(
 
       sme-leaderboard demo runs/demo
     """
-    from leaderboard import intake
-    from leaderboard.bundle import make_bundle
-    from leaderboard.store import Store
     from sme_registry.training import RunRecord
 
     record = RunRecord.read(run)
@@ -53,20 +53,34 @@ def demo(
     for name in _FOLDERS:
         shutil.rmtree(folder / name, ignore_errors=True)  # the next write reports what remains
 
+    err().print("Creating a board with this task and two reference rows, and submitting the agent.")
+    _create_board(folder, run, record)
+    administration.score(folder / "board")
+    results.rank(folder / "board")
+    out().print(
+        "The run is listed without a rank, which needs ten runs in each class.\n"
+        f"Open the board in a browser ({escape(str(folder))}):"
+    )
+    administration.site(folder / "board", folder / "site")
+
+
+def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
+    """Create a board for a run's task, and submit the run."""
+    from leaderboard import intake
+    from leaderboard.bundle import make_bundle
+    from leaderboard.store import Store
+
     setting = record.spec.to_dict()
     seed = setting.pop("seed")
     suite = Suite.from_dict({"classes": [{"name": _SUITE, "setting": setting, "seeds": [seed]}]})
     file = SuiteFile(name=_SUITE, version=1, digest=suite.digest, suite=suite)
-    protocol: EvaluationProtocol = record.protocol
-
-    err().print("Creating a board with this task and two reference rows, and submitting the agent.")
     with Store.create(
         folder / "board",
         title=_TITLE,
         suite_name=file.versioned_name,
         suite=suite,
-        protocol_name=_name_of(protocol),
-        protocol=protocol,
+        protocol_name=_name_of(record.protocol),
+        protocol=record.protocol,
     ) as store:
         intake.submit_references(store)
         make_bundle(
@@ -81,13 +95,6 @@ def demo(
             submitter="Demonstration",
         )
         intake.submit_bundle(store, folder / "bundle")
-    administration.score(folder / "board")
-    results.rank(folder / "board")
-    out().print(
-        "The run is listed without a rank, which needs ten runs in each class.\n"
-        f"Open the board in a browser ({escape(str(folder))}):"
-    )
-    administration.site(folder / "board", folder / "site")
 
 
 def _refuse_other_files(folder: Path) -> None:

@@ -121,22 +121,14 @@ def verify(
             with store.locked():
                 verifier.follow_log()  # entries logged in the meantime
                 verifier.check_numbering()
-                if digest is not None and digest not in verifier.digests:
-                    raise TamperedError(
-                        "log",
-                        f"has no entry with the digest {digest}. If it was an entry of this board, "
-                        "the log was cut or rewritten since",
-                    )
+                if digest is not None:
+                    verifier.check_contains(digest)
                 unlogged = verifier.count_unlogged()
                 rows = verifier.check_index()
             verifier.check_signatures()
             objects = verifier.check_objects()
             results = verifier.check_numbers(store)
-            scored = [entry.id for entry in index.entries() if entry.status == "scored"]
-            drawn = random.Random(seed).sample(scored, min(rescore, len(scored)))
-            for id in drawn:
-                _rescore(store, id)
-                verifier.count_row()
+            rescored = verifier.rescore(store, rescore, seed)
         entries, head = index.entries(), index.head
     return VerifyReport(
         entries=head.sequence + 1,
@@ -148,7 +140,7 @@ def verify(
         objects=objects,
         unlogged=unlogged,
         rows=rows,
-        rescored=len(drawn),
+        rescored=rescored,
     )
 
 
@@ -221,6 +213,15 @@ class _Verifier:
                 self._refuse(
                     self.folder.log_entry(following), "is missing, but later entries exist"
                 )
+
+    def check_contains(self, digest: str) -> None:
+        """Check that the log has the entry with this digest."""
+        if digest not in self.digests:
+            raise TamperedError(
+                "log",
+                f"has no entry with the digest {digest}. If it was an entry of this board, the log "
+                "was cut or rewritten since",
+            )
 
     def count_unlogged(self) -> int:
         """Check that no file passes for a logged one; count those about to be logged."""
@@ -332,6 +333,15 @@ class _Verifier:
                 _check_scores(store.document, result)
             self.count_row()
         return len(ids)
+
+    def rescore(self, store: Store, count: int, seed: int) -> int:
+        """Score random submissions again and compare; returns their number."""
+        scored = [entry.id for entry in self.index.entries() if entry.status == "scored"]
+        drawn = random.Random(seed).sample(scored, min(count, len(scored)))
+        for id in drawn:
+            _rescore(store, id)
+            self.count_row()
+        return len(drawn)
 
     def _refuse(self, path: Path, message: str) -> NoReturn:
         raise TamperedError(path.relative_to(self.folder.path).as_posix(), message)

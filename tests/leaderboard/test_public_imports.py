@@ -1,0 +1,48 @@
+"""The leaderboard uses the registry as any other package would: by its public names."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+from pathlib import Path
+from types import ModuleType
+
+import leaderboard
+
+INTERRUPTS = "sme_registry.terminal.interrupts"  # light, unlike the rest of the terminal package
+
+
+def submodules(module: ModuleType) -> set[str]:
+    return {each.name for each in pkgutil.iter_modules(getattr(module, "__path__", ()))}
+
+
+def private_imports(source: str) -> list[str]:
+    """Imports from the registry that are not of a public name of a top-level module."""
+    private = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sme_registry"):
+            module = importlib.import_module(node.module)
+            public = {*getattr(module, "__all__", dir(module)), *submodules(module)}
+            top_level = node.module.count(".") < 2 or node.module == INTERRUPTS
+            private += [
+                f"{node.module}.{alias.name}"
+                for alias in node.names
+                if not top_level or alias.name.startswith("_") or alias.name not in public
+            ]
+    return private
+
+
+def test_the_leaderboard_imports_only_public_names_of_the_registry() -> None:
+    files = sorted(Path(leaderboard.__file__).parent.rglob("*.py"))
+    assert len(files) > 30
+    found = {str(path): private_imports(path.read_text()) for path in files}
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_a_private_import_would_be_found() -> None:
+    source = "from sme_registry.io.files import atomic_file\nfrom sme_registry.io import _x, choice"
+    assert private_imports(source) == [
+        "sme_registry.io.files.atomic_file",
+        "sme_registry.io._x",
+    ]
