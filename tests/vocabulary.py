@@ -1,8 +1,8 @@
-"""The names of numbers in documents: one name for one quantity.
+"""The names of numbers in documents and tables: one name for one quantity.
 
-Every number in a JSON document has one of these names; `tests/architecture/test_vocabulary.py`
-checks it. A new quantity needs a name and a meaning here. A number that has a name already keeps
-it, in JSON, in CSV and in Python. DESIGN has the symbols.
+Every number in a JSON document, in episodes.csv and in a study's data frames has one of these
+names; `tests/architecture/test_vocabulary.py` checks it. A new quantity needs a name and a meaning
+here. A number that has a name already keeps it, in JSON, in CSV and in Python.
 """
 
 QUANTITIES = {
@@ -40,6 +40,13 @@ QUANTITIES = {
     "linear_normalised_regret": "normalised regret of the best linear policy",
     "train_normalised_regret": "normalised regret of a network on its training states",
     "test_normalised_regret": "normalised regret of a network on other states",
+    "best_constant_normalised_regret": "normalised regret of the best constant policy",
+    "random_normalised_regret": "normalised regret of random actions",
+    "constant_similarity": "similarity of the constant policy ½",
+    "final_return": "episode_return of a run's last evaluation",
+    "offline_similarity": "similarity of an offline policy over its last evaluation's episodes",
+    "offline_similarity_sd": "its standard deviation over steps",
+    "improvement": "offline_similarity − behaviour_similarity",
     # Statistics
     "value": "an estimate, or one of two values compared",
     "low": "lower end of its 95 % interval",
@@ -139,6 +146,8 @@ QUANTITIES = {
     "draws": "number of bootstrap samples",
     "sequence": "position in a log",
     "size": "bytes of an artefact",
+    "episode": "number of an episode, from 1",
+    "terminated": "1 if an episode ended by D, else 0",
     # Seeds and versions
     "seed": "of a task, a run or a protocol",
     "seeds": "seeds, or the number of them",

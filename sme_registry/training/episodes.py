@@ -25,8 +25,8 @@ class Episode(NamedTuple):
       episode: its number, from 1.
       step: environment steps of the run over all environments when it ended; a step of a team is
         one step of all its agents.
-      episode_return: sum of its rewards, in [0, T]; the column is `return`. For a team, this,
-        `regret` and `similarity` are means over its agents.
+      episode_return: sum of its rewards, in [0, T]. For a team, this, `regret` and `similarity`
+        are means over its agents.
       length: number of steps.
       regret: mean of 1 − r over its steps, in [0, 1]; exact.
       similarity: mean r̃ over its steps, in [0, 1]; exact.
@@ -46,7 +46,7 @@ class Episode(NamedTuple):
     agents_regret: tuple[float, ...] = ()
 
 
-COLUMNS = tuple("return" if f == "episode_return" else f for f in Episode._fields[:-1])
+COLUMNS = Episode._fields[:-1]
 _TYPES = (int, int, float, int, float, float, int, float)
 
 

@@ -64,6 +64,21 @@ def test_every_number_in_a_document_has_the_name_of_its_quantity(model: type[Str
     assert unnamed(model) == []
 
 
+def columns() -> set[str]:
+    """The columns of numbers in episodes.csv and in a study's data frames."""
+    pytest.importorskip("pandas")
+    from sme_registry.studies.report import frames
+    from sme_registry.training import episodes
+
+    typed = frames._RESULTS | frames._CURVES
+    numeric = {name for name, dtype in typed.items() if dtype.lower().startswith(("int", "float"))}
+    return numeric | set(episodes.COLUMNS)
+
+
+def test_every_column_of_numbers_has_the_name_of_its_quantity() -> None:
+    assert columns() - QUANTITIES.keys() == set()
+
+
 def test_a_new_synonym_is_noticed() -> None:
     class Planted(BaseModel):
         similarity: Real
@@ -81,7 +96,7 @@ def test_a_new_synonym_is_noticed() -> None:
     ]
 
 
-def test_the_vocabulary_has_no_name_that_no_document_uses() -> None:
+def test_the_vocabulary_has_no_unused_name() -> None:
     used = {name for model in documents() for name in numbers(model)}
-    assert set(QUANTITIES) - used == set()
+    assert set(QUANTITIES) - used - columns() == set()
     assert not QUANTITIES.keys() & SYNONYMS.keys()

@@ -57,7 +57,7 @@ def test_the_logged_episodes_are_whole_and_their_regret_is_exact(run: TrainingRe
     for row in rows:
         # With k = 1 and r_min = 0 the return is the horizon less the sum of regrets.
         expected = 20 * (1 - float(row["regret"]))
-        assert float(row["return"]) == pytest.approx(expected, abs=1e-4)
+        assert float(row["episode_return"]) == pytest.approx(expected, abs=1e-4)
         assert float(row["similarity"]) <= 1
         assert row["terminated"] == "0"
     assert read_episodes(run.folder / "episodes.csv") == [

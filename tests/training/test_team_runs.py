@@ -58,7 +58,9 @@ def test_each_agent_of_a_team_has_a_column_of_its_exact_regret(team_run: Trainin
         assert regrets == pytest.approx(episode.agents_regret)
         assert float(row["regret"]) == pytest.approx(sum(regrets) / 2)
         # With k = 1 and r_min = 0 a return is the horizon less the sum of regrets.
-        assert float(row["return"]) == pytest.approx(20 * (1 - float(row["regret"])), abs=1e-4)
+        assert float(row["episode_return"]) == pytest.approx(
+            20 * (1 - float(row["regret"])), abs=1e-4
+        )
         assert row["length"] == "20"
     assert regrets[0] != regrets[1]
     read = read_episodes(path)
