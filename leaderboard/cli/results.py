@@ -82,11 +82,13 @@ def rank(
 
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
-    reasons = dict.fromkeys(row.reason for row in rows if row.reason)
+    from leaderboard.scoring.ranking import REASONS
+
+    reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
     table = Table(
         title=f"{LABELS[metric]} on {suite} (0 optimal, 1 the constant ½; 95 % intervals)",
-        caption="\n".join(f"{mark} not ranked: {escape(reason)}" for reason, mark in notes.items())
+        caption="\n".join(f"{mark} not ranked: {REASONS[reason]}" for reason, mark in notes.items())
         or None,
         title_justify="left",
         caption_justify="left",

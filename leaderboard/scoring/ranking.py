@@ -1,11 +1,11 @@
-"""Who is how good, and how certainly: entries in order of a metric, with the ranks left open.
+"""`ranking`: a board's entries in order of a metric, with the ranks that their intervals allow.
 
     first = 1 + ranked entries whose interval lies wholly below
     last  = N − ranked entries whose interval lies wholly above
 
-Ranked is what was scored with enough runs, and by decay only what has certainly learned: the
-constant policy loses nothing outside, because it has nothing. The reference rows stand among the
-others without a rank.
+Entries are ranked if they are scored with enough runs. By OOD decay, they must also have learned
+with certainty: the constant policy loses nothing outside, because it has learned nothing. The
+reference rows are listed among the others without a rank.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ from leaderboard.scoring.metrics import rank_ranges
 from leaderboard.store import EntryRow
 
 Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
+NotRanked = Literal["", "reference", "too_few_runs", "not_learned"]
 
 REFERENCES = {"optimal": 0.0, "constant": 1.0}  # N_m of each reference row, by its method's name
 TOLERANCE = 1e-6
-LEARNED = 0.5  # the greatest N₀ that an entry ranked by decay may have
+LEARNED = 0.5  # the largest upper bound of N₀ of an entry ranked by OOD decay
 
-IS_REFERENCE = "reference"
-TOO_FEW_RUNS = "too few runs"
-NOT_LEARNED = f"WD regret not certainly below {LEARNED:g}"
+REASONS: dict[str, str] = {
+    "reference": "reference row",
+    "too_few_runs": "too few runs in a class",
+    "not_learned": f"WD regret not certainly below {LEARNED:g}",
+}
 
 
 @dataclass(frozen=True)
@@ -35,27 +38,26 @@ class RankedRow:
     """A row of the ranking.
 
     Attributes:
-      entry: with its scores; never null here.
-      first, last: the best and the worst rank that the intervals leave open; None where the entry
-        is not ranked.
-      reason: why it is not; empty where it is.
+      entry: the entry; its scores are never null here.
+      first, last: the best and the worst rank that the intervals allow; None if not ranked.
+      reason: why it is not ranked, a key of `REASONS`; empty if it is.
     """
 
     entry: EntryRow
     first: int | None
     last: int | None
-    reason: str
+    reason: NotRanked
 
 
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
-    """Every entry that has scores and stands, in order of its score, the best first.
+    """Every scored entry that is not withdrawn, ordered by its score, the best first.
 
     Args:
       entries: of a board, in any order.
       metric: "wd_regret" (N₀), "ood_regret" (N̄) or "ood_decay" (N̄ − N₀); lower is better.
 
     Returns:
-      The rows; those with equal scores in the order in which they were received.
+      The rows; equal scores are in order of submission.
     """
     scored = [
         (_estimate(entry.scores, metric), entry, _reason(entry, entry.scores, metric))
@@ -74,37 +76,38 @@ def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
 
 
 def refuse_unpublishable(entries: list[EntryRow]) -> None:
-    """Refuse to show any number of a board whose reference rows are not what they must be.
+    """Refuse to publish numbers of a board whose reference rows do not have their known scores.
 
     Raises:
-      NotPublishable: one is missing or not scored, or leaves 0 or 1 by more than 1e-6.
+      NotPublishable: a reference row is missing or not scored, or differs from 0 or 1 by more than
+        1e-6.
     """
     for name, regret in REFERENCES.items():
         rows = [entry for entry in entries if entry.reference and entry.method == name]
-        found = [row.scores for row in rows if row.status == "scored" and row.scores is not None]
-        if not found:
+        scored = [row.scores for row in rows if row.status == "scored" and row.scores is not None]
+        if not scored:
             status = rows[-1].status if rows else "missing"
             advice = (
-                "Make the board anew, with `sme-leaderboard init`: a rejection is for good"
+                "Create the board again with `sme-leaderboard init`: a rejection is final"
                 if status == "rejected"
                 else "Run `sme-leaderboard score` on the board"
             )
             raise NotPublishable(
-                f"reference row {name!r}: {status}: must be scored before anything of this board "
-                f"is shown. {advice}."
+                f"reference row {name!r}: {status}: must be scored before the board publishes any "
+                f"number. {advice}."
             )
-        for scores in found:
-            for what, value, expected in _to_hold(scores, regret):
+        for scores in scored:
+            for field, value, expected in _known_scores(scores, regret):
                 if not abs(value - expected) <= TOLERANCE:
                     raise NotPublishable(
-                        f"reference row {name!r}: {what}={value!r}: must be {expected:g} within "
-                        f"{TOLERANCE:g}. The scoring here is at fault, so nothing of this board "
-                        "is shown. Compare the versions in its result with another machine's."
+                        f"reference row {name!r}: {field}={value!r}: must be {expected:g} within "
+                        f"{TOLERANCE:g}. Scoring is faulty here, so the board publishes no number. "
+                        "Compare the versions in this result with those of another machine."
                     )
 
 
-def _to_hold(scores: Scores, regret: float) -> Iterator[tuple[str, float, float]]:
-    """What, how much, and how much it must be, of a reference row with this regret everywhere.
+def _known_scores(scores: Scores, regret: float) -> Iterator[tuple[str, float, float]]:
+    """Field, value and expected value of a reference row with this regret in every region.
 
     Excludes the similarity loss: the constant policy's similarity differs between regions.
     """
@@ -121,12 +124,11 @@ def _estimate(scores: Scores, metric: Metric) -> Estimate:
     return estimate
 
 
-def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> str:
-    """Why an entry is not ranked; empty where it is."""
+def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> NotRanked:
     if entry.reference:
-        return IS_REFERENCE
+        return "reference"
     if not entry.enough_runs:
-        return TOO_FEW_RUNS
+        return "too_few_runs"
     if metric == "ood_decay" and scores.wd_regret.high > LEARNED:
-        return NOT_LEARNED
+        return "not_learned"
     return ""

@@ -1,8 +1,9 @@
 """The board's pages: static, accessible HTML without inline script or style, and data files.
 
-The same functions write a folder (`write_site`) and answer a server's requests (`Pages`).
+`write_site` writes them into a folder; a server reads them from `Pages`.
 """
 
-from leaderboard.web.site.render import STATIC, Pages, content_type, write_site
+from leaderboard.web.site.pages import STATIC, Pages, content_type
+from leaderboard.web.site.write import write_site
 
 __all__ = ["STATIC", "Pages", "content_type", "write_site"]

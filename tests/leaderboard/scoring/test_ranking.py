@@ -16,9 +16,6 @@ from leaderboard.documents.result import Estimate, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.exports import to_csv, to_json, to_latex
 from leaderboard.scoring.ranking import (
-    IS_REFERENCE,
-    NOT_LEARNED,
-    TOO_FEW_RUNS,
     ranking,
     refuse_unpublishable,
 )
@@ -134,10 +131,10 @@ def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> Non
     rows = ranking(entries, "wd_regret")
 
     assert [(row.entry.sequence, row.first, row.last, row.reason) for row in rows] == [
-        (1, None, None, IS_REFERENCE),
-        (3, None, None, TOO_FEW_RUNS),
+        (1, None, None, "reference"),
+        (3, None, None, "too_few_runs"),
         (4, 1, 1, ""),
-        (2, None, None, IS_REFERENCE),
+        (2, None, None, "reference"),
     ]
 
 
@@ -147,7 +144,7 @@ def test_what_has_not_certainly_learned_has_no_rank_by_decay() -> None:
     rows = ranking([unsure, sure], "ood_decay")
 
     assert [(row.entry.sequence, row.first, row.reason) for row in rows] == [
-        (3, None, NOT_LEARNED),
+        (3, None, "not_learned"),
         (4, 1, ""),
     ]
     assert [row.first for row in ranking([unsure, sure], "wd_regret")] == [1, 1]

@@ -153,8 +153,8 @@ def test_chosen_entries_are_laid_over_one_another(origin, width, opened):
     page = opened(origin + "index.html", width)
     page.get_by_role("checkbox", name="Compare SAC 2.7.1").check()
     page.get_by_role("checkbox", name="Compare PPO 2.7.1").check()
-    expect(page.get_by_text("2 of at most 6 chosen.")).to_be_visible()
-    page.get_by_role("button", name="Compare the chosen").click()
+    expect(page.get_by_text("2 of at most 6 selected.")).to_be_visible()
+    page.get_by_role("button", name="Compare selected").click()
     expect(page).to_have_url(re.compile(r"compare\.html\?id="))
     chart = page.get_by_role("img", name="Normalised regret by region")
     expect(chart).to_be_visible()
@@ -171,7 +171,7 @@ def test_chosen_entries_are_laid_over_one_another(origin, width, opened):
         label="TD3 2.7.1, by Control Lab, Delft"
     )
     expect(chart.locator(".overlay")).to_have_count(3)
-    page.get_by_role("button", name="Take away SAC").click()
+    page.get_by_role("button", name="Remove SAC").click()
     expect(chart.locator(".overlay")).to_have_count(2)
     expect(table.get_by_role("columnheader")).to_have_text(["Score", "PPO 2.7.1", "TD3 2.7.1"])
 
@@ -188,7 +188,7 @@ def test_six_entries_are_the_most(served, opened):
     for index in range(6):
         boxes.nth(index).check()
     expect(boxes.nth(6)).to_be_disabled()
-    page.get_by_role("button", name="Compare the chosen").click()
+    page.get_by_role("button", name="Compare selected").click()
     expect(page.locator(".overlay")).to_have_count(6)
     expect(page.get_by_role("combobox", name="Add an entry")).to_be_disabled()
 
@@ -226,8 +226,8 @@ def test_without_script_the_board_is_whole_and_the_comparison_says_what_is_missi
     expect(page.get_by_role("combobox")).to_have_count(0)
     expect(page.locator(".bar").first).to_be_visible()
     page.get_by_role("checkbox", name="Compare SAC").check()
-    page.get_by_role("button", name="Compare the chosen").click()
-    expect(page.get_by_text("Comparing needs JavaScript")).to_be_visible()
+    page.get_by_role("button", name="Compare selected").click()
+    expect(page.get_by_text("The comparison needs JavaScript")).to_be_visible()
     expect(page.get_by_role("combobox")).to_have_count(0)
 
 
@@ -254,7 +254,7 @@ def test_everything_that_can_be_used_has_a_name(served, width, opened, written):
 def test_the_keyboard_reaches_the_content_first_and_shows_where_it_is(served, opened):
     page = opened(served + "index.html")
     page.keyboard.press("Tab")
-    skip = page.get_by_role("link", name="To the content")
+    skip = page.get_by_role("link", name="Skip to content")
     expect(skip).to_be_focused()
     expect(skip).to_be_in_viewport()
     page.keyboard.press("Enter")

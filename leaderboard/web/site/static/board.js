@@ -1,20 +1,19 @@
-// What needs a script: sorting and filtering the board, and laying chosen entries over one another.
-// Without it the board is whole and readable. No text is ever read as HTML here: elements are made
-// and texts are set, whatever a submitter wrote.
+// Sorting and filtering of the board, and the comparison of chosen entries. The board is complete and
+// readable without it. Text from submitters is only ever set as text, never parsed as HTML.
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg";
-const MOST = 6; // entries that can be told apart in one drawing
+const MAX_ENTRIES = 6; // that can be distinguished in one chart
 
 function make(name, attributes = {}, ...children) {
-  const svg = ["svg", "path", "polyline", "text", "g", "title", "desc"].includes(name);
+  const svg = ["svg", "path", "polyline", "g"].includes(name);
   const element = svg ? document.createElementNS(SVG, name) : document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   element.append(...children);
   return element;
 }
 
-function shown(value, digits = 3) {
+function formatted(value, digits = 3) {
   const text = value.toFixed(digits);
   return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "\u2212");
 }
@@ -23,7 +22,7 @@ function shown(value, digits = 3) {
 
 function enhanceBoard(table) {
   const tools = document.querySelector("[data-tools]");
-  const said = tools.querySelector("[data-said]");
+  const status = tools.querySelector("[data-status]");
   const bodies = [...table.querySelectorAll("tbody[data-rows]")];
   const rows = bodies.flatMap((body) => [...body.querySelectorAll("tr[data-family]")]);
 
@@ -41,7 +40,7 @@ function enhanceBoard(table) {
       );
       left += row.hidden ? 0 : 1;
     }
-    said.textContent = left === rows.length ? "" : `${left} of ${rows.length} entries shown`;
+    status.textContent = left === rows.length ? "" : `${left} of ${rows.length} entries shown`;
   };
   for (const field of filters) field.addEventListener("input", filter);
   tools.hidden = false;
@@ -72,11 +71,11 @@ function enhanceBoard(table) {
   const note = document.querySelector("[data-chosen]");
   const count = () => {
     const chosen = boxes.filter((box) => box.checked).length;
-    note.textContent = chosen ? `${chosen} of at most ${MOST} chosen.` : "Tick up to six entries.";
-    for (const box of boxes) box.disabled = !box.checked && chosen >= MOST;
+    note.textContent = chosen ? `${chosen} of at most ${MAX_ENTRIES} selected.` : `Select up to ${MAX_ENTRIES} entries.`;
+    for (const box of boxes) box.disabled = !box.checked && chosen >= MAX_ENTRIES;
   };
   table.addEventListener("change", count);
-  window.addEventListener("pageshow", count); // going back brings the ticks back, unannounced
+  window.addEventListener("pageshow", count); // going back restores the selection without an event
   count();
 }
 
@@ -88,12 +87,12 @@ function enhanceComparison(place) {
   let chosen = idsOf(location)
     .map((id) => entries.find((entry) => entry.id.startsWith(id)))
     .filter((entry, index, all) => entry && all.indexOf(entry) === index)
-    .slice(0, MOST);
+    .slice(0, MAX_ENTRIES);
 
   const choose = (next) => {
     chosen = next;
     const query = chosen.map((entry) => `id=${entry.id.slice(0, 16)}`).join("&");
-    // A page opened from a file may not change its address; then only the link is lost.
+    // A page opened from a file may not change its address. Only the link is lost then.
     try {
       history.replaceState(null, "", query ? `?${query}` : location.pathname);
     } catch {}
@@ -114,25 +113,25 @@ function enhanceComparison(place) {
         .filter((entry) => !chosen.includes(entry))
         .map((entry) => make("option", { value: entry.id }, label(entry))),
     );
-    add.disabled = chosen.length >= MOST;
-    part("said").textContent =
+    add.disabled = chosen.length >= MAX_ENTRIES;
+    part("status").textContent =
       chosen.length === 0
-        ? "Nothing is chosen yet. Add entries here, or tick them on the board."
-        : chosen.length >= MOST
-          ? `${MOST} entries, as many as can be told apart. Take one away to add another.`
+        ? "No entry is selected. Add entries here, or select them on the board."
+        : chosen.length >= MAX_ENTRIES
+          ? `${MAX_ENTRIES} entries, the maximum. Remove one to add another.`
           : chosen.length === 1
-            ? "One entry. Add another to see what lies between them."
+            ? "One entry. Add another to compare them."
             : `${chosen.length} entries, compared with the first.`;
     part("legend").replaceChildren(...chosen.map(legendItem));
     part("figure").hidden = chosen.length === 0;
-    part("chart").replaceChildren(...(chosen.length ? [chart(chosen, regions, label)] : []));
+    drawCurves(part("figure").querySelector("svg"), chosen, label);
     part("table").parentNode.hidden = chosen.length === 0;
     part("table").replaceChildren(...(chosen.length ? table(chosen, regions, metrics) : []));
   }
 
   function legendItem(entry, index) {
-    const remove = make("button", { type: "button" }, "Take away");
-    remove.setAttribute("aria-label", `Take away ${label(entry)}`);
+    const remove = make("button", { type: "button" }, "Remove");
+    remove.setAttribute("aria-label", `Remove ${label(entry)}`);
     remove.addEventListener("click", () => {
       choose(chosen.filter((other) => other !== entry));
       add.focus();
@@ -148,8 +147,8 @@ function enhanceComparison(place) {
 }
 
 function idsOf(address) {
-  const asked = new URLSearchParams(address.search).getAll("id");
-  const ids = asked.length ? asked : address.hash.slice(1).split(",");
+  const query = new URLSearchParams(address.search).getAll("id");
+  const ids = query.length ? query : address.hash.slice(1).split(",");
   return ids.filter((id) => /^[0-9a-f]{8,64}$/.test(id));
 }
 
@@ -162,7 +161,7 @@ function key(index) {
   );
 }
 
-// Each series has a shape of its own: disc, square, triangle up, diamond, triangle down, cross.
+// Each series has its own shape: disc, square, triangle up, diamond, triangle down, cross.
 function mark(index, x, y) {
   const shapes = [
     `M${x - 5} ${y}a5 5 0 1 0 10 0a5 5 0 1 0 -10 0`,
@@ -175,66 +174,28 @@ function mark(index, x, y) {
   return make("path", { class: "mark", d: shapes[index] });
 }
 
-function ticksOf(values) {
-  const low = Math.min(0, ...values);
-  const high = Math.max(1, ...values);
-  const raw = (high - low) / 4;
-  const power = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 2.5, 5, 10].map((factor) => factor * power).find((size) => size >= raw - 1e-12);
-  const first = Math.floor(low / step + 1e-9);
-  const last = Math.ceil(high / step - 1e-9);
-  return Array.from({ length: last - first + 1 }, (_, index) => (first + index) * step);
-}
-
-function chart(chosen, regions, label) {
-  const [width, height, left, right, top, bottom] = [720, 380, 60, 708, 22, 316];
-  const ticks = ticksOf(chosen.flatMap((entry) => entry.normalised_regret.flat()));
-  const [low, high] = [ticks[0], ticks[ticks.length - 1]];
-  const y = (value) => bottom - ((bottom - top) * (value - low)) / (high - low);
-  const step = (right - left) / regions.length;
+// The server drew the axes; this draws the chosen entries on them, next to one another.
+function drawCurves(svg, chosen, label) {
+  const [left, step, zero, one] = ["left", "step", "zero", "one"].map((name) => Number(svg.dataset[name]));
+  const y = (value) => zero + (one - zero) * value;
   const apart = Math.min(12, (step * 0.7) / chosen.length);
-  const x = (region, series) =>
-    left + step * (region + 0.5) + apart * (series - (chosen.length - 1) / 2);
-  const svg = make(
-    "svg",
-    { class: "profile", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-labelledby": "chart-title chart-desc" },
-    make("title", { id: "chart-title" }, "Normalised regret by region"),
-    make("desc", { id: "chart-desc" }, `${chosen.map(label).join("; ")}. The table below has the numbers.`),
-  );
-  for (const tick of ticks) {
-    svg.append(
-      make("path", { class: "grid", d: `M${left} ${y(tick)}H${right}` }),
-      make("text", { class: "tick end", x: left - 8, y: y(tick) + 4 }, String(Number(tick.toFixed(6))).replace("-", "\u2212")),
-    );
-  }
-  for (const [name, value, text] of [["optimal", 0, "optimal"], ["constant", 1, "constant ½"]]) {
-    svg.append(
-      make("path", { class: name, d: `M${left} ${y(value)}H${right}` }),
-      make("text", { class: "tick label", x: right, y: y(value) - 6 }, text),
-    );
-  }
-  const every = 1 + Math.floor((regions.length - 1) / 12);
-  regions.forEach((text, region) => {
-    if (region % every) return;
-    svg.append(make("text", { class: "tick middle", x: left + step * (region + 0.5), y: bottom + 24 }, text));
-  });
-  svg.append(
-    make("text", { class: "tick middle", x: (left + right) / 2, y: height - 10 }, "expansion ε beyond the training cube"),
-  );
+  svg.querySelectorAll(".overlay").forEach((curve) => curve.remove());
+  svg.querySelector("desc").textContent =
+    `${chosen.map(label).join("; ")}. The table below has the numbers.`;
   chosen.forEach((entry, series) => {
-    const group = make("g", { class: `overlay series-${series}` });
-    const points = entry.normalised_regret.map(([value], region) => `${x(region, series)},${y(value)}`);
-    group.append(make("polyline", { class: "line", points: points.join(" ") }));
-    entry.normalised_regret.forEach(([value, from, to], region) => {
-      const at = x(region, series);
-      group.append(
-        make("path", { class: "whisker", d: `M${at} ${y(from)}V${y(to)}M${at - 3} ${y(from)}h6M${at - 3} ${y(to)}h6` }),
+    const x = (region) => left + step * (region + 0.5) + apart * (series - (chosen.length - 1) / 2);
+    const points = entry.normalised_regret.map(([value], region) => `${x(region)},${y(value)}`);
+    const curve = make("g", { class: `overlay series-${series}` });
+    curve.append(make("polyline", { class: "line", points: points.join(" ") }));
+    entry.normalised_regret.forEach(([value, low, high], region) => {
+      const at = x(region);
+      curve.append(
+        make("path", { class: "whisker", d: `M${at} ${y(low)}V${y(high)}M${at - 3} ${y(low)}h6M${at - 3} ${y(high)}h6` }),
         mark(series, at, y(value)),
       );
     });
-    svg.append(group);
+    svg.append(curve);
   });
-  return svg;
 }
 
 function table(chosen, regions, metrics) {
@@ -245,14 +206,14 @@ function table(chosen, regions, metrics) {
   const row = (name, estimates, digits) => {
     const [base] = estimates;
     const cells = estimates.map(([value, low, high], index) => {
-      const range = make("span", {}, `${shown(low, digits)} to ${shown(high, digits)}`);
-      const cell = make("td", { class: "n estimate" }, make("strong", {}, shown(value, digits)), range);
+      const range = make("span", {}, `${formatted(low, digits)} to ${formatted(high, digits)}`);
+      const cell = make("td", { class: "n estimate" }, make("strong", {}, formatted(value, digits)), range);
       if (index > 0) {
         const difference = value - base[0];
         const apart = low > base[2] || high < base[1];
         const sign = Number(difference.toFixed(digits)) > 0 ? "+" : "";
         const kind = apart ? "diff apart" : "diff";
-        cell.append(make("span", { class: kind }, `Δ ${sign}${shown(difference, digits)}`));
+        cell.append(make("span", { class: kind }, `Δ ${sign}${formatted(difference, digits)}`));
       }
       return cell;
     });

@@ -9,12 +9,12 @@ from leaderboard.documents.result import Estimate
 from leaderboard.web.site import charts
 
 finite = st.floats(-1e6, 1e6)
-REGRET = (("optimal", 0.0), ("constant", 1.0))
+REGRET = {"optimal": 0.0, "constant": 1.0}
 
 
 @given(st.lists(finite, max_size=5))
 def test_a_scale_holds_every_value_between_round_ends(values):
-    scale = charts.Scale.of(values)
+    scale = charts.Scale.covering(*values)
     assert scale.low < scale.high
     assert 2 <= len(scale.ticks) <= 8
     for value in values:
@@ -24,7 +24,7 @@ def test_a_scale_holds_every_value_between_round_ends(values):
 
 
 def test_regret_of_good_entries_is_drawn_from_zero_to_one():
-    assert charts.Scale.of([0.0, 1.0, 0.3]).ticks == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert charts.Scale.covering(0.0, 1.0, 0.3).ticks == (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_a_number_has_a_true_minus_and_no_negative_zero(value, text):
 
 
 def test_a_bar_spans_its_interval_and_bears_its_value():
-    scale = charts.Scale.of([0.0, 1.0])
+    scale = charts.Scale.covering(0.0, 1.0)
     lines = charts.reference_lines(scale, REGRET)
     bar = ElementTree.fromstring(
         charts.interval_bar(Estimate(value=0.5, low=0.25, high=1.0), scale, lines)
@@ -48,7 +48,7 @@ def test_a_bar_spans_its_interval_and_bears_its_value():
 
 
 def test_a_sparkline_says_its_numbers():
-    spark = charts.sparkline([0.1, 0.25, 0.4], charts.Scale.of([0.0, 1.0]))
+    spark = charts.sparkline([0.1, 0.25, 0.4], charts.Scale.covering(0.0, 1.0))
     assert "0.10, 0.25, 0.40" in ElementTree.fromstring(spark).get("aria-label")
     assert len(re.search(r'points="([^"]*)"', spark)[1].split()) == 3
 
@@ -56,7 +56,7 @@ def test_a_sparkline_says_its_numbers():
 def test_a_profile_of_many_regions_labels_only_some_of_them():
     edges = [(0.0, 0.0), *((m / 100, (m + 1) / 100) for m in range(100))]
     profile = [Estimate(value=0.1, low=0.0, high=0.2)] * len(edges)
-    chart = ElementTree.fromstring(charts.profile_chart(profile, edges, "p", "x"))
+    chart = ElementTree.fromstring(charts.regret_chart(profile, edges, "x"))
     labels = [text.text for text in chart.iter("text") if "–" in (text.text or "")]
     assert 5 <= len(labels) <= 12
     assert len(list(chart.iter("circle"))) == len(edges)
@@ -64,8 +64,8 @@ def test_a_profile_of_many_regions_labels_only_some_of_them():
 
 def test_a_profile_has_a_title_and_a_description_and_escapes_the_name():
     profile = [Estimate(value=0.1, low=0.0, high=0.2)] * 2
-    chart = charts.profile_chart(profile, [(0, 0), (0, 1)], "p", "<b>&\"'")
+    chart = charts.regret_chart(profile, [(0, 0), (0, 1)], "<b>&\"'")
     drawn = ElementTree.fromstring(chart)
-    assert drawn.get("aria-labelledby") == "p-title p-desc"
+    assert drawn.get("aria-labelledby") == "chart-title chart-desc"
     assert drawn.find("title").text == "Normalised regret of <b>&\"' by region"
     assert "WD: 0.100, from 0.000 to 0.200" in drawn.find("desc").text

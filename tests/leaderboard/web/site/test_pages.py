@@ -17,7 +17,8 @@ from leaderboard.documents.submission import SignedWithdrawal, Withdrawal
 from leaderboard.errors import BoardError, NotPublishable
 from leaderboard.intake import withdrawal_of
 from leaderboard.store import Store
-from leaderboard.web.site import STATIC, Pages, content_type, render, write_site
+from leaderboard.web.site import STATIC, Pages, content_type, rows, write_site
+from leaderboard.web.site import pages as site_pages
 from sme_registry.errors import OptionError
 from tests.leaderboard.web.site import boards
 
@@ -162,8 +163,8 @@ def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
     store, _ = board
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         words = pages[name].words
-        assert "This board proves performance, never learning." in words
-        assert "specs are public, so π* is computable by anyone" in words
+        assert "This board proves performance, not learning." in words
+        assert "specs are public, so anyone can compute π*" in words
         for digest in (store.document.suite.digest, store.document.protocol.digest):
             assert digest in words
         assert store.document.key in words
@@ -183,7 +184,7 @@ def test_the_method_page_says_how_failures_and_intervals_count(pages):
 def test_the_log_page_says_what_a_kept_digest_is_good_for(pages, board):
     words = pages["log.html"].words
     assert "verify BOARD --contains DIGEST" in words
-    assert "Entries cut off the end leave none" in words
+    assert "Removing entries at the end leaves none" in words
     assert board[0].head[1] in words
 
 
@@ -210,7 +211,7 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
     ]
     assert shown[-1] == ("–", "PPO small")
     assert "fewer than 10 runs in a class" in rows[-1][2]
-    assert "oracle-like: code asked for" in rows[2][2]
+    assert "oracle-like: code requested" in rows[2][2]
     assert 'href="https://example.org/sac?a=1&amp;b=2"' in rows[3][2]
     assert all('class="bar"' in row and 'class="spark"' in row for _, _, row in rows)
 
@@ -240,7 +241,7 @@ def test_the_page_of_a_submission_says_what_became_of_it(kind, board, pages, sit
     assert ids[kind] in words
     has_result = (site / f"results/{digits}.json").is_file()
     if kind == "sac":
-        assert "Profile over the regions" in words
+        assert "Regret over the regions" in words
         run = store.result(ids[kind]).runs[0]
         assert f"{run.evaluation_seed}" in words
         assert "onnxruntime 1.24.1" in words
@@ -259,10 +260,10 @@ def test_the_page_of_a_withdrawn_submission_gives_its_reason_as_text(tmp_path):
     key = SigningKey.generate()
     with boards.create(tmp_path / "board", classes=1) as store:
         id = boards.submit(store, key, "PPO", [0.2] * 6)
-        assert "The reason given" not in Page(Pages(store).submission(id)).words
+        assert "Reason:" not in Page(Pages(store).submission(id)).words
         store.withdraw(withdrawal_of(id, key, boards.HOSTILE))
         page = Page(Pages(store).submission(id))
-    assert f"The reason given: {boards.HOSTILE}" in page.words
+    assert f"Reason: {boards.HOSTILE}" in page.words
 
 
 def test_latex_has_no_negative_zero(tmp_path):
@@ -309,9 +310,9 @@ def test_hostile_text_stays_text_on_every_page(board, pages, site):
 
 
 def test_only_https_becomes_a_link():
-    assert render._https("https://example.org/") == "https://example.org/"
+    assert rows.https_only("https://example.org/") == "https://example.org/"
     for link in (None, "javascript:alert(1)", "http://example.org", " https://example.org"):
-        assert render._https(link) is None
+        assert rows.https_only(link) is None
 
 
 def test_the_comparison_has_every_entry_that_stands_and_no_other(board, site):
@@ -373,7 +374,7 @@ def test_a_server_reads_the_same_bytes_as_the_folder_holds(board, site):
         "",
         "nothing.html",
         "../board.key",
-        "static/../render.py",
+        "static/../pages.py",
         "static/",
         "log-1.html",
         "log-00.html",
@@ -445,7 +446,7 @@ def test_pages_never_replace_a_boards_own_files(tmp_path, out):
         shutil.copytree(store.folder.path, tmp_path / "other")
         (tmp_path / "other" / "board.key").unlink()  # as one that is handed on
         before = {path: path.read_bytes() for path in tmp_path.rglob("*.json")}
-        with pytest.raises(OptionError, match=r"is of the board .* another folder"):
+        with pytest.raises(OptionError, match=r"belongs to the board .* another folder"):
             write_site(store, tmp_path / out)
         assert {path: path.read_bytes() for path in tmp_path.rglob("*.json")} == before
         assert not list(tmp_path.rglob("*.html"))
@@ -462,7 +463,7 @@ def test_pages_may_lie_in_a_board_and_beside_it(tmp_path):
 
 def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
     store, _ = board
-    monkeypatch.setattr(render, "LOG_ROWS", 10)
+    monkeypatch.setattr(site_pages, "LOG_ROWS", 10)
     pages = Pages(store)
     last = store.head[0]
     count = last // 10 + 1
@@ -489,7 +490,7 @@ def test_an_empty_board_is_a_page_that_says_so(tmp_path):
     [(0, "0"), (999, "999"), (1000, "1 k"), (1_250_000, "1.25 M"), (30_000_000_000, "30 G")],
 )
 def test_steps_are_short(steps, text):
-    assert render.steps_text(steps) == text
+    assert rows.steps_text(steps) == text
 
 
 def test_contrast_is_enough_in_light_and_dark():

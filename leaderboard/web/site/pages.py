@@ -1,0 +1,351 @@
+"""`Pages`: the files of a board's site, each a function of the store.
+
+    index.html, ood_regret.html, ood_decay.html    the board by each metric
+    submissions/<64 hex>.html, .json    every submission; results/<64 hex>.json
+    compare.html, board-data.js         comparison of chosen entries, drawn by static/board.js
+    log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
+    method.html                         the formulas
+    board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
+
+Jinja2 escapes all text from submitters. Only the drawings are marked as safe; they contain numbers
+and text that they escape themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from leaderboard import exports
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.result import METRICS, Estimate, Result
+from leaderboard.documents.submission import SignedSubmission
+from leaderboard.errors import CODES
+from leaderboard.scoring import ranking
+from leaderboard.store import EntryRow, Store
+from sme_registry.errors import MissingDependencyError
+
+try:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+except ImportError:
+    raise MissingDependencyError(
+        "The pages need Jinja2, which is not installed. "
+        "Install it with `pip install 'sme-registry[leaderboard]'`."
+    ) from None
+
+from leaderboard.web.site import charts
+from leaderboard.web.site.rows import SHORT, TABS, board_rows, https_only, run_rows, steps_text
+
+STATIC = Path(__file__).parent / "static"
+LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
+
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".csv": "text/csv; charset=utf-8",
+    ".tex": "text/plain; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+_EXPORTS = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
+_LOG_PAGE = re.compile(r"log-(0|[1-9][0-9]{0,8})\.html")
+
+
+class Pages:
+    """The pages of a board in its present state. Create another when its log has grown.
+
+    Args:
+      store: an open store; it is only read.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.document = store.document
+        self._latest: tuple[str, tuple[SignedSubmission, Result | None]] | None = None
+
+    @cached_property
+    def entries(self) -> list[EntryRow]:
+        """Every entry of the board.
+
+        Raises:
+          NotPublishable: the reference rows are missing or differ from 0 and 1.
+        """
+        entries = self.store.entries()
+        ranking.refuse_unpublishable(entries)
+        return entries
+
+    def board(self, metric: ranking.Metric = "wd_regret") -> str:
+        """The board by a metric.
+
+        Raises:
+          NotPublishable: see `entries`; every other page raises it too.
+        """
+        tab = next(tab for tab in TABS if tab.key == metric)
+        rows, axis = board_rows(ranking.ranking(self.entries, metric), tab)
+        submitted = [row for row in rows if not row.entry.reference]
+        entrants = [entry for entry in self.entries if not entry.reference]
+        not_scored = [entry for entry in reversed(entrants) if entry.status != "scored"]
+        return self._render(
+            "board.html",
+            here="index.html",
+            title=tab.label,
+            metric=tab,
+            head=self.store.head,
+            instances=sum(len(member.seeds) for member in self.document.suite.classes),
+            entrants=len(entrants),
+            references=[row for row in rows if row.entry.reference],
+            ranked=[row for row in submitted if row.rank],
+            listed=[row for row in submitted if not row.rank],
+            not_scored=[{"entry": entry, "hex": hex_of(entry.id)} for entry in not_scored],
+            families=sorted({row.entry.family for row in submitted}),
+            knowledges=sorted({row.entry.knowledge for row in submitted}),
+            reasons=ranking.REASONS,
+            axis=axis,
+        )
+
+    def submission(self, id: str) -> str:
+        """The page of a submission: waiting, scored, rejected or withdrawn.
+
+        Raises:
+          KeyError: there is no such submission.
+        """
+        entry = self._by_id[id]
+        signed, result = self._documents(id)
+        withdrawal = self.store.withdrawal(id)
+        submission = signed.submission
+        edges = self.document.protocol.edges
+        chart, classes = "", []
+        if result is not None and result.scores is not None:
+            name = submission.method.name
+            chart = charts.regret_chart(result.scores.normalised_regret, edges, name)
+            regrets = [each.normalised_regret for each in result.classes]
+            scale = charts.Scale.covering(0.0, 1.0, *(N for regret in regrets for N in regret))
+            sparks = [charts.sparkline(regret, scale) for regret in regrets]
+            classes = list(zip(result.classes, sparks, strict=True))
+        return self._render(
+            "submission.html",
+            here="",
+            root="../",
+            title=f"{submission.method.name} {submission.method.version}",
+            id=id,
+            hex=hex_of(id),
+            short=hex_of(id)[:SHORT],
+            s=submission,
+            result=result,
+            entry=entry,
+            withdrawal=withdrawal and withdrawal.withdrawal,
+            code_link=https_only(submission.code),
+            codes=CODES,
+            chart=chart,
+            classes=classes,
+            regions=charts.region_labels(edges),
+            runs=run_rows(submission, result, self._class_of),
+        )
+
+    def compare(self) -> str:
+        """The page on which `board.js` compares chosen entries."""
+        estimates = [each for entry in self._scored for each in entry.scores.normalised_regret]
+        chart = charts.comparison_chart(estimates, self.document.protocol.edges)
+        return self._render(
+            "compare.html", here="compare.html", title="Compare entries", chart=chart
+        )
+
+    def log(self, page: int | None = None) -> str:
+        """A page of the log, with instructions to verify it.
+
+        Args:
+          page: 0 for the oldest entries; None for the newest page.
+
+        Raises:
+          KeyError: there is no such page.
+        """
+        last = self.store.head[0]
+        count = last // LOG_ROWS + 1
+        page = count - 1 if page is None else page
+        if not 0 <= page < count:
+            raise KeyError(page)
+        return self._render(
+            "log.html",
+            here="log.html",
+            title="Log and verification",
+            head=self.store.head,
+            rows=[
+                {"entry": entry, "hex": hex_of(entry.subject) if entry.event != "opened" else ""}
+                for entry in self.store.log(page * LOG_ROWS, LOG_ROWS)
+            ],
+            page=page,
+            pages=[
+                (n, _log_page(n), n * LOG_ROWS, min((n + 1) * LOG_ROWS - 1, last))
+                for n in range(count)
+            ],
+        )
+
+    def method(self) -> str:
+        """The page of formulas."""
+        regions = charts.region_labels(self.document.protocol.edges)
+        return self._render("method.html", here="method.html", title="Method", regions=regions)
+
+    def data_js(self) -> str:
+        """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
+
+        def rounded(estimate: Estimate) -> list[float]:
+            return [round(x, 5) + 0.0 for x in (estimate.value, estimate.low, estimate.high)]
+
+        data = {
+            "regions": charts.region_labels(self.document.protocol.edges),
+            "metrics": [*(tab.label for tab in TABS), "Regret slope", "Similarity loss"],
+            "entries": [
+                {
+                    "id": hex_of(entry.id),
+                    "name": f"{entry.method} {entry.version}",
+                    "by": entry.submitter,
+                    "scores": [rounded(getattr(entry.scores, key)) for key in METRICS],
+                    "normalised_regret": [rounded(N) for N in entry.scores.normalised_regret],
+                }
+                for entry in self._scored
+            ],
+        }
+        return f"window.boardData = {json.dumps(data, separators=(',', ':'))};\n"
+
+    def read(self, path: str) -> bytes | None:
+        """A file of the site by its path, such as `ood_regret.html`; None if there is none.
+
+        Raises:
+          NotPublishable: see `entries`.
+        """
+        folder, _, name = path.rpartition("/")
+        if folder == "static":
+            return _static().get(name)
+        self.entries  # noqa: B018  raises if the board may not publish
+        if folder in ("submissions", "results"):
+            return self._document(folder, name)
+        return None if folder else self._page(name)
+
+    def paths(self) -> Iterator[str]:
+        """The paths of all files of the site; `index.html` last, so that its links work."""
+        yield from (f"static/{name}" for name in _static())
+        for entry in self.entries:
+            digits = hex_of(entry.id)
+            yield f"submissions/{digits}.json"
+            if entry.scores is not None or entry.code:
+                yield f"results/{digits}.json"
+            yield f"submissions/{digits}.html"
+        for number in range(self.store.head[0] // LOG_ROWS + 1):
+            yield _log_page(number)
+        yield from ("board-data.js", "log.html", "method.html", "compare.html")
+        yield from (f"{tab.stem}.{kind}" for tab in TABS for kind in _EXPORTS)
+        yield from (tab.page for tab in reversed(TABS))
+
+    def _page(self, name: str) -> bytes | None:
+        renderers: dict[str, Callable[[], str]] = {
+            "compare.html": self.compare,
+            "method.html": self.method,
+            "log.html": self.log,
+            "board-data.js": self.data_js,
+        }
+        if name in renderers:
+            return renderers[name]().encode()
+        for tab in TABS:
+            if tab.page == name:
+                return self.board(tab.key).encode()
+            stem, _, kind = name.rpartition(".")
+            if stem == tab.stem and kind in _EXPORTS:
+                rows = ranking.ranking(self.entries, tab.key)
+                # The date is the log's, not the clock's, so that the same board gives equal bytes.
+                (last,) = self.store.log(self.store.head[0], 1)
+                table = _EXPORTS[kind](rows, tab.key, self.document, self.store.head[:2], last.time)
+                return table.encode()
+        number = _LOG_PAGE.fullmatch(name)
+        try:
+            return self.log(int(number[1])).encode() if number else None
+        except KeyError:
+            return None
+
+    def _document(self, folder: str, name: str) -> bytes | None:
+        digits, _, kind = name.partition(".")
+        id = f"sha256:{digits}"
+        if id not in self._by_id:
+            return None
+        if kind == "html" and folder == "submissions":
+            return self.submission(id).encode()
+        if kind != "json":
+            return None
+        _, result = self._documents(id)
+        if folder == "submissions":
+            return self.store.folder.submission(id).read_bytes()  # verified by the store
+        return self.store.folder.result(id).read_bytes() if result is not None else None
+
+    def _documents(self, id: str) -> tuple[SignedSubmission, Result | None]:
+        """A submission and its result; the latest are kept, because three files need them."""
+        latest = self._latest  # read once: a server's threads share these pages
+        if latest is None or latest[0] != id:
+            latest = self._latest = id, (self.store.submission(id), self.store.result(id))
+        return latest[1]
+
+    @cached_property
+    def _by_id(self) -> dict[str, EntryRow]:
+        return {entry.id: entry for entry in self.entries}
+
+    @cached_property
+    def _scored(self) -> list[Any]:
+        """Entries with scores that are not withdrawn."""
+        return [entry for entry in self.entries if entry.scores and entry.status == "scored"]
+
+    @cached_property
+    def _digests(self) -> dict[str, str]:
+        """Digests of the board's documents, which compute them on every access."""
+        document = self.document
+        return {
+            "board": document.digest,
+            "suite": document.suite.digest,
+            "protocol": document.protocol.digest,
+        }
+
+    @cached_property
+    def _class_of(self) -> dict[str, str]:
+        return {digest: name for digest, (name, _) in self.document.instances.items()}
+
+    def _render(self, template: str, **values: Any) -> str:
+        common = {
+            "root": "",
+            "document": self.document,
+            "digests": self._digests,
+            "learned": ranking.LEARNED,
+            "metrics": TABS,
+        }
+        return _environment().get_template(template).render({**common, **values})
+
+
+def content_type(path: str) -> str:
+    """The media type of a file of the site."""
+    return _TYPES[Path(path).suffix]
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        auto_reload=False,
+    )
+    environment.filters["number"] = charts.number
+    environment.filters["short"] = lambda digest: hex_of(digest)[:12]
+    environment.filters["steps"] = steps_text
+    return environment
+
+
+@cache
+def _static() -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(STATIC.iterdir())}
+
+
+def _log_page(number: int) -> str:
+    return f"log-{number}.html"
