@@ -93,3 +93,12 @@ def expand(pattern: str) -> list[str]:
     """`Plane{1,10}` to `Plane1` and `Plane10`, as a shell does."""
     parts = [part.split(",") for part in re.split(r"[{}]", pattern)]
     return ["".join(combination) for combination in product(*parts)]
+
+
+@pytest.mark.parametrize("package", ["sme_registry", "leaderboard"])
+def test_the_map_of_the_code_lists_every_module_of_a_package(package: str) -> None:
+    table = (ROOT / "CONTRIBUTING.md").read_text().split(f"`{package}`", 1)[1].split("\n\n")[1]
+    listed = set(re.findall(r"`(\w+)`", "\n".join(first_column(table))))
+    modules = {path.stem for path in (ROOT / package).glob("[!_]*.py")}
+    packages = {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
+    assert listed == modules | packages
