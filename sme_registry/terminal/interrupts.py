@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 
@@ -35,7 +34,7 @@ def block_interrupts() -> Iterator[None]:
     `unblock_interrupts`, or ignoring the signal, ends the block in the child. Windows has no signal
     masks, so there this does nothing.
     """
-    if sys.platform == "win32":
+    if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
@@ -50,5 +49,5 @@ def block_interrupts() -> Iterator[None]:
 
 def unblock_interrupts() -> None:
     """Accept interrupts in a process that began with them blocked, including one already sent."""
-    if sys.platform != "win32":
+    if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
