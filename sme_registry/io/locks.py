@@ -14,6 +14,11 @@ import filelock
 
 from sme_registry.errors import OptionError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _POLL_SECONDS = 0.002
 
 
@@ -73,9 +78,22 @@ def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | N
 
 
 def is_locked(path: str | os.PathLike[str]) -> bool:
-    """Whether a lock file is held, by this process or another one. Creates no file."""
-    if not os.path.exists(path):
+    """Whether a lock file is held, by this process or another one. Creates no file.
+
+    Where the system has `flock`, reading the file suffices, and asking does not hold up others.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
         return False
+    try:
+        if fcntl is not None:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(handle)
     try:
         # Waiting a moment keeps two simultaneous questions from answering each other's with yes.
         lock = file_lock(path, timeout=5 * _POLL_SECONDS)

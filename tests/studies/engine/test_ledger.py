@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -79,6 +81,27 @@ def test_a_lock_ends_with_the_process_that_held_it_however_that_died(tmp_path: P
         holder.wait()
     wait_for(lambda: not Ledger(tmp_path).is_running(CELL.digest))
     assert Ledger(tmp_path).lock(CELL.digest) is not None
+
+
+def test_a_reader_who_may_not_write_sees_that_a_cell_runs() -> None:
+    folder = Path(tempfile.mkdtemp(prefix="read-only-"))
+    lock = Ledger(folder).lock(CELL.digest)
+    assert lock is not None
+    for path in (*folder.rglob("*"), folder):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    root = os.geteuid() == 0
+    try:
+        if root:
+            os.seteuid(65534)
+        assert Ledger(folder).is_running(CELL.digest)
+        assert not Ledger(folder).is_running(OTHER.digest)
+    finally:
+        if root:
+            os.seteuid(0)
+        lock.release()
+        for path in (folder, folder / "locks"):
+            path.chmod(0o755)
+        shutil.rmtree(folder)
 
 
 def test_asking_whether_a_cell_runs_makes_no_file(tmp_path: Path) -> None:
