@@ -96,16 +96,20 @@ def show(
     if name is None:
         raise OptionError("Give a name, a path or a digest, as in `sme show Default`.")
     document = find_any(name)
-    if digests and (json or not isinstance(document, SuiteFile)):
-        raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
+    if digests:
+        if json or not isinstance(document, SuiteFile):
+            raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
+        tasks = document.suite.instances
+        out().print("\n".join(spec.digest for spec in tasks), soft_wrap=True)
+    else:
+        _show_document(name, document, json)
+
+
+def _show_document(name: str, document: Envelope | SMESpec, json: bool) -> None:
     if isinstance(document, SMESpec | EnvFile):
         _show_task(document, json)
     elif isinstance(document, SuiteFile):
-        if digests:
-            tasks = document.suite.instances
-            out().print("\n".join(spec.digest for spec in tasks), soft_wrap=True)
-        else:
-            _show_suite(document, json)
+        _show_suite(document, json)
     elif json:
         print_json(document.to_dict())
     elif isinstance(document, StudyFile):

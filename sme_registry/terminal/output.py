@@ -59,7 +59,7 @@ def print_pairs(title: str, pairs: dict[str, object]) -> None:
 
 
 def mark(outcome: str) -> str:
-    """An outcome in its colour."""
+    """An outcome of `certify`, coloured."""
     return _MARKS[outcome]
 
 
