@@ -13,9 +13,8 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.result import CellResult
-from sme_registry.studies.report import tables
+from sme_registry.studies.report import frames, offline_tables, tables
 from sme_registry.studies.report.classes import ClassInfo, Group, class_infos, groups
-from sme_registry.studies.report.frames import study_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +65,7 @@ class Analysis:
 
 def analyse(
     file: StudyFile,
-    results: Mapping[str, CellResult],
+    finished: Mapping[str, CellResult],
     errors: Mapping[str, str] | None = None,
     *,
     draws: int = statistics.DRAWS,
@@ -75,41 +74,41 @@ def analyse(
 
     Args:
       file: the plan.
-      results: finished runs by the digests of their cells; other cells are ignored.
+      finished: results by the digests of their cells; other cells are ignored.
       errors: of failed runs, likewise.
       draws: bootstrap samples of each interval.
     """
     plan = file.plan
     planned = [cell.cell.digest for cell in plan.cells]
-    frames = study_frames(plan, results)
-    runs = tables.runs(frames.results)
+    results, curves = frames.study_frames(plan, finished)
+    runs = frames.runs(results)
     classes = class_infos(plan)
     present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
     names = tuple(algorithm.name for algorithm in present)
     compared = groups(classes, names, set(tables.by_place(runs)))
     missing = tables.missing(plan, runs, errors or {})
-    offline_runs = tables.offline_runs(frames.results, plan.algorithms)
+    offline_runs = offline_tables.offline_runs(results, plan.algorithms)
     bootstrap = tables.Bootstrap(file.digest, draws)
     return Analysis(
         file=file,
-        cells={key: results[key] for key in planned if key in results},
+        cells={key: finished[key] for key in planned if key in finished},
         classes=classes,
         base=plan.classes[0].name,
         algorithms=names,
         learners=tuple(a.name for a in present if not a.uses.startswith("reference:")),
         groups=compared,
-        results=frames.results,
-        curves=frames.curves,
+        results=results,
+        curves=curves,
         runs=runs,
         counts=tables.counts(plan, missing),
         missing=missing,
-        learning_curves=tables.learning_curves(frames.curves, runs),
-        regions=tables.regions(frames.results),
-        levels=tables.levels(frames.results, bootstrap),
+        learning_curves=tables.learning_curves(curves, runs),
+        regions=tables.regions(results),
+        levels=tables.levels(results, bootstrap),
         contrasts=tables.contrasts(runs, classes, bootstrap),
         aggregates=tables.aggregates(runs, compared, names, bootstrap),
         profiles=tables.profiles(runs, compared, names, bootstrap),
         improvements=tables.improvements(runs, compared, names, bootstrap),
         offline_runs=offline_runs,
-        offline=tables.offline(offline_runs, bootstrap),
+        offline=offline_tables.offline(offline_runs, bootstrap),
     )

@@ -14,7 +14,8 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, OFFLINE_INTERVAL
+from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
 from sme_registry.terminal import escape_latex, fixed
 
 CSV_TABLES = (

@@ -58,41 +58,21 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import RegionReport
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 
 RUN = ["class_name", "algorithm", "run"]
-REGION_COLUMNS = {
-    "region": "str", "epsilon_low": "float64", "epsilon_high": "float64", "states": "int64",
-    "similarity": "float64", "similarity_sd": "float64", "mae": "float64",
-    "normalised_regret": "float64", "similarity_decay": "float64", "similarity_loss": "float64",
-    "clipped_share": "float64", "linear_normalised_regret": "float64",
-    "best_constant_normalised_regret": "float64", "random_normalised_regret": "float64",
-    "constant_similarity": "float64",
-}  # fmt: skip
-RUN_COLUMNS = {
-    "wd_regret": "float64", "ood_regret": "float64", "ood_decay": "float64",
-    "final_return": "float64", "online_regret": "float64", "uses": "str", "action_range": "str",
-    "steps": "int64", "state_dim": "int64", "action_dim": "int64", "k": "int64",
-    "r_min": "float64", "D": "float64", "complexity": "int64", "horizon": "int64",
-    "hidden_width": "int64", "policy_init": "str", "spec_seed": "str", "spec_digest": "str",
-    "seed": "int64", "nu": "float64", "transitions": "Int64", "dataset_digest": "str",
-    "behaviour_similarity": "float64", "behaviour_similarity_sd": "float64",
-    "offline_similarity": "float64", "offline_similarity_sd": "float64",
-    "improvement": "float64", "seconds": "float64", "steps_per_second": "float64", "key": "str",
-}  # fmt: skip
-_PLACE_COLUMNS = {"class_name": "str", "algorithm": "str", "run": "int64"}
-_RESULTS = _PLACE_COLUMNS | REGION_COLUMNS | RUN_COLUMNS
-_CURVES = _PLACE_COLUMNS | {
-    "step": "int64", "episode_return": "float64", "regret": "float64", "similarity": "float64",
-    "length": "float64",
-}  # fmt: skip
-_SPEC_FIELDS = (
-    "state_dim", "action_dim", "k", "r_min", "D", "complexity", "horizon", "hidden_width",
-    "policy_init",
-)  # fmt: skip
+_PLACE = "class_name:str algorithm:str run:int64 "
+_REGION = """region:str epsilon_low epsilon_high states:int64 similarity similarity_sd mae
+    normalised_regret similarity_decay similarity_loss clipped_share linear_normalised_regret
+    best_constant_normalised_regret random_normalised_regret constant_similarity """
+_RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str action_range:str
+    steps:int64 state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
+    hidden_width:int64 policy_init:str spec_seed:str spec_digest:str seed:int64 nu
+    transitions:Int64 dataset_digest:str behaviour_similarity behaviour_similarity_sd
+    offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
+_CURVES = _PLACE + "step:int64 episode_return regret similarity length"
 _REFERENCES = {
     "linear_normalised_regret": "linear_least_squares",
     "best_constant_normalised_regret": "best_constant",
@@ -154,11 +134,17 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
       plan: the plan; cells that are not in it are ignored.
       results: finished runs, by the digests of their cells.
     """
-    finished = [(cell, results[cell.cell.digest]) for cell in ordered(plan)
-                if cell.cell.digest in results]  # fmt: skip
+    planned = [(cell, results.get(cell.cell.digest)) for cell in ordered(plan)]
+    finished = [(cell, result) for cell, result in planned if result is not None]
     rows = [row for cell, result in finished for row in _result_rows(cell, result)]
     evaluations = [row for cell, result in finished for row in _curve_rows(cell, result)]
-    return StudyFrames(frame(rows, _RESULTS), frame(evaluations, _CURVES))
+    return StudyFrames(frame(rows, _PLACE + _REGION + _RUN), frame(evaluations, _CURVES))
+
+
+def runs(results: pd.DataFrame) -> pd.DataFrame:
+    """One row per run: `results` without the columns of its regions."""
+    columns = [*RUN, *_dtypes(_RUN)]
+    return results.drop_duplicates(RUN)[columns].reset_index(drop=True)
 
 
 def ordered(plan: StudyPlan) -> list[PlannedCell]:
@@ -168,9 +154,20 @@ def ordered(plan: StudyPlan) -> list[PlannedCell]:
     return sorted(plan.cells, key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
 
 
-def frame(rows: Sequence[Any], columns: Mapping[str, str]) -> pd.DataFrame:
-    """A frame with these columns and their dtypes, also where there are no rows."""
-    return pd.DataFrame(rows, columns=list(columns)).astype(dict(columns))
+def frame(rows: Sequence[Any], columns: str) -> pd.DataFrame:
+    """A frame of rows, with the same columns and dtypes where there are none.
+
+    Args:
+      rows: tuples or dicts.
+      columns: `name:dtype`, or `name` alone for float64, separated by spaces.
+    """
+    dtypes = _dtypes(columns)
+    return pd.DataFrame(rows, columns=list(dtypes)).astype(dtypes)
+
+
+def _dtypes(columns: str) -> dict[str, str]:
+    parts = (column.partition(":") for column in columns.split())
+    return {name: dtype or "float64" for name, _, dtype in parts}
 
 
 def window(evaluations: int) -> int:
@@ -179,20 +176,25 @@ def window(evaluations: int) -> int:
 
 
 def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+    """One row a region."""
     run = _place(cell) | _run_columns(result)
     references = result.report.references
     for index, region in enumerate(result.report.regions):
-        yield run | {
-            **_region_columns(region),
-            **{
-                column: references[name][index].normalised_regret
-                for column, name in _REFERENCES.items()
-            },
+        regrets = {
+            column: references[name][index].normalised_regret
+            for column, name in _REFERENCES.items()
+        }
+        yield {
+            **run,
+            **region.model_dump(exclude={"name", "channels"}),
+            **regrets,
+            "region": region.name,
             "constant_similarity": references["constant_half"][index].similarity,
         }
 
 
 def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[tuple[Any, ...]]:
+    """One row an evaluation."""
     curve = result.curve
     columns = (curve.steps, curve.episode_return, curve.regret, curve.similarity, curve.length)
     for evaluation in zip(*columns, strict=True):
@@ -203,25 +205,11 @@ def _place(cell: PlannedCell) -> dict[str, Any]:
     return {"class_name": cell.class_name, "algorithm": cell.algorithm, "run": cell.run}
 
 
-def _region_columns(region: RegionReport) -> dict[str, Any]:
-    return {
-        "region": region.name,
-        "epsilon_low": region.epsilon_low,
-        "epsilon_high": region.epsilon_high,
-        "states": region.states,
-        "similarity": region.similarity,
-        "similarity_sd": region.similarity_sd,
-        "mae": region.mae,
-        "normalised_regret": region.normalised_regret,
-        "similarity_decay": region.similarity_decay,
-        "similarity_loss": region.similarity_loss,
-        "clipped_share": region.clipped_share,
-    }
-
-
 def _run_columns(result: CellResult) -> dict[str, Any]:
-    cell, report = result.cell, result.report
-    return {
+    """The columns of `_RUN`; those of offline runs only where there are any."""
+    cell, report, offline = result.cell, result.report, result.offline
+    columns = {
+        **cell.spec.model_dump(exclude={"schema_version", "seed", "team"}),
         "wd_regret": report.wd_regret,
         "ood_regret": report.ood_regret,
         "ood_decay": report.ood_decay,
@@ -230,31 +218,20 @@ def _run_columns(result: CellResult) -> dict[str, Any]:
         "uses": cell.uses,
         "action_range": cell.action_range,
         "steps": cell.steps,
-        **{name: getattr(cell.spec, name) for name in _SPEC_FIELDS},
         "spec_seed": str(cell.spec.seed),
         "spec_digest": cell.spec.digest,
         "seed": cell.seed,
-        **_offline_columns(result),
         "seconds": result.timing.total,
         "steps_per_second": result.timing.steps_per_second,
         "key": result.key,
     }
-
-
-def _offline_columns(result: CellResult) -> dict[str, Any]:
-    offline = result.offline
-    if offline is None:
-        return {}  # NaN, NA
-    return {
-        "nu": offline.nu,
-        "transitions": offline.transitions,
-        "dataset_digest": offline.dataset_digest,
-        "behaviour_similarity": offline.behaviour_similarity,
-        "behaviour_similarity_sd": offline.behaviour_similarity_sd,
-        "offline_similarity": offline.similarity,
-        "offline_similarity_sd": offline.similarity_sd,
-        "improvement": offline.similarity - offline.behaviour_similarity,
-    }
+    if offline is not None:
+        columns |= offline.model_dump(exclude={"similarity", "similarity_sd"}) | {
+            "offline_similarity": offline.similarity,
+            "offline_similarity_sd": offline.similarity_sd,
+            "improvement": offline.similarity - offline.behaviour_similarity,
+        }
+    return columns
 
 
 def _final_return(result: CellResult) -> float:

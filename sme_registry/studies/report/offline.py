@@ -12,7 +12,8 @@ from typing import Any
 
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.exports import number
-from sme_registry.studies.report.tables import ENOUGH_RUNS, OFFLINE_INTERVAL, training_data
+from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
 
 _NEAR = 0.02  # of r̃: what is called near, or imitated
 _FALLEN = 0.1  # of r̃ below its data: what is called a collapse

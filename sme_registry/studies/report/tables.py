@@ -7,20 +7,25 @@ in `counts` and `missing`, and are part of no other number. An unknown interval 
     change           IQM over run numbers i of  x_i(class) − x_i(first class)
     low, high        ends of a 95 % bootstrap interval (`statistics`); NaN for a single run
 
-| table | one row per | columns |
-|---|---|---|
-| `runs` | run | class_name, algorithm, run, and `frames.RUN_COLUMNS` |
-| `counts` | class × algorithm | done, failed, planned |
-| `missing` | run that has not finished | run, error ("" if it has not failed) |
-| `regions` | class × algorithm × region | epsilon_high, runs, similarity (IQM), similarity_q25, similarity_q75, normalised_regret (IQM), linear_normalised_regret (median) |
-| `levels` | class × algorithm × metric | runs, iqm, low, high, linear (median of the linear policy on the same tasks) |
-| `contrasts` | class × algorithm × metric | axis, base (IQM on the first class), level (IQM on this one), change, low, high, pairs, enough_pairs, verdict (worse, better, open) |
-| `aggregates` | group × metric × algorithm × statistic | classes, runs, fewest_runs (in a class), value, low, high |
-| `profiles` | group × metric × algorithm × threshold | fewest_runs, share (of runs whose value is above the threshold), low, high |
-| `improvements` | group × metric × pair of algorithms | first, second, classes, fewest_runs, probability, low, high |
-| `learning_curves` | class × algorithm × measure × step | median, q25, q75 over runs, smoothed; runs, window (evaluations averaged) |
-| `offline` | class × ν × learner | runs, similarity, similarity_sd, improvement (means over runs), low, high, verdict (above, above_few, below, below_few, open), behaviour_similarity, behaviour_similarity_sd, data_sets, constant_similarity |
-"""  # noqa: E501
+Columns of each table, those that name the row first; class_name and algorithm are not repeated.
+
+    counts            done, failed, planned: number of runs
+    missing           run; error: "" if it has not failed
+    regions           region: epsilon_high, runs; IQM over runs of similarity (and its quartiles
+                      similarity_q25, similarity_q75) and normalised_regret; median of
+                      linear_normalised_regret
+    levels            metric: runs, iqm, low, high; linear: the linear policy's median on the same
+                      tasks, NaN for metrics of training
+    contrasts         metric: axis; base, level: IQM on the first class and on this one; change,
+                      low, high; pairs; enough_pairs; verdict: worse, better or open
+    aggregates        group, metric, statistic: classes, runs, fewest_runs (of a class); value: mean
+                      over classes; low, high
+    profiles          group, metric, threshold: fewest_runs; share: of runs whose value is above the
+                      threshold; low, high
+    improvements      group, metric, first, second: classes, fewest_runs; probability; low, high
+    learning_curves   measure, step: median, q25, q75 over runs, smoothed; runs; window: evaluations
+                      averaged
+"""
 
 from __future__ import annotations
 
@@ -34,22 +39,15 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyAlgorithm, StudyPlan
+from sme_registry.spec import StudyPlan
 from sme_registry.statistics import Array, Statistic
 from sme_registry.studies.report.classes import ClassInfo, Group
-from sme_registry.studies.report.frames import (
-    RUN,
-    RUN_COLUMNS,
-    frame,
-    ordered,
-    window,
-)
+from sme_registry.studies.report.frames import frame, ordered, runs, window
 
 # With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
 # 95 % interval of one class covers the truth in 32–62 % of cases with 2 runs, in 48–86 % with 3, in
 # 94–98 % with 4 to 10.
 ENOUGH_RUNS = 5
-OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
 THRESHOLDS = np.linspace(0.0, 1.0, 101)
 STATISTICS: dict[str, Statistic] = {
     "iqm": statistics.iqm,
@@ -57,7 +55,8 @@ STATISTICS: dict[str, Statistic] = {
     "optimality_gap": statistics.optimality_gap,
 }
 CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per step"}
-_PLACE = ["class_name", "algorithm"]
+PLACE = ["class_name", "algorithm"]
+_PLACE = "class_name:str algorithm:str"
 
 Runs = Mapping[tuple[str, str], pd.DataFrame]
 
@@ -114,11 +113,6 @@ class Bootstrap:
         return float(low[0]), float(high[0])
 
 
-def runs(results: pd.DataFrame) -> pd.DataFrame:
-    """One row per run: `results` without the columns of its regions."""
-    return results.drop_duplicates(RUN)[[*RUN, *RUN_COLUMNS]].reset_index(drop=True)
-
-
 def missing(plan: StudyPlan, runs: pd.DataFrame, errors: Mapping[str, str]) -> pd.DataFrame:
     """The runs that have not finished, in the plan's order; `errors` are by the cells' digests."""
     done = set(runs.key)
@@ -127,18 +121,15 @@ def missing(plan: StudyPlan, runs: pd.DataFrame, errors: Mapping[str, str]) -> p
         for cell in plan.cells
         if cell.cell.digest not in done
     ]
-    columns = {"class_name": "str", "algorithm": "str", "run": "int64", "error": "str"}
-    return frame(rows, columns)
+    return frame(rows, f"{_PLACE} run:int64 error:str")
 
 
 def counts(plan: StudyPlan, missing: pd.DataFrame) -> pd.DataFrame:
     """How many runs of each algorithm on each class have finished and failed."""
-    planned = frame(
-        [(c.class_name, c.algorithm) for c in ordered(plan)], dict.fromkeys(_PLACE, "str")
-    )
-    table = planned.groupby(_PLACE, sort=False).size().rename("planned").to_frame()
-    absent = missing.groupby(_PLACE).size().reindex(table.index, fill_value=0)
-    failed = missing[missing.error != ""].groupby(_PLACE).size()
+    planned = frame([(c.class_name, c.algorithm) for c in ordered(plan)], _PLACE)
+    table = planned.groupby(PLACE, sort=False).size().rename("planned").to_frame()
+    absent = missing.groupby(PLACE).size().reindex(table.index, fill_value=0)
+    failed = missing[missing.error != ""].groupby(PLACE).size()
     table.insert(0, "done", table.planned - absent)
     table.insert(1, "failed", failed.reindex(table.index, fill_value=0))
     return table.reset_index()
@@ -147,7 +138,7 @@ def counts(plan: StudyPlan, missing: pd.DataFrame) -> pd.DataFrame:
 def regions(results: pd.DataFrame) -> pd.DataFrame:
     """Each algorithm on each class in each region, over its runs."""
     return (
-        results.groupby([*_PLACE, "region"], sort=False)
+        results.groupby([*PLACE, "region"], sort=False)
         .agg(
             epsilon_high=("epsilon_high", "first"),
             runs=("run", "size"),
@@ -172,7 +163,7 @@ def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
                 low, high = bootstrap.interval(values, _label("level", place, metric))
                 reference = linear[place].get(metric.key, math.nan)
                 rows.append((*place, metric.key, len(values), _iqm(values), low, high, reference))
-    return frame(rows, _PLACE_METRIC | {"runs": "int64"} | _floats("iqm low high linear"))
+    return frame(rows, f"{_PLACE} metric:str runs:int64 iqm low high linear")
 
 
 def contrasts(
@@ -198,9 +189,8 @@ def contrasts(
                 (*place, metric.key, classes[place[0]].axis, before, level, middle, low, high,
                  len(both), len(both) >= ENOUGH_RUNS, verdict)
             )  # fmt: skip
-    columns = {"axis": "str", **_floats("base level change low high"), "pairs": "int64",
-               "enough_pairs": "bool", "verdict": "str"}  # fmt: skip
-    return frame(rows, _PLACE_METRIC | columns)
+    columns = "axis:str base level change low high pairs:int64 enough_pairs:bool verdict:str"
+    return frame(rows, f"{_PLACE} metric:str {columns}")
 
 
 def contrast_verdict(worsening: float, low: float, high: float) -> str:
@@ -227,8 +217,8 @@ def aggregates(
                 (group.name, metric.key, algorithm, name, len(sizes), sum(sizes), min(sizes), value,
                  *ends)
             )  # fmt: skip
-    columns = _strings("group metric algorithm statistic") | _integers("classes runs fewest_runs")
-    return frame(rows, columns | _floats("value low high"))
+    columns = "statistic:str classes:int64 runs:int64 fewest_runs:int64 value low high"
+    return frame(rows, f"group:str metric:str algorithm:str {columns}")
 
 
 def profiles(
@@ -242,8 +232,8 @@ def profiles(
         shares = statistics.performance_profile(values, THRESHOLDS, bootstrap.draws, seed)
         shares_at = zip(THRESHOLDS.round(4), shares.value, shares.low, shares.high, strict=True)
         rows += [(group.name, metric.key, algorithm, fewest, *at) for at in shares_at]
-    columns = _strings("group metric algorithm") | _integers("fewest_runs")
-    return frame(rows, columns | _floats("threshold share low high"))
+    columns = "fewest_runs:int64 threshold share low high"
+    return frame(rows, f"group:str metric:str algorithm:str {columns}")
 
 
 def improvements(
@@ -267,15 +257,16 @@ def improvements(
         ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
         place = group.name, metric.key, first, second
         rows.append((*place, len(x), fewest, estimate.value[0], *ends))
-    columns = _strings("group metric first second") | _integers("classes fewest_runs")
-    return frame(rows, columns | _floats("probability low high"))
+    columns = "first:str second:str classes:int64 fewest_runs:int64 probability low high"
+    return frame(rows, f"group:str metric:str {columns}")
 
 
 def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Median and quartiles over runs, then the mean over a window of evaluations."""
     horizons = runs.groupby("class_name").horizon.first()
-    tables = [frame([], _CURVE_COLUMNS)]
-    for (class_name, algorithm), group in curves.groupby(_PLACE, sort=False):
+    columns = f"{_PLACE} measure:str step:int64 median q25 q75 runs:int64 window:int64"
+    tables = [frame([], columns)]
+    for (class_name, algorithm), group in curves.groupby(PLACE, sort=False):
         each = [run for _, run in group.groupby("run")]
         P = min(map(len, each))
         steps = np.median([run.step[:P] for run in each], axis=0).astype(int)
@@ -290,7 +281,7 @@ def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
                 "median": median, "q25": q25, "q75": q75, "runs": len(each), "window": window(P),
             }  # fmt: skip
             tables.append(pd.DataFrame(table))
-    return pd.concat(tables, ignore_index=True).astype(_CURVE_COLUMNS)
+    return pd.concat(tables, ignore_index=True)
 
 
 def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
@@ -301,106 +292,9 @@ def training_data(runs: pd.DataFrame) -> dict[str, tuple[float, int] | None]:
     }
 
 
-def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
-    """One row per run of an offline learner: with `learner` and the WD `constant_similarity`.
-
-    Ordered by class, ν, learner and run.
-    """
-    names = learner_names(algorithms)
-    places = list(dict.fromkeys(names.values()))
-    rows = results[results.nu.notna()].drop_duplicates(RUN)
-    rows = rows.assign(learner=rows.algorithm.map(names))
-    order = {name: i for i, name in enumerate(dict.fromkeys(rows.class_name))}
-    keys = pd.DataFrame({
-        "class": rows.class_name.map(order), "nu": rows.nu,
-        "learner": rows.learner.map(places.index), "run": rows.run,
-    })  # fmt: skip
-    return rows.loc[keys.sort_values([*keys], kind="stable").index].reset_index(drop=True)
-
-
-def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    """Each offline learner on each class at each ν, with the data that it learnt from.
-
-    Args:
-      runs: see `offline_runs`.
-      bootstrap: of the intervals.
-    """
-    data = {place: _data_columns(group) for place, group in runs.groupby(["class_name", "nu"])}
-    rows = []
-    for (class_name, nu, learner), group in runs.groupby(
-        ["class_name", "nu", "learner"], sort=False
-    ):
-        changes = group.improvement.to_numpy()
-        low = high = math.nan
-        if len(changes) >= OFFLINE_INTERVAL:
-            label = f"offline {learner} {class_name} {nu:g}"
-            low, high = bootstrap.interval(changes, label, statistics.mean)
-        rows.append(
-            {
-                "class_name": class_name, "nu": nu, "learner": learner, "runs": len(group),
-                "similarity": group.offline_similarity.to_numpy().mean(),
-                "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
-                "improvement": changes.mean(), "low": low, "high": high,
-                "verdict": offline_verdict(changes, low, high), **data[class_name, nu],
-            }
-        )  # fmt: skip
-    columns = {
-        "class_name": "str", "nu": "float64", "learner": "str", "runs": "int64",
-        **_floats("similarity similarity_sd improvement low high"), "verdict": "str",
-        **_floats("behaviour_similarity behaviour_similarity_sd"), "data_sets": "int64",
-        "constant_similarity": "float64",
-    }  # fmt: skip
-    return frame(rows, columns)
-
-
-def offline_verdict(improvements: Array, low: float, high: float) -> str:
-    """Whether a learner surpasses its data, from the improvements of its runs.
-
-    `above` or `below` if `ENOUGH_RUNS` runs have an interval that excludes 0; `above_few` or
-    `below_few` if all of fewer runs, but more than one, are on one side; otherwise `open`.
-    """
-    if len(improvements) >= ENOUGH_RUNS:
-        return "above" if low > 0.0 else "below" if high < 0.0 else "open"
-    if len(improvements) > 1 and improvements.min() > 0.0:
-        return "above_few"
-    return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
-
-
-def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
-    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
-    settings = {
-        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
-        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
-        for algorithm in algorithms
-    }
-    names = {}
-    for algorithm in algorithms:
-        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
-        own = settings[algorithm.name]
-        differing = [
-            f"{key} = {own[key]}" if key in own else f"default {key}"
-            for key in sorted({key for each in alike for key in each})
-            if any(each.get(key) != alike[0].get(key) for each in alike)
-        ]
-        name = algorithm.uses.removeprefix("offline:").upper()
-        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
-    return names
-
-
 def by_place(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
     """The rows of each (class, algorithm), in their order."""
-    return dict(iter(rows.groupby(_PLACE, sort=False)))
-
-
-def _data_columns(runs: pd.DataFrame) -> dict[str, Any]:
-    """The data sets of one ν on a class; each counts once, however many runs learnt from it."""
-    data_sets = runs.drop_duplicates("dataset_digest")
-    return {
-        "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
-        "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
-        "data_sets": len(data_sets),
-        "constant_similarity": runs.constant_similarity.to_numpy().mean(),
-    }
+    return dict(iter(rows.groupby(PLACE, sort=False)))
 
 
 def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
@@ -442,24 +336,3 @@ def _smoothed(line: Array, width: int) -> Array:
     ends = np.arange(1, len(line) + 1)
     begins = np.maximum(0, ends - width)
     return np.asarray((total[ends] - total[begins]) / (ends - begins))
-
-
-def _floats(names: str) -> dict[str, str]:
-    return dict.fromkeys(names.split(), "float64")
-
-
-def _integers(names: str) -> dict[str, str]:
-    return dict.fromkeys(names.split(), "int64")
-
-
-def _strings(names: str) -> dict[str, str]:
-    return dict.fromkeys(names.split(), "str")
-
-
-_PLACE_METRIC = _strings("class_name algorithm metric")
-_CURVE_COLUMNS = (
-    _strings("class_name algorithm measure")
-    | _integers("step")
-    | _floats("median q25 q75")
-    | _integers("runs window")
-)

@@ -6,16 +6,8 @@ from collections.abc import Sequence
 
 from sme_registry.plots import literal
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.panels import (
-    HEADINGS,
-    WIDTH,
-    Picture,
-    legend,
-    looks,
-    marks_by_algorithm,
-    panel_grid,
-    shade_rows,
-)
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.tables import ENOUGH_RUNS, REGRET_METRICS
 
 
@@ -25,20 +17,20 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Picture | str
     if rows.empty:
         return "No aggregates over classes: no class has runs of every algorithm."
     place = {group: float(i) for i, group in enumerate(dict.fromkeys(rows.group))}
-    drawn = looks(analysis)
+    drawn = panels.looks(analysis)
     height = 1.1 + (0.09 * len(drawn) + 0.1) * max(2, len(place))
-    with panel_grid(2, (WIDTH, height), formats) as (grid, files):
+    with panels.panel_grid(2, formats, (0.0, height)) as (grid, files):
         for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
             own = rows[rows.metric == metric.key]
             enough = own.fewest_runs >= ENOUGH_RUNS
-            marks_by_algorithm(axes, own, "value", own.group.map(place), enough, drawn)
-            axes.set_title(HEADINGS[metric.key], fontsize=9)
+            panels.marks_by_algorithm(axes, own, "value", own.group.map(place), enough, drawn)
+            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
             axes.set_xlabel("IQM of 1 − normalised regret")
-            shade_rows(axes, place.values())
+            panels.shade_rows(axes, place.values())
         labels = [literal(group) for group in place]
         grid.panels[0].set_yticks([*place.values()], labels, fontsize=8)
         grid.panels[0].set_ylim(len(place) - 0.4, -0.6)
-        legend(grid.figure, drawn)
+        panels.legend(grid.figure, drawn)
     return Picture(
         "aggregates",
         "Aggregates over kinds of tasks",

@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.panels import (
-    WIDTH,
-    Picture,
-    legend,
-    looks,
-    marks_by_algorithm,
-    panel_grid,
-    shade_rows,
-)
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.tables import ENOUGH_RUNS, Metric
 
 
@@ -26,24 +19,23 @@ def draw_contrasts(
         return (
             "No contrasts: they need finished runs of one number on the first class and on another."
         )
-    present = set(rows.algorithm)
-    drawn = {algorithm: look for algorithm, look in looks(analysis).items() if algorithm in present}
+    drawn = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
     axes_of = {c: analysis.classes[c].axis for c in analysis.classes if c in set(rows.class_name)}
     place = _places(axes_of)
     height = 1.15 + (0.07 * len(drawn) + 0.09) * max(5.0, max(place.values()) + 1)
-    with panel_grid(len(metrics), (WIDTH, height), formats) as (grid, files):
+    with panels.panel_grid(len(metrics), formats, (0.0, height)) as (grid, files):
         for axes, metric in zip(grid.panels, metrics, strict=True):
             own = rows[rows.metric == metric.key]
             at = own.class_name.map(place)
-            marks_by_algorithm(axes, own, "change", at, own.enough_pairs, drawn)
+            panels.marks_by_algorithm(axes, own, "change", at, own.enough_pairs, drawn)
             axes.axvline(0.0, color="black", linewidth=0.9, zorder=1.5)
             side = "right" if metric.worse > 0 else "left"
             axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
-            axes.locator_params(axis="x", nbins=5)
-            shade_rows(axes, place.values())
+            axes.locator_params(axis="x", nbins=15 // len(metrics))
+            panels.shade_rows(axes, place.values())
         grid.panels[0].set_yticks([*place.values()], [*place], fontsize=8)
         grid.panels[0].set_ylim(max(place.values()) + 0.6, -0.6)
-        legend(grid.figure, drawn)
+        panels.legend(grid.figure, drawn)
     names = [metric.label.partition(",")[0] for metric in metrics]
     return Picture(
         name,

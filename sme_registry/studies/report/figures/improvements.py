@@ -7,14 +7,8 @@ from collections.abc import Sequence
 from sme_registry.plots import GREY, literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
-from sme_registry.studies.report.figures.panels import (
-    HEADINGS,
-    WIDTH,
-    Look,
-    Picture,
-    marks,
-    panel_grid,
-)
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Look, Picture
 from sme_registry.studies.report.tables import ENOUGH_RUNS, REGRET_METRICS
 
 
@@ -28,15 +22,14 @@ def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Picture | s
         )
     pairs = rows["first"] + " over " + rows["second"]
     place = {pair: float(i) for i, pair in enumerate(dict.fromkeys(pairs))}
-    size = (WIDTH, 1.0 + 0.26 * max(3, len(place)))
-    with panel_grid(2, size, formats) as (grid, files):
+    with panels.panel_grid(2, formats, (1.0, 0.26 * max(3, len(place)))) as (grid, files):
         for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
             own = rows[rows.metric == metric.key]
             at, enough = pairs[own.index].map(place), own.fewest_runs >= ENOUGH_RUNS
-            marks(axes, own, "probability", at, enough, Look("black", "o", "-"))
+            panels.marks(axes, own, "probability", at, enough, Look("black", "o", "-"))
             axes.axvline(0.5, color=GREY, linewidth=1.0, zorder=1.5)
             axes.set_xlim(-0.02, 1.02)
-            axes.set_title(HEADINGS[metric.key], fontsize=9)
+            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
             axes.set_xlabel("P(a run of X beats a run of Y)")
             axes.grid(visible=False, axis="y")
             axes.tick_params(axis="y", length=0)

@@ -7,19 +7,11 @@ from typing import Any
 
 import pandas as pd
 
-from sme_registry.plots import MARKERS, literal, shades
+from sme_registry.plots import literal, shades
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, Group, setting_label
-from sme_registry.studies.report.figures.panels import (
-    DASHES,
-    WIDTH,
-    Look,
-    Picture,
-    columns,
-    cycled,
-    line_sample,
-    panel_grid,
-)
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Look, Picture
 from sme_registry.studies.report.tables import CURVES, training_data
 
 _MOST_ACROSS = 4
@@ -44,18 +36,12 @@ def _draw_group(
     analysis: Analysis, formats: Sequence[str], group: Group, rows: pd.DataFrame, names: list[str]
 ) -> Picture:
     data = training_data(analysis.runs)
-    drawn = {
-        name: Look(colour, cycled(MARKERS, i), cycled(DASHES, i))
-        for i, (name, colour) in enumerate(
-            zip(group.classes, shades(len(group.classes)), strict=True)
-        )
-    }
-    across, down = columns(len(names), _MOST_ACROSS)
-    size = (min(WIDTH, 1.2 + 2.6 * across), 0.6 + 4.4 * down)
-    with panel_grid(len(names), size, formats, most_across=_MOST_ACROSS, stack=len(CURVES)) as (
-        grid,
-        files,
-    ):
+    drawn = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
+    figure = panels.panel_grid(
+        len(names), formats, (0.6, 4.4), width=min(panels.WIDTH, 1.2 + 2.6 * len(names)),
+        most_across=_MOST_ACROSS, stack=len(CURVES),
+    )  # fmt: skip
+    with figure as (grid, files):
         for stack, name in zip(grid.stacks, names, strict=True):
             own = rows[rows.algorithm == name]
             for axes, measure in zip(stack, CURVES, strict=True):
@@ -67,14 +53,8 @@ def _draw_group(
             stack[-1].xaxis.set_major_formatter(_steps)
         for index, label in enumerate(CURVES.values()):
             grid.label_rows(label, index)
-        handles = [
-            line_sample(
-                grid.stacks[0][0], _label(analysis, name, group), color=look.colour,
-                linewidth=1.6, markersize=4, linestyle=look.dash, marker=look.marker,
-            )
-            for name, look in drawn.items()
-        ]  # fmt: skip
-        grid.figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
+        labels = {_label(analysis, name, group): look for name, look in drawn.items()}
+        panels.legend(grid.figure, labels, across=4)
     window = rows.window.max()
     return Picture(
         f"learning-curves-{(group.axis or group.name).replace(' ', '-').lower()}",
@@ -99,8 +79,8 @@ def _draw_curves(axes: Any, rows: pd.DataFrame, drawn: Mapping[str, Look]) -> No
         )
         every = max(1, len(curve) // 6)
         axes.plot(
-            curve.step, curve["median"], color=look.colour, linewidth=1.6, linestyle=look.dash,
-            marker=look.marker, markersize=4, markevery=(index * every // len(drawn), every),
+            curve.step, curve["median"], **look.line, linewidth=1.6, markersize=4,
+            markevery=(index * every // len(drawn), every),
         )  # fmt: skip
 
 

@@ -6,22 +6,14 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from sme_registry.plots import COLOURS, GREY, MARKERS, literal
+from sme_registry.plots import GREY, literal
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.panels import (
-    CONSTANT_DASH,
-    WIDTH,
-    Look,
-    Picture,
-    columns,
-    cycled,
-    line_sample,
-    marks,
-    panel_grid,
-)
-from sme_registry.studies.report.tables import ENOUGH_RUNS, OFFLINE_INTERVAL
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Look, Picture
+from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import ENOUGH_RUNS
 
-_LEARNER_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 _OPTIMUM_DASH: Any = (0, (1, 1.2))
 
 
@@ -30,34 +22,23 @@ def draw_offline(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
     if not analysis.has_offline_runs:
         return []
     classes = list(dict.fromkeys(analysis.offline.class_name))
-    drawn = {
-        name: Look(cycled(COLOURS, i), cycled(MARKERS, i), cycled(_LEARNER_DASHES, i))
-        for i, name in enumerate(dict.fromkeys(analysis.offline.learner))
-    }
-    across, down = columns(len(classes))
-    size = (max(3.6, min(WIDTH, 1.0 + 2.4 * across)), 0.9 + 2.4 * down)
-    with panel_grid(len(classes), size, formats, share_x=True) as (grid, files):
+    drawn = panels.numbered_looks(dict.fromkeys(analysis.offline.learner), dashes=_DASHES)
+    across = min(3, len(classes))
+    width = max(3.6, min(panels.WIDTH, 1.0 + 2.4 * across))
+    with panels.panel_grid(len(classes), formats, (0.9, 2.4), width=width, share_x=True) as (
+        grid,
+        files,
+    ):
         for axes, class_name in zip(grid.panels, classes, strict=True):
             _draw_class(axes, analysis, class_name, drawn)
         grid.label_rows("r̃ − r̃ of the behaviour")
         grid.label_columns("ν of the behaviour policy")
-        first = grid.panels[0]
-        handles = [
-            line_sample(
-                first, name, linewidth=1.4, markersize=4.5, color=look.colour, marker=look.marker,
-                linestyle=look.dash,
-            )
-            for name, look in drawn.items()
-        ]  # fmt: skip
-        handles += [
-            line_sample(first, label, color=colour, linewidth=1.1, linestyle=dash)
-            for label, dash, colour in (
-                ("behaviour policy", "-", "black"),
-                ("optimum", _OPTIMUM_DASH, GREY),
-                ("constant ½", CONSTANT_DASH, GREY),
-            )
-        ]
-        grid.figure.legend(handles=handles, loc="outside lower center", ncols=2 * across)
+        lines = {
+            "behaviour policy": ("black", "-"),
+            "optimum": (GREY, _OPTIMUM_DASH),
+            "constant ½": (GREY, panels.CONSTANT_DASH),
+        }
+        panels.legend(grid.figure, drawn, lines, across=2 * across)
     title = "Improvement over the behaviour policy"
     return [Picture("offline-improvement", title, _caption(analysis), files)]
 
@@ -67,7 +48,10 @@ def _draw_class(axes: Any, analysis: Analysis, class_name: str, drawn: dict[str,
     runs = analysis.offline_runs[analysis.offline_runs.class_name == class_name]
     data = rows.drop_duplicates("nu")
     axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
-    for similarity, dash in ((1.0, _OPTIMUM_DASH), (data.constant_similarity, CONSTANT_DASH)):
+    for similarity, dash in (
+        (1.0, _OPTIMUM_DASH),
+        (data.constant_similarity, panels.CONSTANT_DASH),
+    ):
         height = similarity - data.behaviour_similarity
         axes.plot(data.nu, height, color=GREY, linewidth=1.1, linestyle=dash, zorder=1.6)
     nus = sorted(set(analysis.offline.nu))
@@ -75,15 +59,12 @@ def _draw_class(axes: Any, analysis: Analysis, class_name: str, drawn: dict[str,
     for index, (name, look) in enumerate(drawn.items()):
         shift = (index - (len(drawn) - 1) / 2) * 0.25 * apart / len(drawn)
         own, each = rows[rows.learner == name], runs[runs.learner == name]
+        at, enough = own.nu + shift, own.runs >= ENOUGH_RUNS
+        panels.marks(axes, own, "improvement", at, enough, look, upright=True, joined=True)
         axes.plot(
-            own.nu + shift, own.improvement, color=look.colour, linewidth=1.4, linestyle=look.dash
-        )
-        axes.plot(
-            each.nu + shift, each.improvement, color=look.colour, marker=look.marker,
-            markersize=2.5, markeredgewidth=0.0, alpha=0.5, linestyle="none", zorder=2.5,
+            each.nu + shift, each.improvement, **look.points, markersize=2.5, markeredgewidth=0.0,
+            alpha=0.5, zorder=3.5,
         )  # fmt: skip
-        enough = own.runs >= ENOUGH_RUNS
-        marks(axes, own, "improvement", own.nu + shift, enough, look, upright=True)
     axes.set_title(literal(class_name))
 
 

@@ -45,11 +45,21 @@ class Picture:
 
 
 class Look(NamedTuple):
-    """How an algorithm is drawn in every figure."""
+    """How an algorithm, or a class, is drawn."""
 
     colour: Any
     marker: str
     dash: Any
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """As arguments of `plot`, for a line with marks."""
+        return {"color": self.colour, "marker": self.marker, "linestyle": self.dash}
+
+    @property
+    def points(self) -> dict[str, Any]:
+        """As arguments of `plot`, for marks alone."""
+        return self.line | {"linestyle": "none"}
 
 
 class Grid(NamedTuple):
@@ -83,18 +93,13 @@ class Grid(NamedTuple):
             axes.set_xlabel(label if lowest else "")
 
 
-def columns(panels: int, most: int = 3) -> tuple[int, int]:
-    """How many columns and rows a grid has."""
-    across = min(most, panels)
-    return across, math.ceil(panels / across)
-
-
 @contextmanager
 def panel_grid(
     panels: int,
-    size: tuple[float, float],
     formats: Sequence[str],
+    heights: tuple[float, float],
     *,
+    width: float = WIDTH,
     most_across: int = 3,
     stack: int = 1,
     share_x: bool = False,
@@ -103,8 +108,9 @@ def panel_grid(
 
     Args:
       panels: how many.
-      size: width and height in inches.
       formats: of `plots.FORMATS`.
+      heights: in inches, of all but the panels and of each row of panels.
+      width: in inches.
       most_across: panels in a row.
       stack: axes in a panel, one above the other; they share x, and y with the same row of others.
       share_x: whether all panels share x.
@@ -112,8 +118,9 @@ def panel_grid(
     Yields:
       The grid, and a dict that holds each format's bytes after the block.
     """
-    across, down = columns(panels, most_across)
-    with drawing(size, tuple(formats)) as (figure, files):
+    across = min(most_across, panels)
+    down = math.ceil(panels / across)
+    with drawing((width, heights[0] + down * heights[1]), tuple(formats)) as (figure, files):
         axes = figure.subplots(stack * down, across, squeeze=False)
         stacks = np.concatenate([block.T for block in np.split(axes, down)])
         for unused in stacks[panels:].ravel():
@@ -133,19 +140,21 @@ def panel_grid(
 
 def looks(analysis: Analysis) -> dict[str, Look]:
     """The look of each algorithm: colours for those that learn, grey for references."""
-    result = {
-        name: Look(cycled(COLOURS, i), cycled(MARKERS, i), cycled(DASHES, i))
-        for i, name in enumerate(analysis.learners)
-    }
+    result = numbered_looks(analysis.learners)
     references = [name for name in analysis.algorithms if name not in result]
     for i, name in enumerate(references):
-        result[name] = Look(GREY, cycled("x+12", i), DASHES[1 + i % 4])
+        result[name] = Look(GREY, "x+12"[i % 4], DASHES[1 + i % 4])
     return result
 
 
-def cycled(values: Sequence[Any], index: int) -> Any:
-    """The value at an index, from the beginning again after the last."""
-    return values[index % len(values)]
+def numbered_looks(
+    names: Iterable[str], colours: Sequence[Any] = COLOURS, dashes: Sequence[Any] = DASHES
+) -> dict[str, Look]:
+    """A look for each name, in order; each list is taken from its beginning again after its end."""
+    return {
+        name: Look(colours[i % len(colours)], MARKERS[i % len(MARKERS)], dashes[i % len(dashes)])
+        for i, name in enumerate(names)
+    }
 
 
 def marks(
@@ -181,9 +190,10 @@ def marks(
             ends = ([place, place], [low, high])
             axes.plot(*(ends if upright else ends[::-1]), color=look.colour, linewidth=1.4)
         point = (place, row_value) if upright else (row_value, place)
+        face = look.colour if is_filled else "white"
         axes.plot(
-            *point, color=look.colour, marker=look.marker, markersize=4.5, markeredgewidth=1.1,
-            markerfacecolor=look.colour if is_filled else "white", linestyle="none", zorder=3,
+            *point, **look.points, markersize=4.5, markeredgewidth=1.1, markerfacecolor=face,
+            zorder=3,
         )  # fmt: skip
 
 
@@ -213,19 +223,26 @@ def shade_rows(axes: Axes, places: Iterable[float]) -> None:
         axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
 
 
-def line_sample(axes: Axes, label: str, **style: Any) -> Any:
-    """A line without points, for a legend."""
-    return axes.plot([], [], label=literal(label), **style)[0]
+def legend(
+    figure: Figure,
+    looks: Mapping[str, Look],
+    lines: Mapping[str, tuple[str, Any]] | None = None,
+    across: int = 6,
+) -> None:
+    """The legend below a figure.
 
-
-def legend(figure: Figure, looks: Mapping[str, Look], extra: Sequence[Any] = ()) -> None:
-    """The legend of algorithms below the figure, with further lines after them."""
+    Args:
+      figure: that the legend is for.
+      looks: of what the labels name.
+      lines: colour and dash of further lines, by label.
+      across: entries in a row, at most.
+    """
+    styles = {name: {**look.line, "linewidth": 1.4} for name, look in looks.items()} | {
+        label: {"color": colour, "linestyle": dash, "linewidth": 1.2}
+        for label, (colour, dash) in (lines or {}).items()
+    }
     handles = [
-        line_sample(
-            figure.axes[0], name, color=look.colour, marker=look.marker, markersize=4.5,
-            linewidth=1.4, linestyle=look.dash,
-        )
-        for name, look in looks.items()
-    ]  # fmt: skip
-    handles += extra
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))
+        figure.axes[0].plot([], [], label=literal(label), markersize=4.5, **style)[0]
+        for label, style in styles.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(across, len(handles)))

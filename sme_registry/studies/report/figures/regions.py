@@ -10,7 +10,8 @@ import numpy as np
 from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import literal
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.panels import WIDTH, Picture, columns, panel_grid
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Picture
 
 _LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue
 
@@ -22,9 +23,8 @@ def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture | str:
         return "No table of regions: no run has finished."
     regions = list(dict.fromkeys(rows.region))
     classes = [name for name in analysis.classes if name in set(rows.class_name)]
-    _, down = columns(len(analysis.algorithms))
-    size = (WIDTH, down * (0.62 + 0.2 * len(classes)) + 0.75)
-    with panel_grid(len(analysis.algorithms), size, formats) as (grid, files):
+    heights = 0.75, 0.62 + 0.2 * len(classes)
+    with panels.panel_grid(len(analysis.algorithms), formats, heights) as (grid, files):
         for axes, name in zip(grid.panels, analysis.algorithms, strict=True):
             own = rows[rows.algorithm == name]
             values = own.pivot(index="class_name", columns="region", values="similarity")

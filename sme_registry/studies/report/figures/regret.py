@@ -9,20 +9,8 @@ from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import GREY, literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL, Group
-from sme_registry.studies.report.figures.panels import (
-    CONSTANT_DASH,
-    HEADINGS,
-    LINEAR_DASH,
-    WIDTH,
-    Look,
-    Picture,
-    columns,
-    legend,
-    line_sample,
-    looks,
-    marks_by_algorithm,
-    panel_grid,
-)
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Look, Picture
 from sme_registry.studies.report.tables import ENOUGH_RUNS, Metric
 
 
@@ -32,21 +20,20 @@ def draw_regret(analysis: Analysis, formats: Sequence[str], metric: Metric) -> P
     if not groups:
         return "No normalised regret: no run has finished."
     names = analysis.learners or analysis.algorithms
-    drawn = {name: look for name, look in looks(analysis).items() if name in names}
-    _, down = columns(len(groups))
-    with panel_grid(len(groups), (WIDTH, 0.7 + 2.3 * down), formats) as (grid, files):
+    drawn = {name: look for name, look in panels.looks(analysis).items() if name in names}
+    with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as (grid, files):
         for axes, group in zip(grid.panels, groups, strict=True):
             _draw_axis(axes, analysis, group, metric, drawn)
         grid.panels[0].set_ylim(bottom=0.0)  # of all, once all is drawn: it ends autoscaling
         grid.label_rows("normalised regret")
-        references = [
-            line_sample(grid.panels[0], label, color=GREY, linewidth=1.2, linestyle=dash)
-            for dash, label in ((LINEAR_DASH, "linear (LSQ)"), (CONSTANT_DASH, "constant ½"))
-        ]
-        legend(grid.figure, drawn, references)
+        references = {
+            "linear (LSQ)": (GREY, panels.LINEAR_DASH),
+            "constant ½": (GREY, panels.CONSTANT_DASH),
+        }
+        panels.legend(grid.figure, drawn, references)
     return Picture(
         metric.key.replace("_", "-"),
-        f"Normalised regret {HEADINGS[metric.key]}, along each axis",
+        f"Normalised regret {panels.HEADINGS[metric.key]}, along each axis",
         "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
         "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
         f"Hollow: fewer than {ENOUGH_RUNS} runs."
@@ -69,10 +56,10 @@ def _draw_axis(
     linear = levels.drop_duplicates("class_name", keep="last")
     axes.plot(
         at[linear.index], linear.linear, color=GREY, linewidth=1.2, markersize=14, zorder=1.6,
-        linestyle=LINEAR_DASH if ordered else "none", marker="" if ordered else "_",
+        linestyle=panels.LINEAR_DASH if ordered else "none", marker="" if ordered else "_",
     )  # fmt: skip
-    axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=CONSTANT_DASH, zorder=1.6)
-    marks_by_algorithm(
+    axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=panels.CONSTANT_DASH, zorder=1.6)
+    panels.marks_by_algorithm(
         axes, levels, "iqm", at, levels.runs >= ENOUGH_RUNS, drawn, spread=0.5, upright=True,
         joined=ordered,
     )  # fmt: skip

@@ -1,0 +1,128 @@
+"""Tables of the runs that learnt from data: how good the data were, and what was learnt from them.
+
+The improvement of a run is its r̃ minus the r̃ of the policy that made its data: 0 for imitation.
+
+`offline_runs` has one row per run: the columns of `frames`, `learner`, and `constant_similarity` in
+WD. `offline` has one row per class × ν × learner:
+
+    class_name, nu, learner      the learner's name is the same for every ν
+    runs                         number of runs
+    similarity, similarity_sd    mean over runs of `offline_similarity`, `offline_similarity_sd`
+    improvement, low, high       mean over runs, and its 95 % interval from `OFFLINE_INTERVAL` runs
+    verdict                      above, above_few, below, below_few, open: see `offline_verdict`
+    behaviour_similarity, behaviour_similarity_sd    mean over the data sets
+    data_sets                    number of data sets
+    constant_similarity          mean r̃ of the constant ½ in WD, over runs
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from sme_registry import statistics
+from sme_registry.spec import StudyAlgorithm
+from sme_registry.statistics import Array
+from sme_registry.studies.report.frames import RUN, frame
+from sme_registry.studies.report.tables import ENOUGH_RUNS, Bootstrap
+
+OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at all
+
+
+def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
+    """One row per run of an offline learner: with `learner` and the WD `constant_similarity`.
+
+    Ordered by class, ν, learner and run.
+    """
+    names = learner_names(algorithms)
+    places = list(dict.fromkeys(names.values()))
+    rows = results[results.nu.notna()].drop_duplicates(RUN)
+    rows = rows.assign(learner=rows.algorithm.map(names))
+    order = {name: i for i, name in enumerate(dict.fromkeys(rows.class_name))}
+    keys = pd.DataFrame({
+        "class": rows.class_name.map(order), "nu": rows.nu,
+        "learner": rows.learner.map(places.index), "run": rows.run,
+    })  # fmt: skip
+    return rows.loc[keys.sort_values([*keys], kind="stable").index].reset_index(drop=True)
+
+
+def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """Each offline learner on each class at each ν, with the data that it learnt from.
+
+    Args:
+      runs: see `offline_runs`.
+      bootstrap: of the intervals.
+    """
+    data = {place: _data_columns(group) for place, group in runs.groupby(["class_name", "nu"])}
+    rows = []
+    for (class_name, nu, learner), group in runs.groupby(
+        ["class_name", "nu", "learner"], sort=False
+    ):
+        changes = group.improvement.to_numpy()
+        low = high = math.nan
+        if len(changes) >= OFFLINE_INTERVAL:
+            label = f"offline {learner} {class_name} {nu:g}"
+            low, high = bootstrap.interval(changes, label, statistics.mean)
+        rows.append(
+            {
+                "class_name": class_name, "nu": nu, "learner": learner, "runs": len(group),
+                "similarity": group.offline_similarity.to_numpy().mean(),
+                "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
+                "improvement": changes.mean(), "low": low, "high": high,
+                "verdict": offline_verdict(changes, low, high), **data[class_name, nu],
+            }
+        )  # fmt: skip
+    return frame(
+        rows,
+        "class_name:str nu learner:str runs:int64 similarity similarity_sd improvement low high "
+        "verdict:str behaviour_similarity behaviour_similarity_sd data_sets:int64 "
+        "constant_similarity",
+    )
+
+
+def offline_verdict(improvements: Array, low: float, high: float) -> str:
+    """Whether a learner surpasses its data, from the improvements of its runs.
+
+    `above` or `below` if `ENOUGH_RUNS` runs have an interval that excludes 0; `above_few` or
+    `below_few` if all of fewer runs, but more than one, are on one side; otherwise `open`.
+    """
+    if len(improvements) >= ENOUGH_RUNS:
+        return "above" if low > 0.0 else "below" if high < 0.0 else "open"
+    if len(improvements) > 1 and improvements.min() > 0.0:
+        return "above_few"
+    return "below_few" if len(improvements) > 1 and improvements.max() < 0.0 else "open"
+
+
+def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
+    """What each algorithm of a plan is apart from its ν: `IQL`, or `IQL (expectile = 0.9)`."""
+    settings = {
+        algorithm.name: {k: v for k, v in algorithm.hyperparameters.items() if k != "nu"}
+        | ({} if algorithm.steps is None else {"steps": algorithm.steps})
+        for algorithm in algorithms
+    }
+    names = {}
+    for algorithm in algorithms:
+        alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
+        own = settings[algorithm.name]
+        differing = [
+            f"{key} = {own[key]}" if key in own else f"default {key}"
+            for key in sorted({key for each in alike for key in each})
+            if any(each.get(key) != alike[0].get(key) for each in alike)
+        ]
+        name = algorithm.uses.removeprefix("offline:").upper()
+        names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
+    return names
+
+
+def _data_columns(runs: pd.DataFrame) -> dict[str, Any]:
+    """The data sets of one ν on a class; each counts once, however many runs learnt from it."""
+    data_sets = runs.drop_duplicates("dataset_digest")
+    return {
+        "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
+        "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
+        "data_sets": len(data_sets),
+        "constant_similarity": runs.constant_similarity.to_numpy().mean(),
+    }
