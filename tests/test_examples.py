@@ -31,7 +31,7 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def test_help_works_without_optional_packages(example: Path) -> None:
     done = run("-c", WITHOUT_TORCHRL, example, "--help")
     assert done.returncode == 0, done.stderr
-    assert "--seeds" in done.stdout
+    assert done.stdout.startswith("usage:")
 
 
 def test_a_missing_torchrl_is_named_with_the_command_that_installs_it() -> None:
