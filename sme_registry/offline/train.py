@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.datasets import Dataset, Transitions, open_dataset
-from sme_registry.errors import OptionError, SpecError
-from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.datasets import Dataset, Transitions
+from sme_registry.evaluation import EvaluationReport, evaluate
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import (
@@ -36,8 +35,9 @@ from sme_registry.io import (
 from sme_registry.offline.hyperparameters import hyperparameters_of, known_algorithm
 from sme_registry.offline.learn import Section, learn
 from sme_registry.offline.record import BehaviourQuality, Evaluation, OfflineRecord
-from sme_registry.spec import EvaluationProtocol, ProtocolLike, SMESpec, SpecLike
-from sme_registry.task import Task, load_spec, materialize
+from sme_registry.offline.source import check_task, data_source
+from sme_registry.spec import ProtocolLike, SpecLike
+from sme_registry.task import Task, materialize
 from sme_registry.training.evaluation import DECAY_CURVE, EVALUATION, write_evaluation
 from sme_registry.training.record import PACKAGES
 
@@ -47,8 +47,6 @@ _FILES = (RECORD, POLICY, EVALUATION, DECAY_CURVE)
 
 EPISODES = 10  # METHOD, section 4
 MAX_STEPS = 10**9
-_CHECKED_ROWS = 64
-_TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
 
 Progress = Callable[[int, int, str], None]
 
@@ -125,10 +123,10 @@ def train_offline(
     seed = integer_in("seed", seed, 0, 2**53 - 1)
     evaluations = integer_in("evaluations", evaluations, 1, steps)
     episodes = integer_in("episodes", episodes, 1, 4096)
-    source = _source(data, spec, protocol)
+    source = data_source(data, spec, protocol)
     require_packages("offline training", {"torch": "PyTorch"}, "offline")
     transitions, task = source.transitions, materialize(source.spec)
-    _check_task(transitions, task)
+    check_task(transitions, task)
     batch_size = integer_in(
         "batch_size", batch_size, 1, len(transitions), advice="The data set has no more rows."
     )
@@ -178,78 +176,6 @@ def train_offline(
     if target is not None:
         _write(target, policy, record, report)
     return OfflineResult(policy, record, report, target)
-
-
-@dataclass(frozen=True)
-class _Source:
-    """The data of a training, and the task and protocol for its evaluation."""
-
-    transitions: Transitions
-    spec: SMESpec
-    protocol: EvaluationProtocol
-    dataset_id: str | None
-    recipe_digest: str | None
-
-
-def _source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None) -> _Source:
-    if isinstance(data, Transitions):
-        if spec is None:
-            raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
-        task = _single_agent(load_spec(spec))
-        chosen = resolve_protocol("paper-v1" if protocol is None else protocol)
-        return _Source(data, task, chosen, None, None)
-    if not isinstance(data, Dataset | str | os.PathLike):
-        raise OptionError(
-            f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."
-        )
-    dataset = data if isinstance(data, Dataset) else open_dataset(data)
-    record, recipe = dataset.record, dataset.recipe
-    if spec is not None and (digest := load_spec(spec).digest) != record.spec_digest:
-        raise OptionError(
-            f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it out."
-        )
-    task = _single_agent(recipe.spec)
-    chosen = recipe.protocol if protocol is None else resolve_protocol(protocol)
-    return _Source(dataset.transitions(), task, chosen, dataset.id, record.recipe_digest)
-
-
-def _single_agent(spec: SMESpec) -> SMESpec:
-    if spec.team is not None:
-        raise SpecError(
-            f"team: the data set has {len(spec.team.agents)} agents, and a policy that sees all "
-            "observations cannot be executed by the individual agents. Train on a single-agent "
-            "data set."
-        )
-    return spec
-
-
-def _check_task(transitions: Transitions, task: Task) -> None:
-    """Check that arrays are finite, and that they are of a task.
-
-    Raises:
-      OptionError: they are not.
-    """
-    S, A = task.spec.state_dim, task.spec.action_dim
-    if len(transitions) == 0:
-        raise OptionError("transitions=0: must be at least 1. Give a data set with rows.")
-    for name, width in (("observations", S + 2), ("actions", A), ("next_observations", S + 2)):
-        shape = getattr(transitions, name).shape
-        if shape != (len(transitions), width):
-            raise OptionError(
-                f"{name} of shape {shape}: must be ({len(transitions)}, {width}) for state_dim={S},"
-                f" action_dim={A}. Give the spec of the data set."
-            )
-    for name in ("observations", "actions", "next_observations", "rewards", "states"):
-        if not np.isfinite(getattr(transitions, name)).all():
-            raise OptionError(f"{name}: contains NaN or infinity. Give finite numbers.")
-    rows = np.linspace(0, len(transitions) - 1, min(_CHECKED_ROWS, len(transitions))).astype(int)
-    optimal = task.optimal_action(transitions.states[rows])
-    difference = np.abs(optimal - transitions.optimal_actions[rows]).max()
-    if not difference <= _TOLERANCE:
-        raise OptionError(
-            f"spec={task.spec.digest[:19]}…: is not the task of the data set: the optimal actions "
-            f"differ by up to {difference:.2g}. Give the spec of the data set."
-        )
 
 
 def _evaluation(

@@ -42,7 +42,7 @@ def fragile():
     return found
 
 
-def test_the_digest_is_of_every_array_its_name_type_and_shape(fragile):
+def test_the_digest_covers_every_array_its_name_type_and_shape(fragile):
     digests = {fragile.digest}
     for name, array in fragile.columns().items():
         changed = array.copy()
@@ -56,13 +56,13 @@ def test_the_digest_is_of_every_array_its_name_type_and_shape(fragile):
     assert len({fragile.digest, swapped.digest, wider.digest}) == 3
 
 
-def test_the_ends_cut_the_rows_into_the_trajectories(fragile):
+def test_ends_delimit_the_trajectories(fragile):
     lengths = np.diff([0, *fragile.ends])
     np.testing.assert_array_equal(np.bincount(fragile.episodes), lengths)
     assert fragile.ends[-1] == len(fragile) == 250
 
 
-def test_d3rlpy_is_given_aligned_rows(fragile):
+def test_d3rlpy_gets_aligned_rows(fragile):
     given = to_d3rlpy(fragile)
     assert {len(array) for array in given.values()} == {250}
     np.testing.assert_array_equal(given["observations"], fragile.observations)
@@ -86,7 +86,7 @@ def test_with_final_observations_each_timeout_has_its_successor(fragile):
     assert not given["rewards"][added].any()
 
 
-def test_what_d3rlpy_is_given_is_a_copy(fragile):
+def test_d3rlpy_gets_copies(fragile):
     for final_observations in (False, True):
         given = to_d3rlpy(fragile, final_observations=final_observations)
         before = fragile.digest
@@ -116,7 +116,7 @@ SCRIPT = """
 
 @pytest.mark.skipif(D3RLPY is None, reason="d3rlpy is not installed (SME_D3RLPY_PYTHON names one)")
 @pytest.mark.parametrize("final_observations", [False, True])
-def test_d3rlpy_itself_sees_the_transitions_of_the_task(fragile, final_observations, tmp_path):
+def test_d3rlpy_reads_the_transitions_of_the_task(fragile, final_observations, tmp_path):
     given = to_d3rlpy(fragile, final_observations=final_observations)
     np.savez(tmp_path / "given.npz", **given)
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Collecting: exactly what was asked for, whatever runs beside what, and true to the task."""
+"""Collecting: exact sizes, bits that do not depend on the batch, and transitions of the task."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_every_transition_is_that_of_the_task(task, coverage):
     replay(made(of), of, materialize(of.spec))
 
 
-def test_a_set_is_what_a_single_environment_gives_for_its_actions():
+def test_a_data_set_equals_the_steps_of_a_single_environment():
     of = recipe({"k": 3, "D": 0.2}, transitions=400)
     found = made(of)
     env = sme_registry.make(of.spec)
@@ -83,7 +83,7 @@ def test_a_set_is_what_a_single_environment_gives_for_its_actions():
 
 
 @pytest.mark.parametrize("count", [1, 99, 100, 101, 250])
-def test_a_set_has_exactly_the_transitions_asked_for_and_a_cut_is_a_timeout(count):
+def test_a_data_set_has_exactly_n_transitions_and_its_last_is_a_timeout(count):
     found = made(recipe(transitions=count))
     assert {len(array) for array in found.columns().values()} == {count}
     assert found.timeouts[-1]
@@ -91,19 +91,19 @@ def test_a_set_has_exactly_the_transitions_asked_for_and_a_cut_is_a_timeout(coun
     assert len(found.ends) == -(-count // 100)
 
 
-def test_more_transitions_begin_with_the_same_ones():
+def test_a_larger_data_set_begins_with_the_smaller_one():
     few, many = made(recipe(transitions=150)), made(recipe(transitions=600))
     np.testing.assert_array_equal(few.states, many.states[:150])
     np.testing.assert_array_equal(few.actions, many.actions[:150])
 
 
-def test_the_seed_is_the_datas_and_moves_starts_and_noise_and_not_the_task():
+def test_the_data_seed_changes_starts_and_noise_but_not_the_task():
     one, other = made(recipe(seed=1)), made(recipe(seed=2))
     assert one.digest == made(recipe(seed=1)).digest
     assert not np.isin(one.states[::100, 0], other.states[:, 0]).any()
 
 
-def test_starts_alpha_and_noise_are_streams_of_their_own():
+def test_starts_alpha_and_noise_use_separate_streams():
     of = recipe(seed=5, transitions=300)
     found, task = made(of), materialize(of.spec)
     np.testing.assert_array_equal(found.states[0], uniform(5, "dataset/0/start", 8))
@@ -169,7 +169,7 @@ def test_given_its_noise_policy_the_mean_similarity_is_exact():
     assert abs(found.similarities.mean() - (1 - 0.4 * missed.mean())) < 4 * error
 
 
-def test_random_actions_are_uniform_and_new_at_every_step():
+def test_random_actions_are_uniform_and_drawn_at_every_step():
     found = made(recipe(acting=[("random", 1.0)], transitions=5_000))
     assert len(np.unique(found.actions)) > 19_000
     assert abs(found.actions.mean(axis=0) - 0.5).max() < 5 / np.sqrt(12 * 5_000)
@@ -184,7 +184,7 @@ def test_behaviours_have_their_shares_of_the_transitions_in_whole_episodes():
         assert len(np.unique(found.components[found.episodes == number])) == 1
 
 
-def test_a_sub_cube_keeps_its_states_alone_and_ends_a_trajectory_where_one_leaves_it():
+def test_a_sub_cube_keeps_only_its_states_and_ends_trajectories_that_leave_it():
     of = recipe({"state_dim": 2}, coverage=-0.4, transitions=2_000)
     found, whole = made(of), made(recipe({"state_dim": 2}, transitions=20_000))
     assert expansion(found.states).max() <= -0.4
@@ -200,17 +200,17 @@ def test_coverage_zero_keeps_everything():
     assert made(recipe(coverage=0.0)).digest == made(recipe()).digest
 
 
-def test_a_sub_cube_that_hardly_any_state_lies_in_is_refused_before_the_work():
+def test_a_sub_cube_that_is_too_small_is_rejected_before_the_work():
     with pytest.raises(OptionError, match=r"coverage=-0\.99: 700 transitions need about"):
         made(recipe(coverage=-0.99))
 
 
-def test_a_set_larger_than_memory_is_refused():
+def test_a_data_set_larger_than_memory_is_rejected():
     with pytest.raises(ResourceLimitError, match="transitions=1000000000"):
         made(recipe(transitions=10**9))
 
 
-def test_a_policy_of_the_users_acts_and_its_bits_do_not_depend_on_the_lanes():
+def test_a_users_policy_gives_the_same_bits_for_any_number_of_lanes():
     torch = pytest.importorskip("torch")
     torch.manual_seed(0)
     net = torch.nn.Sequential(torch.nn.Linear(10, 64), torch.nn.Tanh(), torch.nn.Linear(64, 4))
@@ -227,7 +227,7 @@ def test_a_policy_of_the_users_acts_and_its_bits_do_not_depend_on_the_lanes():
     np.testing.assert_allclose(found.actions, np.clip(act(found.observations), 0, 1), atol=1e-6)
 
 
-def test_a_teams_agents_act_on_what_each_is_shown():
+def test_a_teams_agents_act_on_their_own_observations():
     spec = {"team": TEAM, "k": 4, "horizon": 9}
     seen = {}
 
@@ -256,7 +256,7 @@ def test_a_teams_agents_act_on_what_each_is_shown():
     replay(found, of, materialize(of.spec))
 
 
-def test_a_policy_that_fails_is_refused_by_name():
+def test_a_policy_that_fails_is_named():
     def broken(observations):
         return np.full((len(observations), 4), np.nan)
 
@@ -274,7 +274,7 @@ def test_a_policy_that_fails_is_refused_by_name():
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("row", [0, 150, 299])
-def test_replay_sees_a_fault_in_any_array_and_row(array, row):
+def test_replay_detects_a_change_in_any_array_and_row(array, row):
     of = recipe(transitions=300)
     found = made(of)
     changed = getattr(found, array).copy()
@@ -285,7 +285,7 @@ def test_replay_sees_a_fault_in_any_array_and_row(array, row):
         replay(faulty, of, materialize(of.spec))
 
 
-def test_replay_sees_observations_and_actions_that_are_off_by_one():
+def test_replay_detects_observations_and_actions_that_are_off_by_one():
     of = recipe(transitions=300)
     found = made(of)
     shifted = dataclasses.replace(found, actions=np.roll(found.actions, 1, axis=0))
@@ -293,7 +293,7 @@ def test_replay_sees_observations_and_actions_that_are_off_by_one():
         replay(shifted, of, materialize(of.spec))
 
 
-def test_an_episodes_numbers_are_its_own():
+def test_random_numbers_depend_on_the_episode_only():
     alone, beside = EpisodeStream(1, "x", 1, 3, ahead=2), EpisodeStream(1, "x", 5, 3, ahead=7)
     alone.begin(0, 4)
     for lane in range(5):
@@ -303,7 +303,7 @@ def test_an_episodes_numbers_are_its_own():
     assert len(np.unique(numbers)) == numbers.size
 
 
-def test_the_oracle_is_the_optimal_policy_whatever_stands_beside_a_state():
+def test_the_optimal_policy_has_the_same_bits_in_any_batch():
     task = materialize(SMESpec(complexity=10))
     s = np.random.default_rng(0).random((50, 8))
     together = OptimalPolicy(task, 50)(s).copy()
@@ -312,7 +312,7 @@ def test_the_oracle_is_the_optimal_policy_whatever_stands_beside_a_state():
         np.testing.assert_array_equal(OptimalPolicy(task, 1)(s[lane : lane + 1])[0], together[lane])
 
 
-def test_the_environment_takes_the_actions_of_a_set_as_they_are():
+def test_the_environment_does_not_change_the_actions_of_a_data_set():
     found = made(recipe())
     space = gymnasium.spaces.Box(0.0, 1.0, (4,), np.float32)
     assert all(space.contains(action) for action in found.actions[:50])

@@ -47,7 +47,7 @@ def test_the_help_of_each_command_has_examples(command):
     assert text.count(f"sme dataset {command}") >= 3
 
 
-def test_a_set_is_made_listed_shown_and_validated():
+def test_make_list_show_and_validate():
     made = good("make", "Default", "--nu", "0.5", "-n", "300", "--seed", "7")
     assert "300 of 300 transitions" in made.stderr
     assert "constant ½" in made.stdout
@@ -60,7 +60,7 @@ def test_a_set_is_made_listed_shown_and_validated():
     assert "valid" in good("validate", NAME).stdout
 
 
-def test_json_is_the_record_and_nothing_else():
+def test_json_prints_only_the_record():
     made = json.loads(good("make", "Default", "-n", "50", "--seed", "7", "--json").stdout)
     assert made["id"] == NAME
     assert made["nu"] == 0.5
@@ -71,7 +71,7 @@ def test_json_is_the_record_and_nothing_else():
     assert json.loads(good("validate", NAME, "--json").stdout)[0]["valid"] is True
 
 
-def test_a_mix_a_field_a_name_and_a_folder_are_taken():
+def test_make_accepts_a_mix_a_field_a_name_and_a_folder():
     good("make", "Default", "--mix", "nu=0.5:0.7", "--mix", "random:0.3", "-n", "40",
          "--set", "complexity=2", "--coverage", "-0.05", "--name", "me/mixed-v1", "--out", "sets",
          "--protocol", "quick-v1")  # fmt: skip
@@ -83,7 +83,7 @@ def test_a_mix_a_field_a_name_and_a_folder_are_taken():
     assert "no data sets" in good("list").stderr
 
 
-def test_a_trained_policys_zip_acts_and_is_recorded_by_its_digest(tmp_path):
+def test_a_policys_zip_is_recorded_by_its_digest(tmp_path):
     from stable_baselines3 import PPO
 
     import sme_registry
@@ -98,7 +98,7 @@ def test_a_trained_policys_zip_acts_and_is_recorded_by_its_digest(tmp_path):
     assert "valid" in good("validate", "sme/ppo-v0").stdout
 
 
-def test_a_trained_policys_onnx_acts_as_its_zip_does(tmp_path):
+def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     for package in ("onnx", "onnxruntime"):
         pytest.importorskip(package)
     from stable_baselines3 import TD3
@@ -148,7 +148,7 @@ def test_a_trained_policys_onnx_acts_as_its_zip_does(tmp_path):
         (["--set", "complexity=0"], "complexity=0: must be"),
     ],
 )
-def test_bad_input_is_one_line_and_makes_nothing(arguments, message, tmp_path):
+def test_invalid_input_gives_one_line_and_writes_nothing(arguments, message, tmp_path):
     counted = [] if "-n" in arguments else ["-n", "50"]
     assert message in refused("make", "Default", *counted, *arguments)
     assert not (tmp_path / "minari").exists()
@@ -169,7 +169,7 @@ def test_an_existing_data_set_is_kept_without_force():
     assert open_dataset("sme/Default-v1-nu50-seed0-v0").recipe.transitions == 60
 
 
-def test_validate_says_which_set_is_wrong_and_still_checks_the_others(tmp_path):
+def test_validate_names_the_invalid_data_set_and_checks_the_others(tmp_path):
     import h5py
 
     for name in ("sme/good-v0", "sme/bad-v0"):
@@ -181,7 +181,7 @@ def test_validate_says_which_set_is_wrong_and_still_checks_the_others(tmp_path):
     assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
 
 
-def test_a_copy_under_another_name_is_not_listed_and_not_valid(tmp_path):
+def test_a_copy_under_another_name_is_neither_listed_nor_valid(tmp_path):
     good("make", "Default", "-n", "50")
     own = "sme/Default-v1-nu50-seed0-v0"
     shutil.copytree(tmp_path / "minari" / own, tmp_path / "minari/sme/Copy-v0")
@@ -198,7 +198,7 @@ def test_a_copy_under_another_name_is_not_listed_and_not_valid(tmp_path):
     good("validate", own, f"minari/{own}", f"backup/{own}")
 
 
-def test_a_broken_set_is_told_of_beside_the_list(tmp_path):
+def test_list_reports_broken_data_sets(tmp_path):
     good("make", "Default", "-n", "50", "--name", "sme/one-v0")
     good("make", "Default", "-n", "50", "--name", "sme/two-v0")
     (tmp_path / "minari/sme/two-v0/data/metadata.json").write_text("{")

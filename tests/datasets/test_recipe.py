@@ -40,7 +40,7 @@ def test_a_recipe_survives_its_json():
     assert DatasetRecipe.from_dict(made.to_dict()) == made
 
 
-def test_the_fields_in_which_recipes_differ_are_named_with_both_values():
+def test_differences_name_fields_with_both_values():
     assert recipe().differences(recipe()) == []
     asked = recipe(transitions=200, spec={"complexity": 10}, coverage=-0.2, protocol={"seed": 1})
     assert recipe().differences(asked) == [
@@ -51,7 +51,7 @@ def test_the_fields_in_which_recipes_differ_are_named_with_both_values():
     ]
 
 
-def test_behaviours_that_differ_are_named_by_their_place_or_their_number():
+def test_differences_of_behaviours_name_their_index_or_number():
     halves = recipe(behaviours=weights(0.5, 0.5))
     assert halves.differences(recipe(behaviours=weights(0.5, 0.25, 0.25))) == [
         "behaviours of 2 entries, requested 3"
@@ -78,7 +78,7 @@ def test_weights_that_do_not_add_up_are_refused(shares):
         recipe(behaviours=weights(*shares))
 
 
-def test_weights_that_only_floating_point_keeps_from_one_are_taken():
+def test_weights_may_differ_from_one_by_rounding():
     assert sum([0.1] * 10) != 1.0
     assert sum(recipe(behaviours=weights(*[0.1] * 10)).shares) == 50_000
 
@@ -117,7 +117,7 @@ def test_fields_of_another_kind_of_behaviour_are_refused(fields):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 1000, 50_000])
-def test_the_shares_add_up_to_the_transitions_and_are_off_by_at_most_one(count):
+def test_shares_add_up_to_n_and_are_off_by_at_most_one(count):
     for shares in [(1.0,), (0.7, 0.3), (0.5, 0.25, 0.25), (1 / 3, 1 / 3, 1 / 3)]:
         if count * min(shares) < 0.9:
             continue
@@ -131,7 +131,7 @@ def test_a_weight_of_less_than_one_transition_is_refused():
         recipe(behaviours=weights(0.99, 0.01), transitions=10)
 
 
-def test_behaviours_are_written_as_a_person_writes_them(tmp_path):
+def test_behaviours_are_parsed_from_numbers_names_and_policies(tmp_path):
     assert parse_behaviour(0.5).nu == 0.5
     assert parse_behaviour(np.float32(0.5)).nu == 0.5
     assert parse_behaviour(0).label == "ν = 0"

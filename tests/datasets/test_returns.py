@@ -52,7 +52,7 @@ VARIANTS = [
 
 
 @pytest.mark.parametrize("changes", VARIANTS, ids=str)
-def test_from_the_start_it_is_what_the_environment_pays(changes: dict[str, Any]) -> None:
+def test_from_the_start_the_return_is_that_of_the_environment(changes: dict[str, Any]) -> None:
     spec = SPEC.derive(**changes)
     found = exact_return(policy, spec, states=STATES, gamma=0.9)
     for row, state in enumerate(STATES):
@@ -63,7 +63,7 @@ def test_from_the_start_it_is_what_the_environment_pays(changes: dict[str, Any])
 
 
 @pytest.mark.parametrize("changes", VARIANTS[:-1], ids=str)
-def test_from_the_middle_of_an_episode_it_is_what_remains(changes: dict[str, Any]) -> None:
+def test_from_the_middle_of_an_episode_the_return_is_the_rest(changes: dict[str, Any]) -> None:
     spec, state = SPEC.derive(**changes), STATES[0]
     env = make(spec)
     observation, _ = env.reset(options={"state": state})
@@ -80,7 +80,7 @@ def test_from_the_middle_of_an_episode_it_is_what_remains(changes: dict[str, Any
     assert step > 1
 
 
-def test_rows_of_a_set_are_rolled_out_from_where_they_were_acted_in() -> None:
+def test_rollouts_from_rows_of_a_data_set_repeat_its_rewards() -> None:
     spec = SPEC.derive(k=4)
     recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.6),), transitions=90, seed=1)
     transitions = collect(recipe, materialize(spec))
@@ -105,7 +105,7 @@ def test_rows_of_a_set_are_rolled_out_from_where_they_were_acted_in() -> None:
     )
 
 
-def test_the_optimum_earns_every_step_that_is_left() -> None:
+def test_the_optimum_earns_one_in_every_remaining_step() -> None:
     spec = SPEC.derive(k=5, D=0.9)
     task = materialize(spec)
 
@@ -183,12 +183,12 @@ def test_bad_input_is_refused(changes: dict[str, Any], error: type[SMEError], me
         exact_return(arguments.pop("policy"), arguments.pop("spec"), **arguments)
 
 
-def test_an_interval_over_states_needs_more_than_one() -> None:
+def test_an_interval_over_states_requires_two() -> None:
     with pytest.raises(OptionError, match="at least 2"):
         exact_return(policy, SPEC, states=STATES[:1]).over_states()
 
 
-def test_fitted_q_orders_policies_as_their_exact_returns_do() -> None:
+def test_fitted_q_and_exact_returns_rank_policies_equally() -> None:
     example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "ope.py"))
     found = example["judge"](SMESpec(), nu=1.0, seed=0, rows=4000)
     estimates, truths = ({name: row[i] for name, row in found.items()} for i in (0, 1))

@@ -24,7 +24,7 @@ def scored(acting=((0.5, 1.0),), transitions=2_000, **fields):
     return reference_scores(recipe, task, found), found, task
 
 
-def test_on_the_sets_states_the_scores_are_those_of_the_task():
+def test_scores_on_the_data_sets_states_are_exact():
     scores, found, task = scored()
     half = np.full_like(found.optimal_actions, 0.5)
     assert scores.constant.similarity == pytest.approx(task.similarity(found.states, half).mean())
@@ -39,7 +39,7 @@ def test_on_the_sets_states_the_scores_are_those_of_the_task():
 
 
 @pytest.mark.parametrize("fields", [{}, {"k": 7, "r_min": 0.3, "D": 0.2}, {"complexity": 10}])
-def test_the_optimums_return_is_the_horizon_as_its_episodes_show(fields):
+def test_the_optimums_return_is_the_horizon(fields):
     scores, _, task = scored(transitions=100, **fields)
     assert scores.optimum.rollouts.mean_return == 100.0
     env = sme_registry.make(task.spec)
@@ -71,7 +71,7 @@ def test_the_returns_are_those_of_single_environments():
         assert similarity == pytest.approx(similarities[episode])
 
 
-def test_each_behaviour_has_its_own_score_and_the_whole_is_their_mean_by_weight():
+def test_the_behaviour_score_is_the_weighted_mean_over_behaviours():
     scores, found, _ = scored([(0.0, 0.25), ("random", 0.75)])
     best, worst = scores.behaviours
     assert best.similarity > 0.999999
@@ -81,7 +81,7 @@ def test_each_behaviour_has_its_own_score_and_the_whole_is_their_mean_by_weight(
     assert scores.behaviour.similarity == found.similarities.mean()
 
 
-def test_the_behaviours_own_episodes_agree_with_the_sets():
+def test_rollouts_of_the_behaviour_agree_with_the_data_set():
     scores, found, _ = scored(transitions=10_000)
     returns = np.add.reduceat(found.rewards, np.arange(0, 10_000, 100))
     error = np.hypot(scores.behaviour.rollouts.standard_error, returns.std() / 10)

@@ -1,10 +1,9 @@
-"""The file: Minari reads it as its own, it is whole or absent, and what was changed is noticed."""
+"""Data sets on disk: Minari reads them, writes are atomic, and changes are detected."""
 
 from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -86,7 +85,7 @@ def edited(folder, change):
 
 
 class TestReading:
-    def test_what_is_read_is_what_was_made_to_the_bit(self, shelf):
+    def test_transitions_are_read_bit_for_bit(self, shelf):
         from sme_registry.datasets.collect import collect
 
         dataset = open_dataset(NAME, shelf)
@@ -97,7 +96,7 @@ class TestReading:
         assert found.digest == dataset.record.arrays_digest
         replay(found, dataset.recipe, task)
 
-    def test_the_record_says_everything(self, shelf):
+    def test_the_record_has_provenance_and_digests(self, shelf):
         record = open_dataset(NAME, shelf).record
         assert record.recipe.transitions == 250
         assert record.spec_digest == sme_registry.load("Default").digest
@@ -135,7 +134,7 @@ class TestReading:
             first += len(episode)
         assert first == 250
 
-    def test_what_else_minari_does_with_a_set_works(self, copied, monkeypatch):
+    def test_minari_can_sample_filter_split_and_combine(self, copied, monkeypatch):
         monkeypatch.setenv("MINARI_DATASETS_PATH", str(copied))
         loaded = minari.load_dataset(NAME)
         assert len(loaded.sample_episodes(2)) == 2
@@ -217,13 +216,13 @@ class TestNames:
         ["", "x", "x-v", "a b-v0", "a.b-v0", "s/x-v0", "/x-v0", "../x-v0", "a//b-v0", "ä-v0",
          "data/x-v0", "sme/data/x-v0", "x-v0\n", "a:b-v0", "x-v-1"],
     )  # fmt: skip
-    def test_one_that_minari_refuses_is_refused_before_anything_is_made(self, name, tmp_path):
+    def test_invalid_names_are_rejected_before_any_work(self, name, tmp_path):
         with pytest.raises(OptionError, match="name="):
             make_dataset("Default", transitions=10, name=name, folder=tmp_path)
         assert not list(tmp_path.iterdir())
 
     @pytest.mark.parametrize("name", ["x-v0", "my/x-v3", "a/-b/x_Y-v12", "ns/deep/er/x-v0"])
-    def test_what_is_taken_minari_lists(self, name, tmp_path):
+    def test_minari_lists_every_accepted_name(self, name, tmp_path):
         try:
             storage.check_id(name)
         except OptionError:
@@ -245,7 +244,7 @@ class TestNames:
             ({"mix": [("random", 1.0)]}, "sme/Default-v1-random-seed0-v0"),
         ],
     )
-    def test_the_default_one_says_what_the_set_is(self, arguments, name, tmp_path):
+    def test_the_default_name_describes_the_data_set(self, arguments, name, tmp_path):
         assert make_dataset("Default", transitions=10, folder=tmp_path, **arguments).id == name
 
 
@@ -256,7 +255,7 @@ class TestAnExistingSet:
             make_dataset("Default", 0.1, transitions=10, name=NAME, folder=copied)
         assert (copied / NAME / "data" / "main_data.hdf5").read_bytes() == before
 
-    def test_of_a_function_is_the_same_as_far_as_its_name_tells(self, tmp_path):
+    def test_of_a_function_is_compared_by_its_name(self, tmp_path):
         def act(observations):
             return observations[:, :4]
 
@@ -277,7 +276,7 @@ class TestAnExistingSet:
         ]
 
     @pytest.mark.parametrize("foreign", ["empty", "minari's", "a file"])
-    def test_that_is_not_ours_is_never_replaced(self, foreign, tmp_path):
+    def test_of_another_package_is_never_replaced(self, foreign, tmp_path):
         place = tmp_path / NAME
         if foreign == "a file":
             place.parent.mkdir(parents=True)
@@ -309,6 +308,7 @@ KILLED = """
 """
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and limits")
 class TestAWriterThatFails:
     @pytest.mark.parametrize("step", ["fsync 2", "fsync 3", "rename"])
     def test_killed_in_mid_write_leaves_nothing_that_is_listed(self, step, tmp_path):
@@ -327,7 +327,9 @@ class TestAWriterThatFails:
         assert open_dataset(NAME, copied).transitions().digest
 
     @pytest.mark.parametrize("kibibytes", [4, 60])
-    def test_a_full_disk_is_one_line_and_leaves_nothing(self, kibibytes, tmp_path):
+    def test_a_full_disk_gives_one_line_and_leaves_nothing(self, kibibytes, tmp_path):
+        import resource
+
         def limit():
             resource.setrlimit(resource.RLIMIT_FSIZE, (kibibytes * 1024, kibibytes * 1024))
 
@@ -343,20 +345,20 @@ class TestAWriterThatFails:
         assert visible(tmp_path) == set()
         assert not [path for path in tmp_path.rglob("*") if path.suffix == ".hdf5"]
 
-    def test_a_folder_that_cannot_be_made_is_an_error_of_ours(self, tmp_path):
+    def test_a_folder_that_cannot_be_created_is_an_option_error(self, tmp_path):
         (tmp_path / "file").write_text("")
         with pytest.raises(OptionError, match="cannot be written"):
             make_dataset("Default", transitions=10, folder=tmp_path / "file" / "sets")
 
 
 class TestAChangedSet:
-    def test_of_which_a_number_changed_is_noticed(self, copied):
+    def test_with_a_changed_number_is_rejected(self, copied):
         with h5py.File(copied / NAME / "data" / "main_data.hdf5", "r+") as file:
             file["episode_1/infos/regret"][3] += 1e-9
         with pytest.raises(DigestMismatchError, match=r"its arrays have sha256:.* as generated"):
             open_dataset(NAME, copied).transitions()
 
-    def test_to_which_minari_added_is_noticed_and_stays_readable_for_minari(self, copied):
+    def test_extended_by_minari_is_rejected_and_minari_can_read_it(self, copied):
         loaded = open_dataset(NAME, copied).minari()
         episode = loaded[0]
         loaded.update_dataset_from_buffer(
@@ -372,19 +374,19 @@ class TestAChangedSet:
         with pytest.raises(DigestMismatchError, match="total_steps=350: must be 250"):
             open_dataset(NAME, copied)
 
-    def test_whose_spec_was_changed_is_refused(self, copied):
+    def test_with_a_changed_spec_is_rejected(self, copied):
         edited(copied, lambda data: data["sme"]["recipe"]["spec"].update(complexity=10))
         with pytest.raises(DigestMismatchError, match="recipe_digest"):
             open_dataset(NAME, copied)
 
     @pytest.mark.parametrize("field", ["spec_digest", "recipe_digest", "protocol_digest"])
-    def test_with_a_digest_of_something_else_is_refused(self, field, copied):
+    def test_with_a_wrong_digest_is_rejected(self, field, copied):
         edited(copied, lambda data: data["sme"].update({field: "sha256:" + "0" * 64}))
         with pytest.raises(DigestMismatchError, match=field):
             open_dataset(NAME, copied)
 
     @pytest.mark.parametrize(("version", "age"), [(0, "an older"), (2, "a newer")])
-    def test_of_another_schema_is_refused_and_left_as_it_is(self, version, age, copied):
+    def test_of_another_schema_is_rejected_and_not_modified(self, version, age, copied):
         edited(copied, lambda data: data["sme"].update(schema_version=version, other_fields=1))
         before = sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*"))
         with pytest.raises(SpecError, match=f"schema_version={version}: must be 1.*{age} version"):
@@ -404,18 +406,18 @@ class TestAChangedSet:
             lambda record: record["recipe"]["behaviours"][0].update(nu=2.0),
         ],
     )
-    def test_whose_record_is_broken_is_refused(self, change, copied):
+    def test_with_an_invalid_record_is_rejected(self, change, copied):
         edited(copied, lambda data: change(data["sme"]))
         with pytest.raises(SMEError, match="sme"):
             open_dataset(NAME, copied)
 
     @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"no HDF5 at all" * 100])
-    def test_whose_data_are_no_hdf5_cannot_be_read(self, content, copied):
+    def test_with_data_that_is_not_hdf5_cannot_be_read(self, content, copied):
         (copied / NAME / "data" / "main_data.hdf5").write_bytes(content)
         with pytest.raises(MalformedDocumentError, match="cannot be read"):
             open_dataset(NAME, copied).transitions()
 
-    def test_whose_data_are_cut_or_lack_a_part_cannot_be_read(self, copied):
+    def test_with_truncated_or_missing_data_cannot_be_read(self, copied):
         path = copied / NAME / "data" / "main_data.hdf5"
         with h5py.File(path, "r+") as file:
             del file["episode_2/infos/regret"]
@@ -425,7 +427,7 @@ class TestAChangedSet:
         with pytest.raises(MalformedDocumentError, match="cannot be read"):
             open_dataset(NAME, copied).transitions()
 
-    def test_of_minari_alone_is_named_as_such_and_not_listed(self, copied):
+    def test_not_written_by_this_package_is_not_listed(self, copied):
         edited(copied, lambda data: data.pop("sme"))
         with pytest.raises(MalformedDocumentError, match="Minari can open it"):
             open_dataset(NAME, copied)
@@ -452,22 +454,20 @@ class TestAMisplacedSet:
         with pytest.warns(UserWarning, match=f"does not match id '{NAME}'"):
             assert list(minari.list_local_datasets()) == [NAME]
 
-    def test_is_still_opened_and_is_refused_by_whatever_name_it_is_given(
-        self, misplaced, copied, monkeypatch
-    ):
+    def test_opens_but_fails_the_location_check_by_any_name(self, misplaced, copied, monkeypatch):
         monkeypatch.chdir(copied / misplaced)
         for given in (misplaced, copied / misplaced, ".", "data"):
             with pytest.raises(SpecError, match=f"contains the data set {NAME}"):
                 storage.check_location(open_dataset(given, copied), copied)
 
-    def test_outside_the_folder_of_sets_is_known_by_the_end_of_its_path(self, copied, tmp_path):
+    def test_outside_the_root_is_checked_by_the_end_of_its_path(self, copied, tmp_path):
         for place, right in [("a/sme/tests-v0", True), ("mine", False), ("sme/copy-v0", False)]:
             shutil.copytree(copied / NAME, tmp_path / place)
             dataset, error = open_dataset(tmp_path / place), f"back to a folder {NAME}"
             with nullcontext() if right else pytest.raises(SpecError, match=error):
                 storage.check_location(dataset, copied)
 
-    def test_a_link_in_the_right_place_is_in_the_right_place(self, copied, tmp_path):
+    def test_a_symbolic_link_in_the_right_place_is_correct(self, copied, tmp_path):
         (copied / NAME).rename(tmp_path / "elsewhere")
         (copied / NAME).symlink_to(tmp_path / "elsewhere")
         found, broken = list_datasets(copied)
@@ -475,10 +475,10 @@ class TestAMisplacedSet:
         assert not broken
 
 
-def test_a_set_that_is_not_there_names_the_nearest(shelf):
+def test_an_unknown_id_suggests_a_similar_one(shelf):
     with pytest.raises(UnknownNameError, match=r"Did you mean 'sme/tests-v0'"):
         open_dataset("sme/test-v0", shelf)
 
 
-def test_no_folder_is_no_sets(tmp_path):
+def test_a_missing_folder_has_no_data_sets(tmp_path):
     assert list_datasets(tmp_path / "none") == ([], {})

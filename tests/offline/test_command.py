@@ -31,7 +31,7 @@ def sme(*arguments: str) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "iql"])
-def test_a_set_is_trained_on_and_its_policy_evaluated(
+def test_train_and_evaluate_from_the_command_line(
     folder: Path, tmp_path: Path, algorithm: str
 ) -> None:
     out, task = tmp_path / "run", tmp_path / "tiny.json"
@@ -76,7 +76,7 @@ def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None
         (["tiny-v0", "--protocol", "nothing"], "nothing"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(
+def test_invalid_input_gives_one_line_and_exit_code_2(
     folder: Path, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     out = tmp_path / "run"

@@ -63,7 +63,7 @@ def test_the_losses_of_iql_are_its_equations(batch: Batch) -> None:
     assert found == pytest.approx({"value": value, "critic": critic, "actor": actor}, rel=1e-5)
 
 
-def test_an_advantage_weighs_no_more_than_the_most(batch: Batch) -> None:
+def test_the_weight_of_an_advantage_is_limited(batch: Batch) -> None:
     free = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), inverse_temperature=1000.0, max_weight=1e6))
     cut = IQL(SEEN, A, IQLHyperparameters(hidden=(8,), inverse_temperature=1000.0, max_weight=2.0))
     for learner in (free, cut):
@@ -78,7 +78,7 @@ def test_an_advantage_weighs_no_more_than_the_most(batch: Batch) -> None:
     assert losses == pytest.approx([1e6 * losses[2], 2.0 * losses[2], losses[2]], rel=1e-5)
 
 
-def test_no_loss_reaches_the_networks_of_another(batch: Batch) -> None:
+def test_each_loss_trains_only_its_own_networks(batch: Batch) -> None:
     learner = IQL(SEEN, A, IQLHyperparameters(hidden=(8,)))
     parts = {
         "actor": [*learner.actor.parameters(), learner.spread],
@@ -103,7 +103,7 @@ def test_targets_follow_the_critics_by_their_rate(batch: Batch) -> None:
         assert not now.requires_grad
 
 
-def test_bc_finds_a_function_that_it_can_represent() -> None:
+def test_bc_learns_a_function_that_it_can_represent() -> None:
     torch.manual_seed(0)
     truth = mlp(SEEN, (4,), A)
     learner = BC(SEEN, A, BCHyperparameters(hidden=(32,), learning_rate=0.01))
@@ -117,7 +117,7 @@ def test_bc_finds_a_function_that_it_can_represent() -> None:
     assert last < 0.02 * first
 
 
-def test_iql_prefers_the_action_that_pays() -> None:
+def test_iql_prefers_the_rewarded_action() -> None:
     # One step, no future: of two actions in every state, +½ pays 1 and −½ nothing.
     torch.manual_seed(0)
     learner = IQL(SEEN, 1, IQLHyperparameters(hidden=(32,), learning_rate=0.01))
@@ -132,7 +132,7 @@ def test_iql_prefers_the_action_that_pays() -> None:
     assert mean == pytest.approx(0.5 * np.tanh(1.5), abs=0.03)
 
 
-def test_each_row_comes_once_before_any_comes_again() -> None:
+def test_every_row_is_used_once_before_any_repeats() -> None:
     transitions = transitions_of(count=50)
     batches = iter(Batches(transitions, 20, torch.Generator().manual_seed(0)))
     seen = np.concatenate([next(batches).observations.numpy() for _ in range(5)])
@@ -142,7 +142,7 @@ def test_each_row_comes_once_before_any_comes_again() -> None:
     assert indices[:50] != indices[50:]
 
 
-def test_a_batch_is_the_rows_of_the_set_side_by_side() -> None:
+def test_a_batch_has_matching_rows_of_all_columns() -> None:
     transitions = transitions_of(count=50)
     batch = next(iter(Batches(transitions, 50, torch.Generator().manual_seed(0))))
     rows = {row.tobytes(): index for index, row in enumerate(transitions.observations)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import signal
 import subprocess
 import sys
 import time
@@ -47,9 +46,10 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 break
             time.sleep(0.05)
     finally:
-        process.send_signal(signal.SIGKILL)
+        running = process.poll() is None
+        process.kill()
         process.wait()
-    assert process.returncode == -signal.SIGKILL
+    assert running
     return folder
 
 
