@@ -24,7 +24,7 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 from sme_registry.task.memory import refuse_above_limit
 
-Progress = Callable[[int, int], None]
+ReportProgress = Callable[[int, int], None]
 
 _LANES = 512
 _MAX_STEPS = 10**8  # of the environment; a sub-cube that needs more is too small
@@ -73,7 +73,7 @@ def collect(
     policies: dict[int, Any] | None = None,
     *,
     lanes: int | None = None,
-    progress: Progress | None = None,
+    progress: ReportProgress | None = None,
 ) -> Transitions:
     """Generate the transitions of a recipe.
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from sme_registry.datasets.collect import Progress, collect
+from sme_registry.datasets.collect import ReportProgress, collect
 from sme_registry.datasets.minari_format import require_minari
 from sme_registry.datasets.recipe import Behaviour, DatasetRecipe, parse_behaviour
 from sme_registry.datasets.record import DatasetRecord, Seeds
@@ -41,7 +41,7 @@ def make_dataset(
     name: str | None = None,
     folder: str | os.PathLike[str] | None = None,
     force: bool = False,
-    progress: Progress | None = None,
+    progress: ReportProgress | None = None,
 ) -> Dataset:
     """Generate a data set of a chosen quality and write it in Minari's HDF5 format.
 

@@ -85,7 +85,7 @@ def known_algorithm(name: str) -> str:
     return algorithms.known_algorithm(name, ALGORITHMS)
 
 
-def hyperparameters_of(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
+def resolve_hyperparameters(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
     """The hyperparameters of an algorithm: its defaults, with changes.
 
     Raises:

@@ -32,7 +32,7 @@ from sme_registry.io import (
     versions,
     write_atomically,
 )
-from sme_registry.offline.hyperparameters import hyperparameters_of, known_algorithm
+from sme_registry.offline.hyperparameters import known_algorithm, resolve_hyperparameters
 from sme_registry.offline.learn import Section, learn
 from sme_registry.offline.record import BehaviourQuality, Evaluation, OfflineRecord
 from sme_registry.offline.source import check_task, data_source
@@ -48,7 +48,7 @@ _FILES = (RECORD, POLICY, EVALUATION, DECAY_CURVE)
 EPISODES = 10  # METHOD, section 4
 MAX_STEPS = 10**9
 
-Progress = Callable[[int, int, str], None]
+ReportProgress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def train_offline(
     protocol: ProtocolLike | None = None,
     folder: str | os.PathLike[str] | None = None,
     force: bool = False,
-    progress: Progress | None = None,
+    progress: ReportProgress | None = None,
 ) -> OfflineResult:
     """Train BC or IQL on a data set, on the CPU and one thread.
 
@@ -118,7 +118,7 @@ def train_offline(
       MissingDependencyError: PyTorch is not installed, or Minari, which files require.
     """
     algorithm = known_algorithm(algorithm)
-    settings = hyperparameters_of(algorithm, hyperparameters)
+    settings = resolve_hyperparameters(algorithm, hyperparameters)
     steps = integer_in("steps", steps, 1, MAX_STEPS)
     seed = integer_in("seed", seed, 0, 2**53 - 1)
     evaluations = integer_in("evaluations", evaluations, 1, steps)

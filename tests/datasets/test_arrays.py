@@ -1,4 +1,4 @@
-"""`Transitions` and what d3rlpy is given: aligned from the first row to the last."""
+"""`Transitions` and its conversion for d3rlpy: all rows are aligned."""
 
 from __future__ import annotations
 

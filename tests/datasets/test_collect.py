@@ -43,7 +43,7 @@ def recipe(spec=None, acting=((0.5, 1.0),), **fields):
     return DatasetRecipe.from_dict({**plain, **fields})
 
 
-def made(of, lanes=None, policies=None):
+def collected(of, lanes=None, policies=None):
     return collect(of, materialize(of.spec), policies, lanes=lanes)
 
 
@@ -51,7 +51,7 @@ def made(of, lanes=None, policies=None):
 @pytest.mark.parametrize("task", TASKS)
 def test_the_number_of_lanes_changes_no_bit(task, coverage):
     of = recipe(TASKS[task], HALVES, coverage=coverage, seed=3)
-    digests = {made(of, lanes).digest for lanes in (None, 1, 7, 64)}
+    digests = {collected(of, lanes).digest for lanes in (None, 1, 7, 64)}
     assert len(digests) == 1
 
 
@@ -59,66 +59,66 @@ def test_the_number_of_lanes_changes_no_bit(task, coverage):
 @pytest.mark.parametrize("task", TASKS)
 def test_every_transition_is_that_of_the_task(task, coverage):
     of = recipe(TASKS[task], HALVES, coverage=coverage, seed=3)
-    replay(made(of), of, materialize(of.spec))
+    replay(collected(of), of, materialize(of.spec))
 
 
 def test_a_data_set_equals_the_steps_of_a_single_environment():
     of = recipe({"k": 3, "D": 0.2}, transitions=400)
-    found = made(of)
+    data = collected(of)
     env = sme_registry.make(of.spec)
     start = 0
-    for end in found.ends:
-        observation, _ = env.reset(options={"state": found.states[start]})
+    for end in data.ends:
+        observation, _ = env.reset(options={"state": data.states[start]})
         for row in range(start, end):
-            np.testing.assert_array_equal(observation, found.observations[row])
-            observation, reward, terminated, truncated, info = env.step(found.actions[row])
-            np.testing.assert_array_equal(observation, found.next_observations[row])
-            assert terminated == found.terminations[row]
-            assert (truncated and not terminated) == found.timeouts[row] or row == len(found) - 1
-            assert reward == found.rewards[row]
-            assert info["regret"] == found.regrets[row]
-            assert info["similarity"] == found.similarities[row]
-            np.testing.assert_array_equal(info["optimal_action"], found.optimal_actions[row])
+            np.testing.assert_array_equal(observation, data.observations[row])
+            observation, reward, terminated, truncated, info = env.step(data.actions[row])
+            np.testing.assert_array_equal(observation, data.next_observations[row])
+            assert terminated == data.terminations[row]
+            assert (truncated and not terminated) == data.timeouts[row] or row == len(data) - 1
+            assert reward == data.rewards[row]
+            assert info["regret"] == data.regrets[row]
+            assert info["similarity"] == data.similarities[row]
+            np.testing.assert_array_equal(info["optimal_action"], data.optimal_actions[row])
         start = end
 
 
 @pytest.mark.parametrize("count", [1, 99, 100, 101, 250])
 def test_a_data_set_has_exactly_n_transitions_and_its_last_is_a_timeout(count):
-    found = made(recipe(transitions=count))
-    assert {len(array) for array in found.columns().values()} == {count}
-    assert found.timeouts[-1]
-    assert not found.terminations.any()
-    assert len(found.ends) == -(-count // 100)
+    data = collected(recipe(transitions=count))
+    assert {len(array) for array in data.columns().values()} == {count}
+    assert data.timeouts[-1]
+    assert not data.terminations.any()
+    assert len(data.ends) == -(-count // 100)
 
 
 def test_a_larger_data_set_begins_with_the_smaller_one():
-    few, many = made(recipe(transitions=150)), made(recipe(transitions=600))
+    few, many = collected(recipe(transitions=150)), collected(recipe(transitions=600))
     np.testing.assert_array_equal(few.states, many.states[:150])
     np.testing.assert_array_equal(few.actions, many.actions[:150])
 
 
 def test_the_data_seed_changes_starts_and_noise_but_not_the_task():
-    one, other = made(recipe(seed=1)), made(recipe(seed=2))
-    assert one.digest == made(recipe(seed=1)).digest
+    one, other = collected(recipe(seed=1)), collected(recipe(seed=2))
+    assert one.digest == collected(recipe(seed=1)).digest
     assert not np.isin(one.states[::100, 0], other.states[:, 0]).any()
 
 
 def test_starts_alpha_and_noise_use_separate_streams():
     of = recipe(seed=5, transitions=300)
-    found, task = made(of), materialize(of.spec)
-    np.testing.assert_array_equal(found.states[0], uniform(5, "dataset/0/start", 8))
+    data, task = collected(of), materialize(of.spec)
+    np.testing.assert_array_equal(data.states[0], uniform(5, "dataset/0/start", 8))
     alpha = 0.5 * uniform(5, "dataset/0/alpha", 100)[:, None]
-    noise = noise_task(task, 5).optimal_action(found.states[:100])
-    blended = (1 - alpha) * found.optimal_actions[:100] + alpha * noise
-    np.testing.assert_allclose(found.actions[:100], blended, atol=1e-7)
+    noise = noise_task(task, 5).optimal_action(data.states[:100])
+    blended = (1 - alpha) * data.optimal_actions[:100] + alpha * noise
+    np.testing.assert_allclose(data.actions[:100], blended, atol=1e-7)
 
 
 def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
     for fields in TASKS.values():
         task = materialize(SMESpec.from_dict(fields))
         noise = noise_task(task, 0)  # the task's own seed, too, is 0
-        for own, other in zip(task.policies, noise.policies, strict=True):
-            for layer, drawn in zip(own, other, strict=True):
+        for optimal, other in zip(task.policies, noise.policies, strict=True):
+            for layer, drawn in zip(optimal, other, strict=True):
                 assert layer.W.shape == drawn.W.shape
                 assert np.abs(layer.W - drawn.W).max() > 0.1
         np.testing.assert_array_equal(task.W, noise.W)
@@ -126,11 +126,11 @@ def test_the_noise_policy_has_the_shapes_of_the_optimal_one_and_other_numbers():
 
 def test_alpha_is_drawn_at_every_step_and_uniform_up_to_nu():
     of = recipe(acting=[(0.4, 1.0)], transitions=5_000, seed=2)
-    found = made(of)
-    noise = noise_task(materialize(of.spec), 2).optimal_action(found.states)
-    gap = noise - found.optimal_actions
+    data = collected(of)
+    noise = noise_task(materialize(of.spec), 2).optimal_action(data.states)
+    gap = noise - data.optimal_actions
     widest = np.abs(gap).argmax(axis=1)[:, None]
-    moved = np.take_along_axis(found.actions - found.optimal_actions, widest, 1)
+    moved = np.take_along_axis(data.actions - data.optimal_actions, widest, 1)
     alpha = (moved / np.take_along_axis(gap, widest, 1)).ravel()
     assert alpha.min() > -1e-5
     assert alpha.max() < 0.4 + 1e-5
@@ -140,9 +140,9 @@ def test_alpha_is_drawn_at_every_step_and_uniform_up_to_nu():
 
 
 def test_nu_zero_is_the_optimum_to_the_rounding_of_its_actions():
-    found = made(recipe(acting=[(0.0, 1.0)]))
-    np.testing.assert_array_equal(found.actions, found.optimal_actions.astype(np.float32))
-    assert found.regrets.max() < 1e-6
+    data = collected(recipe(acting=[(0.0, 1.0)]))
+    np.testing.assert_array_equal(data.actions, data.optimal_actions.astype(np.float32))
+    assert data.regrets.max() < 1e-6
 
 
 def test_the_mean_similarity_is_one_minus_a_sixth_of_nu_over_the_draws_of_the_noise_policy():
@@ -152,62 +152,62 @@ def test_the_mean_similarity_is_one_minus_a_sixth_of_nu_over_the_draws_of_the_no
     bunches actions around ½, so that ã is nearer to a* than two uniform numbers are.
     """
     means = [
-        made(recipe(acting=[(1.0, 1.0)], seed=seed, transitions=1_000)).similarities.mean()
+        collected(recipe(acting=[(1.0, 1.0)], seed=seed, transitions=1_000)).similarities.mean()
         for seed in range(24)
     ]
     assert abs(np.mean(means) - (1 - 1 / 6)) < 4 * 0.015 / np.sqrt(24)
-    bunched = made(recipe({"complexity": 2}, acting=[(1.0, 1.0)])).similarities.mean()
+    bunched = collected(recipe({"complexity": 2}, acting=[(1.0, 1.0)])).similarities.mean()
     assert bunched > 0.87
 
 
 def test_given_its_noise_policy_the_mean_similarity_is_exact():
     of = recipe(acting=[(0.8, 1.0)], transitions=20_000, seed=4)
-    found = made(of)
-    noise = noise_task(materialize(of.spec), 4).optimal_action(found.states)
-    missed = np.abs(noise - found.optimal_actions).mean(axis=1)
-    error = (found.similarities - (1 - 0.4 * missed)).std() / np.sqrt(len(found))
-    assert abs(found.similarities.mean() - (1 - 0.4 * missed.mean())) < 4 * error
+    data = collected(of)
+    noise = noise_task(materialize(of.spec), 4).optimal_action(data.states)
+    missed = np.abs(noise - data.optimal_actions).mean(axis=1)
+    error = (data.similarities - (1 - 0.4 * missed)).std() / np.sqrt(len(data))
+    assert abs(data.similarities.mean() - (1 - 0.4 * missed.mean())) < 4 * error
 
 
 def test_random_actions_are_uniform_and_drawn_at_every_step():
-    found = made(recipe(acting=[("random", 1.0)], transitions=5_000))
-    assert len(np.unique(found.actions)) > 19_000
-    assert abs(found.actions.mean(axis=0) - 0.5).max() < 5 / np.sqrt(12 * 5_000)
+    data = collected(recipe(acting=[("random", 1.0)], transitions=5_000))
+    assert len(np.unique(data.actions)) > 19_000
+    assert abs(data.actions.mean(axis=0) - 0.5).max() < 5 / np.sqrt(12 * 5_000)
 
 
 def test_behaviours_have_their_shares_of_the_transitions_in_whole_episodes():
-    found = made(recipe(acting=[(0.0, 0.25), (1.0, 0.5), ("random", 0.25)], transitions=2_000))
-    assert np.bincount(found.components).tolist() == [500, 1000, 500]
-    means = [found.similarities[found.components == part].mean() for part in range(3)]
+    data = collected(recipe(acting=[(0.0, 0.25), (1.0, 0.5), ("random", 0.25)], transitions=2_000))
+    assert np.bincount(data.components).tolist() == [500, 1000, 500]
+    means = [data.similarities[data.components == part].mean() for part in range(3)]
     assert means[0] > means[1] > means[2]
-    for number in range(found.episodes[-1] + 1):
-        assert len(np.unique(found.components[found.episodes == number])) == 1
+    for number in range(data.episodes[-1] + 1):
+        assert len(np.unique(data.components[data.episodes == number])) == 1
 
 
 def test_a_sub_cube_keeps_only_its_states_and_ends_trajectories_that_leave_it():
     of = recipe({"state_dim": 2}, coverage=-0.4, transitions=2_000)
-    found, whole = made(of), made(recipe({"state_dim": 2}, transitions=20_000))
-    assert expansion(found.states).max() <= -0.4
-    assert expansion(found.states).max() > -0.41
+    data, whole = collected(of), collected(recipe({"state_dim": 2}, transitions=20_000))
+    assert expansion(data.states).max() <= -0.4
+    assert expansion(data.states).max() > -0.41
     inside = expansion(whole.states) <= -0.4
-    np.testing.assert_array_equal(found.states, whole.states[inside][:2_000])
-    left = expansion(found.next_states) > -0.4
-    assert (found.timeouts | ~left).all()
+    np.testing.assert_array_equal(data.states, whole.states[inside][:2_000])
+    left = expansion(data.next_states) > -0.4
+    assert (data.timeouts | ~left).all()
     assert left.any()
 
 
 def test_coverage_zero_keeps_everything():
-    assert made(recipe(coverage=0.0)).digest == made(recipe()).digest
+    assert collected(recipe(coverage=0.0)).digest == collected(recipe()).digest
 
 
 def test_a_sub_cube_that_is_too_small_is_rejected_before_the_work():
     with pytest.raises(OptionError, match=r"coverage=-0\.99: 700 transitions need about"):
-        made(recipe(coverage=-0.99))
+        collected(recipe(coverage=-0.99))
 
 
 def test_a_data_set_larger_than_memory_is_rejected():
     with pytest.raises(ResourceLimitError, match="transitions=1000000000"):
-        made(recipe(transitions=10**9))
+        collected(recipe(transitions=10**9))
 
 
 def test_a_users_policy_gives_the_same_bits_for_any_number_of_lanes():
@@ -220,11 +220,11 @@ def test_a_users_policy_gives_the_same_bits_for_any_number_of_lanes():
             return net(torch.as_tensor(observations)).numpy()
 
     of = recipe({"horizon": 10}, acting=[(act, 1.0)], transitions=150)
-    found = made(of, policies={0: act})
+    data = collected(of, policies={0: act})
     for lanes in (1, 100):
-        assert made(of, lanes, {0: act}).digest == found.digest
-    replay(found, of, materialize(of.spec))
-    np.testing.assert_allclose(found.actions, np.clip(act(found.observations), 0, 1), atol=1e-6)
+        assert collected(of, lanes, {0: act}).digest == data.digest
+    replay(data, of, materialize(of.spec))
+    np.testing.assert_allclose(data.actions, np.clip(act(data.observations), 0, 1), atol=1e-6)
 
 
 def test_a_teams_agents_act_on_their_own_observations():
@@ -247,13 +247,13 @@ def test_a_teams_agents_act_on_their_own_observations():
             "transitions": 90,
         }
     )
-    found = made(of, policies=policies)
+    data = collected(of, policies=policies)
     assert seen == {"one": 4, "two": 10}
-    np.testing.assert_array_equal(found.actions[:, 0], found.observations[:, 0])
+    np.testing.assert_array_equal(data.actions[:, 0], data.observations[:, 0])
     # The last thing that agent 1 sees is its own r_cum/k, not its colleague's.
-    np.testing.assert_array_equal(found.actions[:, -1], found.observations[:, 10])
-    assert (found.observations[:, 9] != found.observations[:, 10]).any()
-    replay(found, of, materialize(of.spec))
+    np.testing.assert_array_equal(data.actions[:, -1], data.observations[:, 10])
+    assert (data.observations[:, 9] != data.observations[:, 10]).any()
+    replay(data, of, materialize(of.spec))
 
 
 def test_a_policy_that_fails_is_named():
@@ -262,7 +262,7 @@ def test_a_policy_that_fails_is_named():
 
     of = recipe(acting=[(broken, 1.0)])
     with pytest.raises(PolicyError, match="'broken'"):
-        made(of, policies={0: broken})
+        collected(of, policies={0: broken})
 
 
 @pytest.mark.parametrize(
@@ -276,19 +276,19 @@ def test_a_policy_that_fails_is_named():
 @pytest.mark.parametrize("row", [0, 150, 299])
 def test_replay_detects_a_change_in_any_array_and_row(array, row):
     of = recipe(transitions=300)
-    found = made(of)
-    changed = getattr(found, array).copy()
+    data = collected(of)
+    changed = getattr(data, array).copy()
     one = changed[row : row + 1]
     one[...] = ~one if changed.dtype == bool else one + (1 if changed.dtype == int else 1e-4)
-    faulty = dataclasses.replace(found, **{array: changed})
+    faulty = dataclasses.replace(data, **{array: changed})
     with pytest.raises(FingerprintMismatchError, match=r"row \d+"):
         replay(faulty, of, materialize(of.spec))
 
 
 def test_replay_detects_observations_and_actions_that_are_off_by_one():
     of = recipe(transitions=300)
-    found = made(of)
-    shifted = dataclasses.replace(found, actions=np.roll(found.actions, 1, axis=0))
+    data = collected(of)
+    shifted = dataclasses.replace(data, actions=np.roll(data.actions, 1, axis=0))
     with pytest.raises(FingerprintMismatchError, match="next_states, row 0"):
         replay(shifted, of, materialize(of.spec))
 
@@ -313,6 +313,6 @@ def test_the_optimal_policy_has_the_same_bits_in_any_batch():
 
 
 def test_the_environment_does_not_change_the_actions_of_a_data_set():
-    found = made(recipe())
+    data = collected(recipe())
     space = gymnasium.spaces.Box(0.0, 1.0, (4,), np.float32)
-    assert all(space.contains(action) for action in found.actions[:50])
+    assert all(space.contains(action) for action in data.actions[:50])

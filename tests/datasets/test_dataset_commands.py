@@ -1,4 +1,4 @@
-"""`sme dataset`, as it is typed."""
+"""The command `sme dataset`."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def test_the_help_of_each_command_has_examples(command):
 
 
 def test_make_list_show_and_validate():
-    made = good("make", "Default", "--nu", "0.5", "-n", "300", "--seed", "7")
-    assert "300 of 300 transitions" in made.stderr
-    assert "constant ½" in made.stdout
+    result = good("make", "Default", "--nu", "0.5", "-n", "300", "--seed", "7")
+    assert "300 of 300 transitions" in result.stderr
+    assert "constant ½" in result.stdout
     listed = good("list").stdout
     assert NAME in listed
     assert "300" in listed
-    shown = good("show", NAME).stdout
-    assert "300 in 3 trajectories" in shown
-    assert open_dataset(NAME).record.arrays_digest in shown
+    stdout = good("show", NAME).stdout
+    assert "300 in 3 trajectories" in stdout
+    assert open_dataset(NAME).record.arrays_digest in stdout
     assert "valid" in good("validate", NAME).stdout
 
 

@@ -1,4 +1,4 @@
-"""The recipe: a document with one identity, and what it refuses."""
+"""The recipe of a data set: its digest, its validation and its differences."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_equal_recipes_have_equal_digests_and_each_field_counts():
 
 
 def test_a_recipe_survives_its_json():
-    made = recipe(behaviours=weights(0.5, 0.5), coverage=-0.25)
-    assert DatasetRecipe.from_dict(made.to_dict()) == made
+    parsed = recipe(behaviours=weights(0.5, 0.5), coverage=-0.25)
+    assert DatasetRecipe.from_dict(parsed.to_dict()) == parsed
 
 
 def test_differences_name_fields_with_both_values():
@@ -121,9 +121,9 @@ def test_shares_add_up_to_n_and_are_off_by_at_most_one(count):
     for shares in [(1.0,), (0.7, 0.3), (0.5, 0.25, 0.25), (1 / 3, 1 / 3, 1 / 3)]:
         if count * min(shares) < 0.9:
             continue
-        made = recipe(behaviours=weights(*shares), transitions=count)
-        assert sum(made.shares) == count
-        assert np.abs(np.array(made.shares) - count * np.array(shares)).max() <= 1.0
+        parsed = recipe(behaviours=weights(*shares), transitions=count)
+        assert sum(parsed.shares) == count
+        assert np.abs(np.array(parsed.shares) - count * np.array(shares)).max() <= 1.0
 
 
 def test_a_weight_of_less_than_one_transition_is_refused():
@@ -139,10 +139,12 @@ def test_behaviours_are_parsed_from_numbers_names_and_policies(tmp_path):
     assert parse_behaviour(lambda observations: observations).label == "policy"
     path = tmp_path / "mine.zip"
     path.write_bytes(b"abc")
-    made = parse_behaviour(path, action_range="symmetric")
-    assert made.policy == "mine"
-    assert made.sha256 == "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert made.action_range == "symmetric"
+    parsed = parse_behaviour(path, action_range="symmetric")
+    assert parsed.policy == "mine"
+    assert (
+        parsed.sha256 == "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    )
+    assert parsed.action_range == "symmetric"
     with pytest.raises(PolicyError, match="cannot be read"):
         parse_behaviour(tmp_path / "none.zip")
     for wrong in (None, True, [0.5]):

@@ -1,4 +1,4 @@
-"""Exact returns: against the environment itself, from any state, time and amount owed."""
+"""Exact returns compared with the environment, from any state, time and pending reward."""
 
 from __future__ import annotations
 
@@ -190,8 +190,8 @@ def test_an_interval_over_states_requires_two() -> None:
 
 def test_fitted_q_and_exact_returns_rank_policies_equally() -> None:
     example = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "ope.py"))
-    found = example["judge"](SMESpec(), nu=1.0, seed=0, rows=4000)
-    estimates, truths = ({name: row[i] for name, row in found.items()} for i in (0, 1))
+    values = example["compare"](SMESpec(), nu=1.0, seed=0, rows=4000)
+    estimates, truths = ({name: row[i] for name, row in values.items()} for i in (0, 1))
     assert sorted(estimates, key=estimates.__getitem__) == sorted(truths, key=truths.__getitem__)
     # Near the data it is right to a tenth; of the optimum, off them, it knows far too little.
     near, far = "half optimal, half ½", "optimal"

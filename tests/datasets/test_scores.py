@@ -1,4 +1,4 @@
-"""Reference scores: exact on the set's states, and what whole episodes give."""
+"""Reference scores: exact on the data set's states, and by rollouts."""
 
 from __future__ import annotations
 

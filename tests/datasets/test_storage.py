@@ -34,23 +34,23 @@ NAME = "sme/tests-v0"
 
 
 @pytest.fixture(scope="module")
-def shelf(tmp_path_factory):
+def root(tmp_path_factory):
     """A folder with one set; tests that change anything copy it."""
-    folder = tmp_path_factory.mktemp("shelf")
+    folder = tmp_path_factory.mktemp("root")
     make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=7,
                  name=NAME, folder=folder)  # fmt: skip
     return folder
 
 
 @pytest.fixture
-def copied(shelf, tmp_path):
-    shutil.copytree(shelf, tmp_path / "shelf")
-    return tmp_path / "shelf"
+def copied(root, tmp_path):
+    shutil.copytree(root, tmp_path / "root")
+    return tmp_path / "root"
 
 
 @pytest.fixture
-def minaris(shelf, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(shelf))
+def minaris(root, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
 
 
 def run(script, *arguments, **options):
@@ -85,19 +85,19 @@ def edited(folder, change):
 
 
 class TestReading:
-    def test_transitions_are_read_bit_for_bit(self, shelf):
+    def test_transitions_are_read_bit_for_bit(self, root):
         from sme_registry.datasets.collect import collect
 
-        dataset = open_dataset(NAME, shelf)
+        dataset = open_dataset(NAME, root)
         task = materialize(dataset.recipe.spec)
-        found, made = dataset.transitions(), collect(dataset.recipe, task)
-        for name, array in made.columns().items():
-            np.testing.assert_array_equal(getattr(found, name), array, strict=True)
-        assert found.digest == dataset.record.arrays_digest
-        replay(found, dataset.recipe, task)
+        read, generated = dataset.transitions(), collect(dataset.recipe, task)
+        for name, array in generated.columns().items():
+            np.testing.assert_array_equal(getattr(read, name), array, strict=True)
+        assert read.digest == dataset.record.arrays_digest
+        replay(read, dataset.recipe, task)
 
-    def test_the_record_has_provenance_and_digests(self, shelf):
-        record = open_dataset(NAME, shelf).record
+    def test_the_record_has_provenance_and_digests(self, root):
+        record = open_dataset(NAME, root).record
         assert record.recipe.transitions == 250
         assert record.spec_digest == sme_registry.load("Default").digest
         assert record.protocol_digest == record.recipe.protocol.digest
@@ -107,17 +107,17 @@ class TestReading:
         assert record.trajectories == 4
         assert {"sme_registry", "numpy", "h5py", "minari"} <= set(record.versions)
 
-    def test_a_set_is_opened_by_its_id_and_by_any_of_its_paths(self, shelf, minaris):
+    def test_a_set_is_opened_by_its_id_and_by_any_of_its_paths(self, root, minaris):
         opened = [
             open_dataset(NAME),
-            open_dataset(NAME, shelf),
-            open_dataset(shelf / NAME),
-            open_dataset(str(shelf / NAME / "data")),
+            open_dataset(NAME, root),
+            open_dataset(root / NAME),
+            open_dataset(str(root / NAME / "data")),
         ]
         assert {dataset.id for dataset in opened} == {NAME}
 
-    def test_minari_loads_it_by_its_id_and_aligns_it(self, shelf, minaris):
-        found = open_dataset(NAME, shelf).transitions()
+    def test_minari_loads_it_by_its_id_and_aligns_it(self, root, minaris):
+        transitions = open_dataset(NAME, root).transitions()
         loaded = minari.load_dataset(NAME)
         assert (loaded.total_steps, loaded.total_episodes) == (250, 4)
         first = 0
@@ -125,12 +125,14 @@ class TestReading:
             rows = slice(first, first + len(episode))
             assert len(episode.observations) == len(episode) + 1
             assert {len(info) for info in episode.infos.values()} == {len(episode) + 1}
-            np.testing.assert_array_equal(episode.observations[:-1], found.observations[rows])
-            np.testing.assert_array_equal(episode.observations[1:], found.next_observations[rows])
-            np.testing.assert_array_equal(episode.actions, found.actions[rows])
-            np.testing.assert_array_equal(episode.infos["regret"][:-1], found.regrets[rows])
-            np.testing.assert_array_equal(episode.infos["state"][1:], found.next_states[rows])
-            np.testing.assert_array_equal(episode.truncations, found.timeouts[rows])
+            np.testing.assert_array_equal(episode.observations[:-1], transitions.observations[rows])
+            np.testing.assert_array_equal(
+                episode.observations[1:], transitions.next_observations[rows]
+            )
+            np.testing.assert_array_equal(episode.actions, transitions.actions[rows])
+            np.testing.assert_array_equal(episode.infos["regret"][:-1], transitions.regrets[rows])
+            np.testing.assert_array_equal(episode.infos["state"][1:], transitions.next_states[rows])
+            np.testing.assert_array_equal(episode.truncations, transitions.timeouts[rows])
             first += len(episode)
         assert first == 250
 
@@ -146,7 +148,7 @@ class TestReading:
         score = minari.get_normalized_score(loaded, np.array([loaded[0].rewards.sum()]))
         assert 0.3 < float(score[0]) < 1.0
 
-    def test_the_environment_is_recovered_in_a_fresh_process_that_knows_no_id(self, shelf):
+    def test_the_environment_is_recovered_in_a_fresh_process_that_knows_no_id(self, root):
         script = """
             import json, sys
             import gymnasium, minari
@@ -163,34 +165,36 @@ class TestReading:
                 assert reward == episode.rewards[t] and info["regret"] == episode.infos["regret"][t]
             print(env.unwrapped.sme_spec.digest)
         """
-        done = run(script, shelf / NAME / "data", cwd="/")
+        done = run(script, root / NAME / "data", cwd="/")
         assert done.returncode == 0, done.stderr
         assert done.stdout.strip() == sme_registry.load("Default").digest
 
     def test_a_spec_without_a_name_is_recovered_too(self, tmp_path):
-        made = make_dataset({"state_dim": 3, "seed": "0xfeed"}, 0.5, transitions=20,
+        dataset = make_dataset({"state_dim": 3, "seed": "0xfeed"}, 0.5, transitions=20,
                             folder=tmp_path)  # fmt: skip
-        env = made.minari().recover_environment()
-        assert env.unwrapped.sme_spec == made.recipe.spec
+        env = dataset.minari().recover_environment()
+        assert env.unwrapped.sme_spec == dataset.recipe.spec
 
     def test_a_team_has_joint_actions_and_one_reward_and_no_gymnasium_environment(self, tmp_path):
-        made = make_dataset("Team2", 0.5, transitions=150, folder=tmp_path)
-        spec, found = made.recipe.spec, made.transitions()
-        assert found.actions.shape == (150, spec.action_dim)
-        assert found.observations.shape == (150, spec.state_dim + 1 + 2)
-        assert found.regrets.shape == (150, 2)
-        np.testing.assert_allclose(found.rewards, found.agent_rewards.mean(axis=1), atol=1e-12)
-        replay(found, made.recipe, materialize(spec))
-        loaded = made.minari()
+        dataset = make_dataset("Team2", 0.5, transitions=150, folder=tmp_path)
+        spec, transitions = dataset.recipe.spec, dataset.transitions()
+        assert transitions.actions.shape == (150, spec.action_dim)
+        assert transitions.observations.shape == (150, spec.state_dim + 1 + 2)
+        assert transitions.regrets.shape == (150, 2)
+        np.testing.assert_allclose(
+            transitions.rewards, transitions.agent_rewards.mean(axis=1), atol=1e-12
+        )
+        replay(transitions, dataset.recipe, materialize(spec))
+        loaded = dataset.minari()
         assert loaded.action_space.shape == (spec.action_dim,)
         assert loaded[0].infos["agent_reward"].shape == (101, 2)
         with pytest.raises(ValueError, match="cannot be recovered"):
             loaded.recover_environment()
-        assert sme_registry.make_parallel(open_dataset(made.path).recipe.spec).sme_spec == spec
+        assert sme_registry.make_parallel(open_dataset(dataset.path).recipe.spec).sme_spec == spec
 
 
 class TestTheSameCommand:
-    def test_gives_the_same_bytes_in_two_processes(self, shelf, tmp_path):
+    def test_gives_the_same_bytes_in_two_processes(self, root, tmp_path):
         script = """
             import sys
             from sme_registry.datasets import make_dataset
@@ -200,13 +204,13 @@ class TestTheSameCommand:
         done = run(script, tmp_path)
         assert done.returncode == 0, done.stderr
         for file in ("main_data.hdf5", "metadata.json"):
-            own, other = (folder / NAME / "data" / file for folder in (shelf, tmp_path))
-            assert own.read_bytes() == other.read_bytes()
+            first, second = (folder / NAME / "data" / file for folder in (root, tmp_path))
+            assert first.read_bytes() == second.read_bytes()
 
-    def test_with_another_seed_gives_other_ones(self, shelf, tmp_path):
+    def test_with_another_seed_gives_other_ones(self, root, tmp_path):
         make_dataset("Default", mix=[(0.5, 0.5), ("random", 0.5)], transitions=250, seed=8,
                      name=NAME, folder=tmp_path)  # fmt: skip
-        digests = {open_dataset(NAME, folder).record.arrays_digest for folder in (shelf, tmp_path)}
+        digests = {open_dataset(NAME, folder).record.arrays_digest for folder in (root, tmp_path)}
         assert len(digests) == 2
 
 
@@ -232,9 +236,9 @@ class TestNames:
         make_dataset("Default", transitions=10, name=name, folder=tmp_path)
         assert visible(tmp_path) == {name}
 
-    def test_a_set_inside_another_would_never_be_listed_and_is_refused(self, shelf):
+    def test_a_set_inside_another_would_never_be_listed_and_is_refused(self, root):
         with pytest.raises(OptionError, match="Minari lists none inside another"):
-            make_dataset("Default", transitions=10, name=f"{NAME}/x-v0", folder=shelf)
+            make_dataset("Default", transitions=10, name=f"{NAME}/x-v0", folder=root)
 
     @pytest.mark.parametrize(
         ("arguments", "name"),
@@ -391,8 +395,8 @@ class TestAChangedSet:
         before = sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*"))
         with pytest.raises(SpecError, match=f"schema_version={version}: must be 1.*{age} version"):
             open_dataset(NAME, copied)
-        found, broken = list_datasets(copied)
-        assert found == []
+        datasets, broken = list_datasets(copied)
+        assert datasets == []
         assert list(broken) == [copied / NAME]
         assert sorted((path, path.stat().st_mtime_ns) for path in copied.rglob("*")) == before
 
@@ -443,8 +447,8 @@ class TestAMisplacedSet:
         return request.param
 
     def test_is_not_listed_as_minari_does_not_list_it(self, misplaced, copied, monkeypatch):
-        found, broken = list_datasets(copied)
-        assert [dataset.path for dataset in found] == [copied / NAME]
+        datasets, broken = list_datasets(copied)
+        assert [dataset.path for dataset in datasets] == [copied / NAME]
         assert list(broken) == [copied / misplaced]
         error = (
             f"contains the data set {NAME}. Move or copy it back to {copied / NAME}, or remove it"
@@ -456,9 +460,9 @@ class TestAMisplacedSet:
 
     def test_opens_but_fails_the_location_check_by_any_name(self, misplaced, copied, monkeypatch):
         monkeypatch.chdir(copied / misplaced)
-        for given in (misplaced, copied / misplaced, ".", "data"):
+        for path in (misplaced, copied / misplaced, ".", "data"):
             with pytest.raises(SpecError, match=f"contains the data set {NAME}"):
-                storage.check_location(open_dataset(given, copied), copied)
+                storage.check_location(open_dataset(path, copied), copied)
 
     def test_outside_the_root_is_checked_by_the_end_of_its_path(self, copied, tmp_path):
         for place, right in [("a/sme/tests-v0", True), ("mine", False), ("sme/copy-v0", False)]:
@@ -470,14 +474,14 @@ class TestAMisplacedSet:
     def test_a_symbolic_link_in_the_right_place_is_correct(self, copied, tmp_path):
         (copied / NAME).rename(tmp_path / "elsewhere")
         (copied / NAME).symlink_to(tmp_path / "elsewhere")
-        found, broken = list_datasets(copied)
-        assert [dataset.id for dataset in found] == [NAME]
+        datasets, broken = list_datasets(copied)
+        assert [dataset.id for dataset in datasets] == [NAME]
         assert not broken
 
 
-def test_an_unknown_id_suggests_a_similar_one(shelf):
+def test_an_unknown_id_suggests_a_similar_one(root):
     with pytest.raises(UnknownNameError, match=r"Did you mean 'sme/tests-v0'"):
-        open_dataset("sme/test-v0", shelf)
+        open_dataset("sme/test-v0", root)
 
 
 def test_a_missing_folder_has_no_data_sets(tmp_path):

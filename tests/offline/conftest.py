@@ -1,4 +1,4 @@
-"""One thread for PyTorch: networks this small only wait for one another on more."""
+"""One thread for PyTorch: networks this small are slower on more."""
 
 from __future__ import annotations
 

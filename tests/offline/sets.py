@@ -1,4 +1,4 @@
-"""Small data sets for these tests, made without a file."""
+"""Small data sets for these tests, without files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`sme offline train`, as typed."""
+"""The command `sme offline train`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training on a data set: short real runs, what they report, and what they refuse."""
+"""Training on a data set: short real runs, their records, and invalid arguments."""
 
 from __future__ import annotations
 
