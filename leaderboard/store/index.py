@@ -39,12 +39,12 @@ CREATE TABLE head (
 CREATE TABLE entry (
   id TEXT PRIMARY KEY, sequence INTEGER NOT NULL, received TEXT NOT NULL,
   document TEXT NOT NULL, result TEXT, withdrawal TEXT,
-  status TEXT NOT NULL, code TEXT NOT NULL,
+  status TEXT NOT NULL DEFAULT 'waiting', code TEXT NOT NULL DEFAULT '',
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, steps INTEGER NOT NULL,
-  enough_runs INTEGER NOT NULL, oracle_like INTEGER NOT NULL, reference INTEGER NOT NULL,
-  scores TEXT
+  enough_runs INTEGER NOT NULL DEFAULT 0, oracle_like INTEGER NOT NULL DEFAULT 0,
+  reference INTEGER NOT NULL, scores TEXT
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
@@ -220,18 +220,24 @@ class Index:
         submission = read_document(self.folder, path, SignedSubmission, entry.document).submission
         _check_subject(entry, submission.digest)
         method, submitter = submission.method, submission.submitter
+        values = {
+            "id": entry.subject,
+            "sequence": entry.sequence,
+            "received": entry.time,
+            "document": entry.document,
+            "method": method.name,
+            "version": method.version,
+            "family": method.family,
+            "knowledge": method.knowledge,
+            "submitter": submitter.name,
+            "key": submitter.key,
+            "code_link": submission.code,
+            "runs": len(submission.runs),
+            "steps": sum(run.steps for run in submission.runs),
+            "reference": submitter.key == self.document.key and method.family == "reference",
+        }
         self.connection.execute(
-            f"INSERT INTO entry VALUES ({', '.join('?' * 21)})",
-            (
-                *(entry.subject, entry.sequence, entry.time, entry.document, None, None),
-                *("waiting", ""),
-                *(method.name, method.version, method.family, method.knowledge),
-                *(submitter.name, submitter.key, submission.code),
-                *(len(submission.runs), sum(run.steps for run in submission.runs)),
-                *(False, False),
-                submitter.key == self.document.key and method.family == "reference",
-                None,
-            ),
+            f"INSERT INTO entry ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
         )
         for run in submission.runs:
             if run.artefact is not None:
