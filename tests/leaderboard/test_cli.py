@@ -122,7 +122,7 @@ def test_from_a_key_to_a_page() -> None:
     assert "withdrawn" in fails(1, "submit", "bundle", "board")
 
 
-def test_home_and_board_find_the_same_numbers() -> None:
+def test_check_and_board_compute_the_same_scores() -> None:
     good("keygen")
     make_board()
     id = make_bundle()
@@ -135,7 +135,7 @@ def test_home_and_board_find_the_same_numbers() -> None:
         assert at_home[field] == on_board[field]
 
 
-def test_what_is_rejected_ends_with_1_and_its_code() -> None:
+def test_a_rejection_exits_with_1_and_its_code() -> None:
     good("keygen")
     make_board()
     Path("policy.onnx").write_bytes(b"not a model")
@@ -150,7 +150,7 @@ def test_what_is_rejected_ends_with_1_and_its_code() -> None:
     assert "artefact_digest" in fails(1, "check", "bundle", "--suite", "tiny-v1.json")
 
 
-def test_bad_usage_ends_with_2() -> None:
+def test_invalid_usage_exits_with_2() -> None:
     good("keygen")
     assert "exists already" in fails(2, "keygen")
     assert "init" in fails(2, "rank", "nowhere")
@@ -178,7 +178,7 @@ def test_a_board_whose_references_wait_shows_nothing() -> None:
     assert not Path("board/site/index.html").exists()
 
 
-def test_show_withholds_scores_until_the_references_are_right_and_says_why() -> None:
+def test_show_withholds_scores_until_the_references_are_right_with_the_reason() -> None:
     good("keygen")
     make_board()
     id = make_bundle()
@@ -208,7 +208,7 @@ def test_show_withholds_scores_until_the_references_are_right_and_says_why() -> 
     assert plain["withheld"] == ""
 
 
-def test_show_tells_why_a_submission_was_withdrawn() -> None:
+def test_show_prints_the_reason_for_a_withdrawal() -> None:
     good("keygen")
     make_board()
     id = make_bundle()
@@ -220,7 +220,7 @@ def test_show_tells_why_a_submission_was_withdrawn() -> None:
     assert plain["withdrawal"]["withdrawal"]["reason"] == "a bug in [bold]the wrapper[/]"
 
 
-def test_an_altered_result_ends_with_3_and_is_named() -> None:
+def test_an_altered_result_exits_with_3_and_is_named() -> None:
     make_board()
     good("score", "board")
     path = sorted(Path("board/results").iterdir())[0]
@@ -240,7 +240,7 @@ def test_the_digest_that_verify_prints_is_found_in_the_log_later() -> None:
     assert "contains=" in fails(2, "verify", "board", "--contains", "3f2a")
 
 
-def test_score_says_what_it_did_itself() -> None:
+def test_score_reports_its_own_submissions() -> None:
     good("keygen")
     make_board()
     assert good("score", "board").strip() == "2 scored."
@@ -249,7 +249,7 @@ def test_score_says_what_it_did_itself() -> None:
     assert good("score", "board").strip() == "1 scored. Done before: 2."
 
 
-def test_a_board_without_its_key_takes_nothing_in_and_says_so() -> None:
+def test_a_board_without_its_key_accepts_nothing() -> None:
     good("keygen")
     make_board()
     make_bundle()
@@ -279,7 +279,7 @@ def test_the_index_comes_back_from_the_files(monkeypatch: pytest.MonkeyPatch) ->
     index.close()
 
 
-def test_gc_removes_what_no_submission_names_and_only_says_so_before() -> None:
+def test_gc_removes_unnamed_artefacts_and_a_dry_run_only_counts_them() -> None:
     make_board()
     key = SigningKey.generate()
     data = linear_onnx(1)

@@ -76,7 +76,7 @@ def test_a_submission_is_kept_once(store: Store, key: SigningKey) -> None:
     assert store.head.sequence == 1
 
 
-def test_a_known_submission_is_known_whatever_its_age(store: Store, key: SigningKey) -> None:
+def test_a_known_submission_is_accepted_at_any_age(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
     receive(store, signed)
@@ -84,7 +84,7 @@ def test_a_known_submission_is_known_whatever_its_age(store: Store, key: Signing
     assert receive(store, signed, at=later) == signed.id
 
 
-def test_a_submission_that_is_old_is_refused(store: Store, key: SigningKey) -> None:
+def test_an_old_submission_is_rejected(store: Store, key: SigningKey) -> None:
     signed, artefacts = tiny_submission(store, key)
     put(store, key, artefacts)
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=15)
@@ -92,7 +92,7 @@ def test_a_submission_that_is_old_is_refused(store: Store, key: SigningKey) -> N
     assert store.entries() == []
 
 
-def test_an_artefact_that_is_not_there_is_missed(store: Store, key: SigningKey) -> None:
+def test_a_missing_artefact_is_rejected(store: Store, key: SigningKey) -> None:
     signed, _ = tiny_submission(store, key)
     assert code_of(lambda: receive(store, signed)) == "artefact_missing"
 
@@ -133,7 +133,7 @@ def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> N
     assert receive(store, failed) == failed.id
 
 
-def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKey) -> None:
+def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
         put_submission(store, key, 1)
         put_submission(store, key, 2)
@@ -148,7 +148,7 @@ def test_the_quota_of_a_day_frees_up_when_it_says(tmp_path: Path, key: SigningKe
         assert receive(store, signed, at=after) == signed.id
 
 
-def test_the_quota_of_one_key_is_not_anothers(tmp_path: Path, key: SigningKey) -> None:
+def test_each_key_has_its_own_quota(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 1}) as store:
         put_submission(store, key, 1)
         other = SigningKey.generate()
@@ -157,7 +157,7 @@ def test_the_quota_of_one_key_is_not_anothers(tmp_path: Path, key: SigningKey) -
         assert receive(store, signed) == signed.id
 
 
-def test_a_board_where_many_wait_takes_no_more(tmp_path: Path, key: SigningKey) -> None:
+def test_a_full_queue_accepts_no_more(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
         put_submission(store, key, 1)
         signed, artefacts = tiny_submission(store, key, 2)
@@ -169,7 +169,9 @@ def test_a_board_where_many_wait_takes_no_more(tmp_path: Path, key: SigningKey) 
 # Bundles.
 
 
-def test_a_bundle_brings_its_artefacts(tmp_path: Path, store: Store, key: SigningKey) -> None:
+def test_a_bundle_is_stored_with_its_artefacts(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
     signed, artefacts = tiny_submission(store, key)
     folder = bundle(tmp_path / "bundle", signed, artefacts)
     for _ in range(2):
@@ -194,7 +196,7 @@ def test_a_bundle_that_is_refused_leaves_nothing(
 # The board's own rows.
 
 
-def test_reference_rows_are_one_of_each_however_often(tmp_path: Path) -> None:
+def test_reference_rows_exist_once_however_often_submitted(tmp_path: Path) -> None:
     with tiny_board(tmp_path / "b", instances=2) as store:
         ids = intake.submit_references(store)
         assert intake.submit_references(store) == ids
@@ -226,7 +228,7 @@ def test_reference_rows_make_a_board_publishable(store: Store) -> None:
     refuse_unpublishable(store.entries())
 
 
-def test_a_board_that_is_old_still_takes_its_reference_rows(
+def test_an_old_board_still_accepts_its_reference_rows(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entry = store.log(0, 1)[0].model_copy(update={"time": "2020-01-01T00:00:00Z"})
@@ -234,7 +236,7 @@ def test_a_board_that_is_old_still_takes_its_reference_rows(
     assert len(intake.submit_references(store)) == 2
 
 
-def test_a_name_of_a_reference_row_is_no_reference_row(store: Store, key: SigningKey) -> None:
+def test_the_name_of_a_reference_row_does_not_make_one(store: Store, key: SigningKey) -> None:
     method = {"name": "optimal", "version": "1", "family": "reference", "knowledge": "oracle"}
     put_submission(store, key, method=method)
     assert len(intake.submit_references(store)) == 2
@@ -264,7 +266,7 @@ def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
 
 
 @pytest.mark.parametrize("letter", ["\x1b", "\x00", "\r", "\u202e", "\u2028"])
-def test_a_reason_holds_no_characters_that_steer_whoever_reads_it(
+def test_a_reason_may_not_contain_control_characters(
     store: Store, key: SigningKey, letter: str
 ) -> None:
     signed = put_submission(store, key)
@@ -274,7 +276,7 @@ def test_a_reason_holds_no_characters_that_steer_whoever_reads_it(
     intake.withdraw(store, intake.withdrawal_of(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
 
 
-def test_what_is_not_there_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
+def test_an_unknown_submission_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
     withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key)
     assert code_of(lambda: intake.withdraw(store, withdrawal)) == "unknown_submission"
 
@@ -309,14 +311,14 @@ def test_an_upload_is_signed_for_ten_minutes(key: SigningKey, minutes: int) -> N
     assert code_of(lambda: intake.uploader(header, digest, at=past)) == "stale_time"
 
 
-def test_a_signature_of_a_submission_is_none_of_an_upload(key: SigningKey) -> None:
+def test_the_signature_of_a_submission_does_not_sign_an_upload(key: SigningKey) -> None:
     digest, time = "sha256:" + "1" * 64, utc(datetime.datetime.now(datetime.UTC))
     signature = key.sign("submission", f"{digest} {time}")
     header = f"SME-Ed25519 key={key.public},time={time},signature={signature}"
     assert code_of(lambda: intake.uploader(header, digest)) == "bad_signature"
 
 
-def test_upload_quotas_count_what_is_there_and_under_way(tmp_path: Path, key: SigningKey) -> None:
+def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: SigningKey) -> None:
     limits = {"upload_bytes_per_day": 1000, "total_bytes": 2000, "artefact_bytes": 900}
     with tiny_board(tmp_path / "b", limits=limits) as store:
         put(store, key, {"sha256:" + _sha256(bytes(500)): bytes(500)})

@@ -94,7 +94,7 @@ def resign(board: Path, key: SigningKey, start: int = 1) -> None:
     folder.index.unlink()
 
 
-def test_a_whole_board_is_whole_and_counted(board):
+def test_an_unaltered_board_is_verified_and_counted(board):
     seen = []
     report = verify(board, rescore=5, progress=lambda done, total: seen.append((done, total)))
     with Store.open(board, read_only=True) as store:
@@ -129,7 +129,7 @@ def test_a_board_without_its_private_key_or_its_index_is_verified_all_the_same(b
     assert not Folder(board).index.exists()
 
 
-def test_a_log_cut_at_its_end_is_found_out_by_a_digest_that_was_kept(board):
+def test_a_kept_digest_reveals_a_log_cut_at_its_end(board):
     """As where a board was cloned without its index: the rest of the log is in order."""
     kept = verify(board).log_digest
     folder = Folder(board)
@@ -146,7 +146,7 @@ def test_a_log_cut_at_its_end_is_found_out_by_a_digest_that_was_kept(board):
     assert verify(board, contains=first.digest) == cut
 
 
-def test_a_log_that_the_board_wrote_anew_is_found_out_by_a_digest_that_was_kept(board):
+def test_a_kept_digest_reveals_a_rewritten_log(board):
     kept = verify(board).log_digest
     folder = Folder(board)
     alter(folder.log_entry(8), lambda plain: plain.update({"time": "2126-11-21T09:30:00Z"}))
@@ -155,13 +155,13 @@ def test_a_log_that_the_board_wrote_anew_is_found_out_by_a_digest_that_was_kept(
     assert found(board, contains=kept) == "log"
 
 
-def test_a_digest_that_is_none_is_refused(board):
+def test_an_invalid_digest_is_rejected(board):
     for text in ("", "3f2a", "sha256:" + "x" * 64):
         with pytest.raises(OptionError, match="contains="):
             verify(board, contains=text)
 
 
-def test_no_board_is_no_tampering(tmp_path):
+def test_a_missing_board_is_not_tampering(tmp_path):
     with pytest.raises(BoardError, match="holds no board"):
         verify(tmp_path)
     with pytest.raises(OptionError, match="rescore=-1"):
@@ -202,7 +202,7 @@ def test_an_altered_log_entry_is_named(board, sequence, field):
 
 @pytest.mark.parametrize("sequence", range(9))
 @pytest.mark.parametrize("harm", ["deleted", "emptied", "cut", "noise", "spaces"])
-def test_a_log_entry_that_is_gone_or_no_longer_in_form_is_named(board, sequence, harm):
+def test_a_missing_or_reformatted_log_entry_is_named(board, sequence, harm):
     path = Folder(board).log_entry(sequence)
     data = path.read_bytes()
     changed = {"emptied": b"", "cut": data[:-9], "noise": b"\xff\x00", "spaces": data + b" "}
@@ -264,7 +264,7 @@ def test_an_altered_submission_is_named(board, number, harm):
     assert found(board) == where(board, path)
 
 
-def test_submissions_that_changed_places_are_named(board):
+def test_swapped_submissions_are_named(board):
     one, other = (Folder(board).submission(id) for id in ids(board)[:2])
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
@@ -303,7 +303,7 @@ def test_an_altered_result_is_named(board, number, harm):
     assert found(board) == where(board, path)
 
 
-def test_results_that_changed_places_are_named(board):
+def test_swapped_results_are_named(board):
     one, other = (Folder(board).result(id) for id in ids(board)[:2])
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
@@ -318,12 +318,12 @@ def test_an_unlogged_result_is_named(board):
     assert found(board) == where(board, path)
 
 
-def test_what_is_no_file_of_a_board_is_named(board):
+def test_a_foreign_file_is_named(board):
     (board / "results" / "note.json").write_text("{}")
     assert found(board) == "results/note.json"
 
 
-def test_a_submission_on_its_way_into_the_log_is_counted(board, tmp_path):
+def test_a_submission_not_yet_logged_is_counted(board, tmp_path):
     key = SigningKey.generate()
     with tiny_board(tmp_path / "other", instances=2) as other:
         signed = put_submission(other, key, 5)
@@ -361,7 +361,7 @@ def test_an_altered_artefact_is_named(board, harm):
         ("INSERT INTO lease VALUES ('x', 'y', 1, 0, '', 0.0)", None),
     ],
 )
-def test_an_edited_index_is_named_with_its_first_odd_row(board, change, row):
+def test_an_edited_index_is_named_with_its_first_altered_row(board, change, row):
     one = ids(board)[1]
     with contextlib.closing(sqlite3.connect(Folder(board).index)) as connection:
         first = connection.execute("SELECT min(digest) FROM object").fetchone()[0]
@@ -376,14 +376,14 @@ def test_an_edited_index_is_named_with_its_first_odd_row(board, change, row):
         assert found(board) == f"index.sqlite: {row} {key}"
 
 
-def test_a_row_put_into_the_index_is_named(board):
+def test_an_inserted_index_row_is_named(board):
     with contextlib.closing(sqlite3.connect(Folder(board).index)) as connection:
         connection.execute("INSERT INTO object VALUES ('sha256:0', 1, '', '')")
         connection.commit()
     assert found(board) == "index.sqlite: object sha256:0"
 
 
-def test_a_broken_index_is_named_and_reindexing_heals_it(board):
+def test_a_broken_index_is_named_and_reindexing_repairs_it(board):
     Folder(board).index.write_bytes(b"SQLite format 3\0" + bytes(5000))
     assert found(board) == "index.sqlite"
     with Store.open(board) as store:
@@ -392,7 +392,7 @@ def test_a_broken_index_is_named_and_reindexing_heals_it(board):
 
 
 @pytest.mark.parametrize("lie", ["runs", "scores", "seed", "run's metrics"])
-def test_a_board_that_lies_and_signs_it_is_found_out(board, lie):
+def test_a_forged_and_signed_result_is_detected(board, lie):
     """Chain, signatures and digests are all right: the numbers are not."""
     folder = Folder(board)
     id = ids(board)[1]
@@ -416,7 +416,7 @@ def test_a_board_that_lies_and_signs_it_is_found_out(board, lie):
 
 @pytest.mark.parametrize("lie", ["leaves it out", "scores it 0", "gives it the constant's decay"])
 @pytest.mark.parametrize("kind", ["failed", "not listed"])
-def test_a_board_that_spares_a_run_without_a_policy_is_found_out(tmp_path, kind, lie):
+def test_a_failed_run_left_out_of_a_result_is_detected(tmp_path, kind, lie):
     board = tmp_path / "board"
     key = SigningKey.generate()
     with tiny_board(board) as store:
@@ -441,7 +441,7 @@ def test_a_board_that_spares_a_run_without_a_policy_is_found_out(tmp_path, kind,
     assert found(board) == where(board, path)
 
 
-def test_a_board_that_lies_about_its_runs_is_found_out_by_scoring_them_anew(board):
+def test_rescoring_detects_forged_runs(board):
     folder = Folder(board)
     id = ids(board)[1]
     path = folder.result(id)

@@ -34,7 +34,7 @@ def board(store, submit) -> Path:
     return store.folder.path
 
 
-def test_a_scorer_scores_what_waits_and_returns(store, board):
+def test_a_scorer_empties_the_queue_and_returns(store, board):
     seen = []
     assert run_scorer(board, progress=lambda done, total: seen.append((done, total))) == 3
     assert [row.status for row in store.entries()] == ["scored"] * 3
@@ -47,7 +47,7 @@ def test_a_scorer_scores_what_waits_and_returns(store, board):
     assert store.result(first.id) == anew
 
 
-def test_a_policy_that_is_refused_is_rejected_with_its_code(store, key):
+def test_an_invalid_policy_is_rejected_with_its_code(store, key):
     data = linear_onnx(0, observation_dim=9)
     import hashlib
 
@@ -118,7 +118,7 @@ def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monk
     assert len(held) > 5
 
 
-def test_a_scorer_stops_when_it_is_told_to(store, submit):
+def test_a_scorer_stops_on_request(store, submit):
     submit(1)
     submit(2)
     answers = iter([False, True])
@@ -139,12 +139,12 @@ def test_several_processes_score_everything_once(store, board):
     assert run_scorers(board, 2) == 0
 
 
-def test_no_workers_is_refused(tmp_path):
+def test_zero_workers_are_refused(tmp_path):
     with pytest.raises(OptionError, match="workers=0"):
         run_scorers(tmp_path, 0)
 
 
-def test_what_a_process_finds_altered_stops_them_all(store, board):
+def test_tampering_found_by_one_process_stops_all(store, board):
     path = store.folder.submission(store.entries()[0].id)
     path.write_bytes(path.read_bytes().replace(b"A tester", b"Somebody"))
     with pytest.raises(TamperedError) as tampered:
@@ -153,7 +153,7 @@ def test_what_a_process_finds_altered_stops_them_all(store, board):
     assert multiprocessing.active_children() == []
 
 
-def test_processes_that_only_die_are_given_up(store, board, monkeypatch):
+def test_processes_that_keep_dying_end_the_scoring(store, board, monkeypatch):
     monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))

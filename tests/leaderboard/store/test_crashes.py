@@ -77,7 +77,7 @@ def state(board: Path) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("work", [put, receive, finish, withdraw, reindex])
-def test_a_write_is_whole_or_absent_and_can_be_done_again(tmp_path, key, work: Work):
+def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work: Work):
     prepared(tmp_path / "start", key, work)
     before = state(tmp_path / "start")
     shutil.copytree(tmp_path / "start", tmp_path / "end")
@@ -106,7 +106,7 @@ def test_a_write_is_whole_or_absent_and_can_be_done_again(tmp_path, key, work: W
     assert seen == {before, after}
 
 
-def test_a_board_is_made_whole_or_not_at_all(tmp_path):
+def test_a_board_is_created_completely_or_not_at_all(tmp_path):
     board, made = tmp_path / "board", []
     for call in range(100):
         crashed = crashes_before(call, lambda: tiny_board(board).close())
@@ -122,7 +122,7 @@ def test_a_board_is_made_whole_or_not_at_all(tmp_path):
     assert {False, True} == set(made)
 
 
-def test_a_full_disk_is_said_and_leaves_nothing_half_written(tmp_path, key):
+def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
     with small_disk(tmp_path / "disk", "1500k") as disk:
         if disk is None:
             pytest.skip("no file system may be mounted here")

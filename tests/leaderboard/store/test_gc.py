@@ -36,7 +36,7 @@ def litter(store, key, submit):
     return old, young, named
 
 
-def test_gc_removes_what_dead_processes_left_and_what_nobody_names(store, litter):
+def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     old, young, named = litter
     before = store.usage.total_bytes()
     garbage = collect_garbage(store)
@@ -58,7 +58,7 @@ def test_a_dry_run_counts_the_same_and_removes_nothing(store, litter):
     assert counted == collect_garbage(store)
 
 
-def test_an_object_that_is_brought_again_is_young_again(store, key, litter):
+def test_uploading_an_object_again_resets_its_age(store, key, litter):
     old, _, _ = litter
     assert put(store, key, b"old, and of nobody") == old
     assert collect_garbage(store).objects == 0
@@ -70,7 +70,7 @@ def test_ages_are_arguments(store, litter):
     assert (garbage.temporary, garbage.objects) == (4, 2)
 
 
-def test_gc_leaves_an_upload_in_flight_alone(store, key):
+def test_gc_keeps_an_upload_in_progress(store, key):
     data = b"first half, second half"
     digest = "sha256:" + hashlib.sha256(data).hexdigest()
 

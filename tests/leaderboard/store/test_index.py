@@ -70,7 +70,7 @@ def derived(store: Store) -> list[object]:
         return list(index.derived_rows())
 
 
-def test_the_index_that_grew_equals_the_one_made_anew(tmp_path, key):
+def test_a_grown_index_equals_a_rebuilt_one(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         fill(store, key)
         path = store.folder.index
@@ -86,7 +86,7 @@ def test_the_index_that_grew_equals_the_one_made_anew(tmp_path, key):
     assert made[0] == made[1]
 
 
-def test_reindex_from_the_files_alone_gives_equal_bytes_elsewhere(tmp_path, key):
+def test_reindexing_a_copy_of_the_files_gives_equal_rows(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         fill(store, key, waiting=True)
         store.reindex()
@@ -97,7 +97,7 @@ def test_reindex_from_the_files_alone_gives_equal_bytes_elsewhere(tmp_path, key)
     assert copied == (tmp_path / "board" / "index.sqlite").read_bytes()
 
 
-def test_an_entry_row_says_what_board_and_ranking_need(store, key):
+def test_an_entry_row_has_the_fields_of_pages_and_ranking(store, key):
     fill(store, key, waiting=True)
     rows = store.entries()
     assert [row.status for row in rows] == ["scored", "rejected", "withdrawn", "waiting"]
@@ -115,7 +115,7 @@ def test_an_entry_row_says_what_board_and_ranking_need(store, key):
     assert store.queue.done() == 3
 
 
-def test_rows_of_the_boards_own_key_are_reference_rows(store, key):
+def test_rows_signed_by_the_boards_key_are_reference_rows(store, key):
     method = {"name": "constant", "version": "1", "family": "reference", "knowledge": "family"}
     own = put_submission(store, store.folder.signing_key(), 1, method=method)
     pretender = put_submission(store, key, 2, method=method)
@@ -142,7 +142,7 @@ def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, sub
     assert store.queue.waiting() == 0
 
 
-def test_what_is_unknown_is_said_to_be_unknown(store, key):
+def test_an_unknown_id_is_reported(store, key):
     unknown = "sha256:" + "0" * 64
     with pytest.raises(UnknownNameError, match="no submission"):
         store.submission(unknown)
@@ -163,7 +163,7 @@ def test_submissions_are_counted_by_key_and_time(store, key, submit):
 
 
 @pytest.mark.parametrize("harm", ["missing", "empty", "noise", "torn", "schema", "another board"])
-def test_an_index_of_no_use_is_made_anew_on_opening(tmp_path, key, harm):
+def test_an_unusable_index_is_rebuilt_on_opening(tmp_path, key, harm):
     with tiny_board(tmp_path / "board") as store:
         fill(store, key, waiting=True)
         expected = derived(store)
@@ -206,7 +206,7 @@ def test_an_index_that_is_behind_catches_up(tmp_path, key):
         assert derived(store) == expected
 
 
-def test_an_index_that_lies_about_its_place_is_made_anew(tmp_path, key):
+def test_an_index_with_a_wrong_head_is_rebuilt(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         for number in range(3):
             put_submission(store, key, number)
@@ -221,7 +221,7 @@ def test_an_index_that_lies_about_its_place_is_made_anew(tmp_path, key):
 
 
 @pytest.mark.parametrize("which", ["index.sqlite", "index.sqlite*"])
-def test_an_index_deleted_in_mid_work_is_made_anew_by_who_comes_next(tmp_path, key, which):
+def test_an_index_deleted_while_in_use_is_rebuilt_by_the_next_process(tmp_path, key, which):
     with tiny_board(tmp_path / "board") as first, Store.open(tmp_path / "board") as second:
         put_submission(first, key, 0)
         assert len(second.entries()) == 1
@@ -305,7 +305,7 @@ def insist(call):
 
 
 @pytest.mark.parametrize("deleted", [0, 20], ids=["", "while the index is deleted"])
-def test_processes_take_turns(tmp_path, key, deleted):
+def test_transactions_of_processes_do_not_overlap(tmp_path, key, deleted):
     tiny_board(tmp_path / "board").close()
     children = []
     for worker in range(3):
@@ -335,7 +335,7 @@ def test_processes_take_turns(tmp_path, key, deleted):
         assert derived(store) == expected
 
 
-def test_a_turn_nests(store, key):
+def test_transactions_nest(store, key):
     with store.transaction() as outer, store.transaction() as inner:
         assert isinstance(inner, Index)
         assert inner is outer
@@ -344,7 +344,7 @@ def test_a_turn_nests(store, key):
     assert len(store.entries()) == 1
 
 
-def test_a_turn_that_fails_after_the_log_entry_loses_nothing(store, key):
+def test_a_transaction_that_fails_after_the_log_entry_loses_nothing(store, key):
     def fails() -> None:
         with store.transaction():
             put_submission(store, key)

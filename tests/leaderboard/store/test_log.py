@@ -8,7 +8,7 @@ from leaderboard.store import EMPTY, Store
 from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_board
 
 
-def test_each_entry_holds_the_digest_of_the_one_before_and_the_boards_signature(store, key, submit):
+def test_each_entry_has_the_previous_digest_and_the_boards_signature(store, key, submit):
     signed = submit()
     store.withdraw(signed_withdrawal(signed.id, key))
     entries = store.log()
@@ -21,7 +21,7 @@ def test_each_entry_holds_the_digest_of_the_one_before_and_the_boards_signature(
     assert store.head[:2] == (2, entries[2].digest)
 
 
-def test_the_signature_is_of_every_other_field(store):
+def test_the_signature_covers_every_other_field(store):
     (entry,) = store.log()
     others = {
         "sequence": 1,
@@ -37,7 +37,7 @@ def test_the_signature_is_of_every_other_field(store):
         assert altered.signed_digest != entry.signed_digest
 
 
-def test_pages_of_the_log_end_where_it_ends(store, submit):
+def test_a_range_of_the_log_stops_at_its_end(store, submit):
     for number in range(3):
         submit(number)
     assert [entry.sequence for entry in store.log(1, 2)] == [1, 2]
@@ -68,7 +68,7 @@ def test_a_board_without_its_key_can_be_read_but_not_written(tmp_path, key):
         assert len(store.entries()) == 1
 
 
-def test_another_boards_key_writes_no_entry_that_is_read_again(tmp_path, key):
+def test_another_boards_key_cannot_write_to_the_log(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         store.folder.key.unlink()
         SigningKey.generate().write(store.folder.key)
@@ -78,7 +78,7 @@ def test_another_boards_key_writes_no_entry_that_is_read_again(tmp_path, key):
         assert store.head.sequence == 0
 
 
-def test_a_truncated_log_is_noticed_by_whoever_opens_the_board(tmp_path, key):
+def test_opening_a_board_detects_a_truncated_log(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         for number in range(2):
             put_submission(store, key, number)

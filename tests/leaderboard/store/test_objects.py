@@ -23,7 +23,7 @@ def files(store: Store) -> list[str]:
     return [path.name for path in store.folder.objects.rglob("*") if path.is_file()]
 
 
-def test_an_object_is_new_once_and_comes_back_as_it_was(store):
+def test_an_object_is_stored_once_and_read_back_unchanged(store):
     data = os.urandom(100_000)
     pieces = [data[start : start + 4096] for start in range(0, len(data), 4096)]
     assert store.put_object(digest(data), pieces, by=KEY)
@@ -40,7 +40,7 @@ def test_bytes_of_another_digest_leave_nothing(store):
     assert files(store) == []
 
 
-def test_a_stream_is_cut_off_at_the_limit_and_leaves_nothing(tmp_path):
+def test_a_stream_is_stopped_at_the_limit_and_leaves_nothing(tmp_path):
     with tiny_board(tmp_path / "board", limits={"artefact_bytes": 1000}) as store:
         read = 0
 
@@ -67,25 +67,25 @@ def test_an_upload_that_breaks_off_leaves_nothing(store):
     assert files(store) == []
 
 
-def test_altered_bytes_are_not_handed_out(store):
+def test_altered_bytes_are_not_returned(store):
     store.put_object(digest(b"policy"), [b"policy"], by=KEY)
     store.folder.object(digest(b"policy")).write_bytes(b"Policy")
     with pytest.raises(TamperedError, match="objects/"):
         store.objects.read(digest(b"policy"))
 
 
-def test_a_missing_object_is_said_to_be_missing(store):
+def test_a_missing_object_is_reported(store):
     with pytest.raises(BoardError, match="cannot be read"):
         store.objects.read(digest(b"never seen"))
 
 
-def test_a_path_is_no_digest(store):
+def test_a_path_is_not_a_digest(store):
     for name in ("../../board.key", "sha256:../board.key", "sha256:" + "A" * 64):
         with pytest.raises(ValueError, match="not a digest"):
             store.objects.has(name)
 
 
-def test_bytes_count_for_who_brought_them_until_and_after_they_are_submitted(store, key, submit):
+def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, submit):
     since = "2000-01-01T00:00:00Z"
     store.put_object(digest(b"12345"), [b"12345"], by=key.public)
     assert store.usage.uploaded_bytes(key.public, since) == store.usage.total_bytes() == 5
@@ -98,7 +98,7 @@ def test_bytes_count_for_who_brought_them_until_and_after_they_are_submitted(sto
     assert store.usage.total_bytes() == size
 
 
-def test_many_threads_bring_the_same_object_once(store):
+def test_many_threads_upload_the_same_object_once(store):
     data = os.urandom(50_000)
     new: list[bool] = []
 

@@ -19,7 +19,7 @@ def test_the_oldest_is_claimed_first_and_by_one_worker_only(store, submit):
     assert store.queue.waiting() == 3
 
 
-def test_a_claim_that_ran_out_is_claimed_again_and_the_late_result_refused(store, submit):
+def test_an_expired_claim_is_claimed_again_and_the_late_result_rejected(store, submit):
     submit()
     late = store.queue.claim("late", seconds=0)
     second = store.queue.claim("second")
@@ -34,7 +34,7 @@ def test_a_claim_that_ran_out_is_claimed_again_and_the_late_result_refused(store
     assert [entry.event for entry in store.log()] == ["opened", "received", "result"]
 
 
-def test_a_worker_whose_claim_ran_out_may_still_finish_where_nobody_else_came(store, submit):
+def test_a_worker_with_an_expired_claim_may_finish_if_nobody_claimed_since(store, submit):
     submit()
     claim = store.queue.claim("slow", seconds=0)
     assert store.queue.finish(claim, made_up_result(store, claim.id))
@@ -64,7 +64,7 @@ def test_a_heartbeat_renews_a_claim(store, submit, monkeypatch):
     assert not store.queue.heartbeat(claim)
 
 
-def test_a_claim_does_not_survive_the_machine(store, submit, monkeypatch):
+def test_a_claim_does_not_survive_a_reboot(store, submit, monkeypatch):
     submit()
     monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot one", 1e6))
     store.queue.claim("worker", seconds=1e6)
@@ -73,7 +73,7 @@ def test_a_claim_does_not_survive_the_machine(store, submit, monkeypatch):
 
 
 @pytest.mark.parametrize("days", [-400, 400])
-def test_setting_the_clock_moves_no_claim(store, submit, monkeypatch, days):
+def test_setting_the_clock_changes_no_claim(store, submit, monkeypatch, days):
     submit(0)
     submit(1)
     held = store.queue.claim("worker", seconds=60)
@@ -86,7 +86,7 @@ def test_setting_the_clock_moves_no_claim(store, submit, monkeypatch, days):
     assert store.queue.finish(held, made_up_result(store, held.id))
 
 
-def test_what_is_given_back_does_not_count_as_lost(store, submit):
+def test_a_released_claim_does_not_count_as_lost(store, submit):
     submit()
     for _ in range(ATTEMPTS + 2):
         store.queue.release(store.queue.claim("worker"))
@@ -106,7 +106,7 @@ def test_a_submission_that_lost_every_attempt_is_rejected(store, submit):
     assert store.queue.failed() == 1
 
 
-def test_a_reference_row_is_never_given_up(store, submit):
+def test_a_reference_row_is_retried_indefinitely(store, submit):
     references = intake.submit_references(store)
     other = submit()
     for attempt in range(1, ATTEMPTS + 3):
@@ -120,7 +120,7 @@ def test_a_reference_row_is_never_given_up(store, submit):
         assert store.queue.finish(claim, made_up_result(store, id))
 
 
-def test_a_reference_row_that_was_given_up_once_stays_so_in_the_log(store):
+def test_a_reference_row_rejected_by_an_earlier_version_stays_rejected(store):
     """As scorers did before: such a board is still read, and its log followed."""
     first, second = intake.submit_references(store)
     claim = store.queue.claim("worker")
@@ -130,7 +130,7 @@ def test_a_reference_row_that_was_given_up_once_stays_so_in_the_log(store):
     assert store.queue.claim("worker").id == second
 
 
-def test_what_is_withdrawn_while_it_is_scored_gets_no_result(store, key, submit):
+def test_a_submission_withdrawn_during_scoring_gets_no_result(store, key, submit):
     signed = submit()
     claim = store.queue.claim("worker")
     store.withdraw(signed_withdrawal(signed.id, key))

@@ -195,7 +195,9 @@ def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
     assert HTTP.get(f"{url}/static/board.css").status_code == 200
 
 
-def test_a_browser_gets_a_page_where_nothing_is(published: tuple[str, dict[str, str]]) -> None:
+def test_a_browser_gets_a_page_for_an_unknown_address(
+    published: tuple[str, dict[str, str]],
+) -> None:
     url, _ = published
     page = HTTP.get(f"{url}/nowhere", headers=BROWSER)
     assert page.status_code == 404
@@ -208,12 +210,12 @@ def test_a_browser_gets_a_page_where_nothing_is(published: tuple[str, dict[str, 
 # Reading by the API.
 
 
-def test_the_server_says_that_it_lives(published: tuple[str, dict[str, str]]) -> None:
+def test_the_health_check_answers(published: tuple[str, dict[str, str]]) -> None:
     assert HTTP.get(f"{published[0]}/healthz").json() == {"status": "ok"}
 
 
 @pytest.mark.parametrize("metric", ["wd_regret", "ood_regret", "ood_decay"])
-def test_the_board_as_data_is_in_order(published: tuple[str, dict[str, str]], metric: str) -> None:
+def test_the_ranking_as_json_is_sorted(published: tuple[str, dict[str, str]], metric: str) -> None:
     board = HTTP.get(f"{published[0]}/api/board", params={"metric": metric}).json()
     values = [row["scores"][metric]["value"] for row in board["rows"]]
     assert board["metric"] == metric
@@ -221,12 +223,12 @@ def test_the_board_as_data_is_in_order(published: tuple[str, dict[str, str]], me
     assert len(values) > 5
 
 
-def test_a_metric_that_is_none_is_refused(published: tuple[str, dict[str, str]]) -> None:
+def test_an_unknown_metric_is_rejected(published: tuple[str, dict[str, str]]) -> None:
     answer = HTTP.get(f"{published[0]}/api/board", params={"metric": "reward"})
     assert refusal(answer) == (400, "bad_request")
 
 
-def test_the_log_comes_in_parts_that_join(published: tuple[str, dict[str, str]]) -> None:
+def test_the_log_is_served_in_consecutive_parts(published: tuple[str, dict[str, str]]) -> None:
     url, _ = published
     whole = HTTP.get(f"{url}/api/log").json()
     tail = HTTP.get(f"{url}/api/log", params={"start": 5}).json()
@@ -237,14 +239,12 @@ def test_the_log_comes_in_parts_that_join(published: tuple[str, dict[str, str]])
 
 
 @pytest.mark.parametrize("start", ["-1", "x", "1e3", "9" * 400, "١"])
-def test_a_start_that_is_no_number_is_refused(
-    published: tuple[str, dict[str, str]], start: str
-) -> None:
+def test_an_invalid_start_is_rejected(published: tuple[str, dict[str, str]], start: str) -> None:
     answer = HTTP.get(f"{published[0]}/api/log", params={"start": start})
     assert refusal(answer) == (400, "bad_request")
 
 
-def test_a_submission_is_told_with_its_result(published: tuple[str, dict[str, str]]) -> None:
+def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, str]]) -> None:
     url, ids = published
     scored = HTTP.get(f"{url}/api/submissions/{hex_of(ids['sac'])}").json()
     rejected = HTTP.get(f"{url}/api/submissions/{hex_of(ids['rejected'])}").json()
@@ -304,7 +304,9 @@ def test_an_unknown_submission_has_its_code(published: tuple[str, dict[str, str]
         "/%0d%0aSet-Cookie:x",
     ],
 )
-def test_a_path_that_climbs_is_refused(published: tuple[str, dict[str, str]], path: str) -> None:
+def test_a_path_that_leaves_the_folder_is_rejected(
+    published: tuple[str, dict[str, str]], path: str
+) -> None:
     answer = raw(
         published[0], f"GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n".encode()
     )
@@ -317,7 +319,9 @@ def test_a_path_that_climbs_is_refused(published: tuple[str, dict[str, str]], pa
     "digits", ["0" * 63, "0" * 65, "A" * 64, "g" * 64, "sha256:" + "0" * 64, "٠" * 64, "x"]
 )
 @pytest.mark.parametrize("where", ["objects", "submissions"])
-def test_odd_hex_is_refused(published: tuple[str, dict[str, str]], where: str, digits: str) -> None:
+def test_an_invalid_digest_is_rejected(
+    published: tuple[str, dict[str, str]], where: str, digits: str
+) -> None:
     answer = HTTP.get(f"{published[0]}/api/{where}/{digits}")
     assert refusal(answer) == (400, "unsafe_name")
 
@@ -327,7 +331,7 @@ def test_board_files_are_not_served(published: tuple[str, dict[str, str]]) -> No
         assert HTTP.get(published[0] + path).status_code == 404
 
 
-def test_another_method_is_refused(published: tuple[str, dict[str, str]]) -> None:
+def test_an_unsupported_method_is_rejected(published: tuple[str, dict[str, str]]) -> None:
     url, _ = published
     for method, path in (("POST", "/api/board"), ("DELETE", f"/api/objects/{'0' * 64}")):
         assert refusal(HTTP.request(method, url + path)) == (405, "method_not_allowed")
@@ -336,7 +340,7 @@ def test_another_method_is_refused(published: tuple[str, dict[str, str]]) -> Non
 # Uploads.
 
 
-def test_an_artefact_goes_in_once_and_comes_out_as_it_was(
+def test_an_artefact_is_uploaded_once_and_downloaded_unchanged(
     url: str, store: Store, key: SigningKey
 ) -> None:
     data = linear_onnx(1)
@@ -378,7 +382,7 @@ def test_an_upload_signed_at_another_time_is_refused(
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
-def test_a_time_that_is_no_time_is_refused(url: str, key: SigningKey) -> None:
+def test_an_upload_signed_at_an_impossible_time_is_rejected(url: str, key: SigningKey) -> None:
     header = intake.upload_header(key, sha256(b"x"), "2026-02-31T00:00:00Z")
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
@@ -428,7 +432,7 @@ def test_an_upload_without_a_length_is_stopped_at_the_limit(
         assert files_of(store) == before
 
 
-def test_a_length_that_lies_leaves_nothing_behind(url: str, store: Store, key: SigningKey) -> None:
+def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: SigningKey) -> None:
     before = files_of(store)
     data = b"z" * 1000
     for length in (999, 1001):
@@ -467,7 +471,7 @@ def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
         assert put(url, key, b"good").status_code == 201  # and it holds none of the quota
 
 
-def test_the_quota_of_a_key_counts_what_is_under_way(tmp_path: Path, key: SigningKey) -> None:
+def test_the_quota_of_a_key_counts_uploads_in_progress(tmp_path: Path, key: SigningKey) -> None:
     limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600}
     with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
         head = (
@@ -522,7 +526,7 @@ def uploaded(
     return signed
 
 
-def test_a_submission_is_taken_once(url: str, store: Store, key: SigningKey) -> None:
+def test_a_submission_is_accepted_once(url: str, store: Store, key: SigningKey) -> None:
     signed = uploaded(url, store, key)
     first, second = post(url, signed.to_bytes()), post(url, signed.to_bytes())
     assert (first.status_code, second.status_code) == (202, 200)
@@ -603,7 +607,7 @@ def _named(name: str) -> Break:
         (_artefact_larger, "artefact_digest"),
     ],
 )
-def test_a_submission_that_is_wrong_has_its_code(
+def test_an_invalid_submission_has_its_code(
     url: str, store: Store, key: SigningKey, change: Break, code: str
 ) -> None:
     plain = uploaded(url, store, key).submission.to_dict()
@@ -668,7 +672,7 @@ def test_a_changed_submission_is_not_the_signed_one(
     assert refusal(post(url, json.dumps(plain).encode())) == (403, "bad_signature")
 
 
-def test_submissions_of_a_key_have_a_quota_that_says_when(tmp_path: Path, key: SigningKey) -> None:
+def test_the_submission_quota_states_when_it_frees_up(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
         put_submission(store, key, 1)
         put_submission(store, key, 2)
@@ -682,7 +686,7 @@ def test_submissions_of_a_key_have_a_quota_that_says_when(tmp_path: Path, key: S
             assert post(url, uploaded(url, store, other, 4).to_bytes()).status_code == 202
 
 
-def test_a_board_takes_only_so_many_that_wait(tmp_path: Path, key: SigningKey) -> None:
+def test_the_queue_of_a_board_has_a_limit(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
         put_submission(store, key, 1)
         with serving(store.folder.path) as url:
@@ -726,7 +730,7 @@ def test_a_body_that_is_no_withdrawal_has_its_code(
 # Faults, and `serve`.
 
 
-def test_a_fault_of_the_server_is_told_to_its_log_only(
+def test_an_internal_fault_is_logged_and_not_shown(
     url: str, store: Store, key: SigningKey, caplog: pytest.LogCaptureFixture
 ) -> None:
     data = linear_onnx(5)
@@ -753,7 +757,7 @@ def test_every_code_of_the_server_is_explained() -> None:
 
 
 @pytest.mark.parametrize("signal_name", ["SIGINT", "SIGTERM"])
-def test_serve_scores_beside_and_stops_cleanly(
+def test_serve_runs_scorers_and_stops_cleanly(
     tmp_path: Path, key: SigningKey, signal_name: str
 ) -> None:
     with tiny_board(tmp_path / "board") as store:
@@ -792,7 +796,7 @@ def _is_alive(pid: int) -> bool:
         return False
 
 
-def test_serve_says_where_nothing_can_listen(store: Store) -> None:
+def test_serve_reports_an_address_in_use(store: Store) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(BoardError, match="cannot listen here"),

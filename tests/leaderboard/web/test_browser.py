@@ -123,7 +123,7 @@ def test_no_page_complains_or_is_wider_than_the_screen(origin, width, opened, wr
         assert "system-ui" in fonts, f"{name}: the style sheet was not loaded"
 
 
-def test_a_policy_without_inline_code_is_in_force_and_would_be_heard(served, chromium):
+def test_the_policy_against_inline_code_is_enforced_and_reported(served, chromium):
     page = chromium.new_page()
     heard = []
     page.on("console", lambda message: heard.append(message.text))
@@ -232,7 +232,7 @@ def test_without_script_the_board_is_whole_and_the_comparison_says_what_is_missi
 
 
 @pytest.mark.parametrize("width", ["desktop", "phone"])
-def test_everything_that_can_be_used_has_a_name(served, width, opened, written):
+def test_every_control_has_an_accessible_name(served, width, opened, written):
     page = opened(served + "index.html", width)
     named = 0
     for name in all_pages(written[1]):

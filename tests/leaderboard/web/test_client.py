@@ -110,7 +110,7 @@ def test_the_status_is_that_of_the_board(
     assert withdrawal.withdrawal.reason == "a bug"
 
 
-def test_a_stranger_cannot_withdraw(
+def test_another_key_cannot_withdraw(
     tmp_path: Path, url: str, store: Store, key: SigningKey
 ) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
@@ -120,7 +120,7 @@ def test_a_stranger_cannot_withdraw(
     assert caught.value.code == "bad_signature"
 
 
-def test_a_refusal_has_the_boards_own_code_and_words(tmp_path: Path, key: SigningKey) -> None:
+def test_a_rejection_has_the_boards_code_and_message(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"upload_bytes_per_day": 10}) as store:
         folder, _ = bundle_of(tmp_path / "bundle", store, key)
         with serving(store.folder.path) as url, pytest.raises(Rejection) as caught:
@@ -129,7 +129,7 @@ def test_a_refusal_has_the_boards_own_code_and_words(tmp_path: Path, key: Signin
     assert "within 24 hours" in caught.value.message
 
 
-def test_what_the_board_has_is_not_sent_again(
+def test_existing_artefacts_are_not_sent_again(
     tmp_path: Path, store: Store, key: SigningKey
 ) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
@@ -139,9 +139,7 @@ def test_what_the_board_has_is_not_sent_again(
     assert [line.split()[0] for line in asked] == ["HEAD", "POST"]
 
 
-def test_requests_that_got_lost_are_sent_again(
-    tmp_path: Path, store: Store, key: SigningKey
-) -> None:
+def test_lost_requests_are_repeated(tmp_path: Path, store: Store, key: SigningKey) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
     answers = {
         "HEAD": iter([None, (404, b"")]),
@@ -154,7 +152,7 @@ def test_requests_that_got_lost_are_sent_again(
     assert methods == ["HEAD"] * 2 + ["PUT"] * 3 + ["POST"] * 2
 
 
-def test_a_board_that_is_away_is_given_up(tmp_path: Path, store: Store, key: SigningKey) -> None:
+def test_an_unreachable_board_is_reported(tmp_path: Path, store: Store, key: SigningKey) -> None:
     folder, _ = bundle_of(tmp_path / "bundle", store, key)
     with scripted(lambda *_: None) as (url, asked), pytest.raises(BoardError, match="reached"):
         client.submit(url, folder, key)
@@ -163,7 +161,7 @@ def test_a_board_that_is_away_is_given_up(tmp_path: Path, store: Store, key: Sig
         client.status(url, "0" * 64)
 
 
-def test_a_refusal_is_not_tried_again(key: SigningKey) -> None:
+def test_a_rejected_request_is_not_repeated(key: SigningKey) -> None:
     no = json.dumps({"code": "quota", "message": "none left"}).encode()
     with (
         scripted(lambda *_: (429, no)) as (url, asked),
@@ -185,7 +183,7 @@ def test_a_refusal_is_not_tried_again(key: SigningKey) -> None:
         (200, b"[" * 100_000),
     ],
 )
-def test_what_is_no_board_is_said_so(status: int, body: bytes, key: SigningKey) -> None:
+def test_a_server_that_is_no_board_is_reported(status: int, body: bytes, key: SigningKey) -> None:
     with scripted(lambda *_: (status, body)) as (url, _), pytest.raises(BoardError) as caught:
         client.status(url, "0" * 64)
     assert str(caught.value).isprintable()
@@ -216,7 +214,7 @@ def test_an_endless_answer_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
         "http://localhost.example",
     ],
 )
-def test_a_url_that_is_none_of_a_board_is_refused(url: str) -> None:
+def test_an_invalid_url_is_rejected(url: str) -> None:
     with pytest.raises(OptionError, match="url="):
         client.status(url, "0" * 64)
 
@@ -236,14 +234,14 @@ def test_plain_http_is_for_this_machine(url: str, near: bool) -> None:
     assert client._checked(httpx.URL, url, insecure=False) == (url.rstrip("/"), near)
 
 
-def test_plain_http_elsewhere_has_to_be_asked_for() -> None:
+def test_plain_http_to_other_machines_needs_a_flag() -> None:
     import httpx
 
     url = "http://board.example:8000"
     assert client._checked(httpx.URL, url, insecure=True) == (url, False)
 
 
-def test_an_id_that_is_none_is_refused(key: SigningKey) -> None:
+def test_an_invalid_id_is_rejected(key: SigningKey) -> None:
     for id in ("", "x", "sha256:" + "0" * 63, "../" * 30):
         with pytest.raises(OptionError, match="id="):
             client.status("http://127.0.0.1:1", id)
