@@ -9,8 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from types import TracebackType
-
-import filelock
+from typing import TYPE_CHECKING
 
 from sme_registry.errors import OptionError
 
@@ -18,6 +17,9 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+if TYPE_CHECKING:
+    import filelock
 
 _POLL_SECONDS = 0.002
 
@@ -60,6 +62,8 @@ def file_lock(path: str | os.PathLike[str], *, timeout: float = 0.0) -> Lock | N
     Raises:
       OptionError: the file cannot be created, or its file system has no locks.
     """
+    import filelock  # on first use: most programs take no lock
+
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ import sys
 
 HEAVY = {
     "torch", "jax", "ray", "matplotlib", "numba", "scipy.stats", "stable_baselines3", "pygame",
-    "pandas", "h5py", "minari", "d3rlpy", "onnxruntime", "typer",
+    "pandas", "h5py", "minari", "d3rlpy", "onnxruntime", "typer", "filelock", "jinja2",
 }  # fmt: skip
 CPU_SECONDS = 0.5
 
