@@ -1,8 +1,8 @@
 """Figures: decay outside the training cube, similarity over the plane, regret during training.
 
-Every figure is one file, PNG, PDF or SVG by its ending, and is drawn off screen, without a
-display; `drawing` is how. Colours are those of Okabe and Ito, which the colour-blind tell apart;
-lines also differ in dash and marker, and maps in lightness, so that a print in grey can be read.
+Each figure is one file, PNG, PDF or SVG by its suffix, drawn without a display (`drawing`). The
+colours are those of Okabe and Ito, which colour-blind readers can distinguish. Lines also differ in
+dash and marker, and maps in lightness, so that they remain legible in grey.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from sme_registry.compiled import engine
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.evaluation.report import LABELS
-from sme_registry.io import write_atomically
-from sme_registry.spec import SMESpec, catalogue
+from sme_registry.io import integer_in, write_atomically
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
 from sme_registry.task import load_spec, materialize
 from sme_registry.task.draw import Array
 
@@ -34,13 +34,13 @@ __all__ = ["decay_curve", "similarity_map", "training_curve"]
 
 Measure = Literal["similarity", "normalised_regret"]
 
-# What keeps a format's date out of the file: the same figure is the same file.
+# Metadata without a date, by format, so that equal figures are equal files.
 _UNDATED: dict[str, Any] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 FORMATS = tuple(_UNDATED)
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-MARKERS = "osD^vPX<>*"  # ten beside seven colours: no two of the first 70 share both
+MARKERS = "osD^vPX<>*"  # ten, with seven colours: the first 70 pairs all differ
 GREY = "#707070"
-_DRAWN_POINTS = 400  # of a smoothed line: enough for its every bend at this size
+_DRAWN_POINTS = 400  # of a smoothed line; more would not be visible at this size
 REFERENCE_DASHES: dict[str, Any] = {
     "optimal": "-",
     "linear_least_squares": (0, (6, 2)),
@@ -75,30 +75,30 @@ def decay_curve(
     measures: Sequence[Measure] = ("similarity", "normalised_regret"),
     references: bool = True,
 ) -> Path:
-    """Draw reports over the expansion level ε, one panel a measure, one line a report.
+    """Draw reports over the expansion level ε: one panel per measure, one line per report.
 
-    One report of a team, drawn alone, has a thinner line for each agent, too.
+    A single report of a team also has a thinner line for each agent.
 
     Args:
-      reports: one or more; named by their policies.
+      reports: one or more reports; the legend names their policies.
       path: the file to write, .png, .pdf or .svg.
-      measures: "similarity" and "normalised_regret", or one of them.
-      references: whether the reference policies are drawn, thin, once for each task: in grey,
-        or where there are several tasks in the colour of the task's first report.
+      measures: "similarity", "normalised_regret", or both.
+      references: whether to draw the reference policies as thin lines, once per task: in grey, or
+        with several tasks in the colour of the first report on each task.
 
     Returns:
       The path written.
 
     Raises:
-      OptionError: no report, an unknown measure or ending, or a file that cannot be written.
+      OptionError: no report, an unknown measure or suffix, or the file cannot be written.
       MissingDependencyError: Matplotlib is not installed.
     """
     reports = [reports] if isinstance(reports, EvaluationReport) else list(reports)
     if not reports:
         raise OptionError("reports: must be one or more evaluation reports. Give one.")
     if not measures or any(measure not in _MEASURES for measure in measures):
-        raise OptionError(f"measures={measures!r:.70}: must be of {', '.join(_MEASURES)}.")
-    with _drawing(path, (4.6 * len(measures) + 1.6, 3.7)) as figure:
+        raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(_MEASURES)}.")
+    with _figure_file(path, (4.6 * len(measures) + 1.6, 3.7)) as figure:
         panels = figure.subplots(1, len(measures), squeeze=False)[0]
         for axes, measure in zip(panels, measures, strict=True):
             _decay_panel(axes, reports, measure, references)
@@ -127,7 +127,7 @@ def _decay_panel(
         )
     agents = reports[0].agents if len(reports) == 1 else {}
     for index, (name, agent) in enumerate(agents.items()):
-        several = len(agents) >= len(COLOURS)  # more than can be told apart
+        several = len(agents) >= len(COLOURS)  # too many to distinguish
         label = name if not several else "" if index else f"each of {len(agents)} agents"
         axes.plot(
             *line(agent.regions),
@@ -171,68 +171,58 @@ def _decay_panel(
 
 def similarity_map(
     policy: Any,
-    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str],
+    spec_or_id: SpecLike,
     path: str | os.PathLike[str],
     *,
     epsilon: float = 1.0,
     resolution: int = 240,
     time: float = 0.5,
-    action_range: str | None = None,
+    action_range: ActionRange | None = None,
     name: str | None = None,
 ) -> Path:
     """Draw r̃ of a policy over the plane of a task with two state channels, beyond its unit square.
 
     Args:
-      policy: what `evaluate` takes.
+      policy: any policy that `evaluate` accepts.
       spec_or_id: a task with state_dim=2.
       path: the file to write, .png, .pdf or .svg.
-      epsilon: how far out, in (0, 100]: the plane shown is the cube X_ε; 1 is [−½, 1½]².
+      epsilon: expansion level of the plane, in (0, 100]: the map covers the cube X_ε; 1 is
+        [−½, 1½]².
       resolution: points along each side, in [2, 2000].
-      time: the time input t/T that the policy is given, in [0, 1]; r_cum/k is 0.
+      time: the time input t/T of the policy, in [0, 1]; its r_cum/k is 0.
       action_range: "unit" or "symmetric"; None as in `evaluate`.
-      name: what the title calls the policy.
+      name: the policy's name in the title.
 
     Returns:
       The path written.
 
     Raises:
-      OptionError: the task is no plane, or an argument is out of range.
-      PolicyError: the policy cannot be loaded, or its actions cannot be used.
-      UnknownNameError, SpecError: no such task, or a field out of range.
+      OptionError: the task has no two state channels, or an argument is out of range.
+      PolicyError: the policy cannot be loaded, or its actions are invalid.
+      UnknownNameError, SpecError: the task does not exist, or a field is out of range.
       MissingDependencyError: Matplotlib is not installed.
     """
     spec = load_spec(spec_or_id)
     if spec.state_dim != 2:
         raise OptionError(
-            f"state_dim={spec.state_dim}: must be 2 for a map. Take a task such as SME/Plane1-v1."
+            f"state_dim={spec.state_dim}: must be 2 for a map. Use a task such as SME/Plane1-v1."
         )
-    _within("epsilon", epsilon, 0.0, 100.0, open_below=True)
-    _within("resolution", resolution, 2, 2000)
-    _within("time", time, 0.0, 1.0)
-    asked = as_policy(policy, spec, action_range=action_range, name=name)
-    low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0
-    with _drawing(path, (5.0, 4.2)) as figure:
-        side = low + (np.arange(int(resolution)) + 0.5) * (high - low) / int(resolution)
-        similarity = similarity_on_grid(asked, spec, side, time)
+    _check_range("epsilon", epsilon, 0.0, 100.0, open_below=True)
+    resolution = integer_in("resolution", resolution, 2, 2000)
+    _check_range("time", time, 0.0, 1.0)
+    loaded = as_policy(policy, spec, action_range=action_range, name=name)
+    with _figure_file(path, (5.0, 4.2)) as figure:
+        side = map_side(epsilon, resolution)
+        similarity = similarity_on_grid(loaded, spec, side, time)
         axes = figure.add_subplot()
-        axes.grid(visible=False)
-        image = axes.imshow(
-            similarity,
-            origin="lower",
-            extent=(low, high, low, high),
-            vmin=0.0,
-            vmax=1.0,
-            cmap="viridis",
-            interpolation="nearest",
-        )
-        draw_unit_square(axes, 3.0, 1.2)
+        image = draw_similarity(axes, similarity, epsilon)
         bar = figure.colorbar(image, ax=axes, label="similarity r̃  (1 = optimal)")
         bar.outline.set_visible(False)
         inside = (side >= 0.0) & (side <= 1.0)
         means = [similarity[np.ix_(inside, inside)].mean(), similarity.mean()]
         axes.set_title(
-            f"{literal(asked.name)} on {catalogue.title(spec)}, L = {spec.complexity}\n"
-            f"mean r̃ {means[0]:.3f} in the unit square, {means[1]:.3f} in all shown"
+            f"{literal(loaded.name)} on {catalogue.title(spec)}, L = {spec.complexity}\n"
+            f"mean r̃ {means[0]:.3f} in the unit square, {means[1]:.3f} in the whole map"
         )
         axes.locator_params(nbins=5)
         axes.set_xlabel("state channel 1")
@@ -240,19 +230,33 @@ def similarity_map(
     return Path(path)
 
 
-def draw_unit_square(axes: Axes, outer: float, inner: float) -> None:
-    """The outline of the unit square, white around black: visible on dark and on light colours."""
-    for colour, width in (("white", outer), ("black", inner)):
+def map_side(epsilon: float, resolution: int) -> Array:
+    """`[resolution]` evenly spaced coordinates along a side of the cube X_ε."""
+    low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0
+    return low + (np.arange(resolution) + 0.5) * (high - low) / resolution
+
+
+def draw_similarity(axes: Axes, similarity: Array, epsilon: float) -> Any:
+    """A map of similarities `[N, N]` over the cube X_ε, with the unit square; returns its image."""
+    extent = (-epsilon / 2.0, 1.0 + epsilon / 2.0) * 2
+    axes.grid(visible=False)
+    image = axes.imshow(
+        similarity, origin="lower", extent=extent, vmin=0.0, vmax=1.0, cmap="viridis",
+        interpolation="nearest",
+    )  # fmt: skip
+    # Two strokes, so that the outline is visible on dark and on light colours.
+    for colour, width in (("white", 3.0), ("black", 1.2)):
         axes.plot([0, 1, 1, 0, 0], [0, 0, 1, 1, 0], color=colour, linewidth=width)
+    return image
 
 
-def similarity_on_grid(asked: Any, spec: SMESpec, side: Array, time: float) -> Array:
+def similarity_on_grid(policy: Any, spec: SMESpec, side: Array, time: float) -> Array:
     """r̃ of a policy over the plane of a task with two state channels.
 
     Args:
-      asked: what `as_policy` returns.
+      policy: as `as_policy` returns it.
       spec: the task.
-      side: `[N]` of each state channel.
+      side: `[N]` coordinates of each state channel.
       time: the input t/T.
 
     Returns:
@@ -265,7 +269,7 @@ def similarity_on_grid(asked: Any, spec: SMESpec, side: Array, time: float) -> A
         observations = np.zeros((len(side), 4), dtype=np.float32)
         observations[:, 0], observations[:, 1], observations[:, 2] = side, second, time
         s = observations[:, :2].astype(np.float64)
-        a = np.clip(asked(observations), 0.0, 1.0)
+        a = np.clip(policy(observations), 0.0, 1.0)
         rows.append(task.similarity_of(a, oracle(s)))
     return np.array(rows)
 
@@ -277,36 +281,36 @@ def training_curve(
     title: str = "",
     window: int | None = None,
 ) -> Path:
-    """Draw the exact mean regret of each training episode over environment steps.
+    """Draw the exact regret of each training episode over environment steps.
 
-    The cloud is the episodes; the line their running median over a centred window.
+    Each dot is an episode; the line is their running median over a centred window.
 
     Args:
       episodes: the path of a run's episodes.csv, or rows with `step` and `regret`, as
         attributes or as keys.
       path: the file to write, .png, .pdf or .svg.
-      title: what stands above.
-      window: episodes that the line is smoothed over, from 1; None takes a twentieth of them.
+      title: above the figure.
+      window: number of episodes in the median, at least 1; None for a twentieth of them.
 
     Returns:
       The path written.
 
     Raises:
-      OptionError: no finished episode, other columns, or an argument out of range.
+      OptionError: no finished episode, missing columns, or an argument is out of range.
       MissingDependencyError: Matplotlib is not installed.
     """
     step, regret = _episodes(episodes)
     if window is None:
         window = max(1, len(step) // 20)
-    _within("window", window, 1, 10**9)
-    with _drawing(path, (6.2, 3.6)) as figure:
+    window = integer_in("window", window, 1)
+    with _figure_file(path, (6.2, 3.6)) as figure:
         axes = figure.add_subplot()
         axes.scatter(
             step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True,
             label="one episode",
         )  # fmt: skip
-        drawn, smooth = _running_median(step, regret, int(window))
-        label = f"median of {int(window)} episodes"
+        drawn, smooth = _running_median(step, regret, window)
+        label = f"median of {window} episodes"
         axes.plot(drawn, smooth, color=COLOURS[0], linewidth=2.2, label=label)
         axes.axhline(0.0, color=GREY, linewidth=1.1)
         axes.annotate(
@@ -340,7 +344,7 @@ def _episodes(episodes: str | os.PathLike[str] | Iterable[Any]) -> tuple[Array, 
 
     try:
         if rows and isinstance(rows[-1], dict) and None in rows[-1].values():
-            rows.pop()  # the row that a killed run was writing
+            rows.pop()  # cut short when the run was killed
         points = [(field(row, "step"), field(row, "regret")) for row in rows]
     except (KeyError, AttributeError, TypeError, ValueError):
         raise OptionError(
@@ -348,13 +352,13 @@ def _episodes(episodes: str | os.PathLike[str] | Iterable[Any]) -> tuple[Array, 
             "Give the episodes.csv of a training run."
         ) from None
     if not points:
-        raise OptionError(f"{source}: holds no finished episode yet. Train for longer.")
+        raise OptionError(f"{source}: contains no finished episode. Train for longer.")
     step, regret = np.array(points).T
     return step, regret
 
 
 def _running_median(step: Array, values: Array, window: int) -> tuple[Array, Array]:
-    """Medians over centred windows, which shrink at both ends, at points along the steps."""
+    """Medians over centred windows, shorter at both ends, at some of the steps."""
     before, after = (window - 1) // 2, window // 2
     centres = np.unique(np.linspace(0, len(step) - 1, _DRAWN_POINTS).round().astype(int))
     medians = [np.median(values[max(0, i - before) : i + after + 1]) for i in centres]
@@ -362,8 +366,8 @@ def _running_median(step: Array, values: Array, window: int) -> tuple[Array, Arr
 
 
 @contextlib.contextmanager
-def _drawing(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure that is written when the block ends without an error: whole, or not at all."""
+def _figure_file(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[Figure]:
+    """A figure that is written when the block ends without an error: completely or not at all."""
     path = Path(path)
     ending = path.suffix.removeprefix(".").lower()
     if ending not in FORMATS:
@@ -377,14 +381,14 @@ def _drawing(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterato
 def drawing(
     size: tuple[float, float], formats: Iterable[str]
 ) -> Iterator[tuple[Figure, dict[str, bytes]]]:
-    """A figure in this package's style, and what it is as files once the block has ended.
+    """A figure in the style of this package, and its files.
 
     Args:
       size: width and height in inches.
       formats: of `FORMATS`.
 
     Yields:
-      The figure to draw in, and a dict which holds each format's bytes after the block.
+      The figure to draw in, and a dict that holds the bytes of each format after the block.
 
     Raises:
       MissingDependencyError: Matplotlib is not installed.
@@ -410,18 +414,20 @@ def drawing(
 
 
 def shades(count: int) -> list[tuple[float, ...]]:
-    """Colours for values in an order, dark to light, all of them legible on white."""
+    """Colours for ordered values, from dark to light, all legible on white."""
     from matplotlib import colormaps
 
     return [tuple(colour) for colour in colormaps["viridis"](np.linspace(0.0, 0.85, count))]
 
 
 def literal(text: str) -> str:
-    """Text of a user's that Matplotlib does not read as a formula."""
+    """Text that Matplotlib prints as it is, not as a formula."""
     return text.replace("$", r"\$")
 
 
-def _within(name: str, value: float, low: float, high: float, *, open_below: bool = False) -> None:
+def _check_range(
+    name: str, value: float, low: float, high: float, *, open_below: bool = False
+) -> None:
     if not low <= value <= high or (open_below and value == low):
         bracket = "(" if open_below else "["
         raise OptionError(f"{name}={value!r:.40}: must be in {bracket}{low:g}, {high:g}].")

@@ -45,7 +45,7 @@ def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
-def test_no_two_of_many_lines_look_alike_and_ten_are_told_apart_in_grey():
+def test_56_lines_differ_in_colour_or_marker_and_ten_in_marker():
     colours, markers = plots.COLOURS, plots.MARKERS
     looks = {(colours[i % len(colours)], markers[i % len(markers)]) for i in range(56)}
     assert len(looks) == 56
@@ -61,7 +61,7 @@ def test_the_same_figure_is_the_same_file(tmp_path, report, ending):
 
 
 @pytest.mark.parametrize("name", ["figure.jpg", "figure", "png"])
-def test_another_format_is_refused_before_anything_is_drawn(tmp_path, report, name):
+def test_unknown_formats_are_rejected_before_anything_is_drawn(tmp_path, report, name):
     with pytest.raises(OptionError, match=r"must end in \.png, \.pdf, \.svg"):
         plots.decay_curve(report, tmp_path / name)
     assert not list(tmp_path.iterdir())
@@ -102,7 +102,7 @@ def test_decay_curve_shows_the_reports_numbers_and_every_reference(tmp_path, rep
         assert "not comparable" in axes.get_xlabel()
 
 
-def test_figures_say_which_task_they_are_of(tmp_path, report, figures):
+def test_figures_name_their_task(tmp_path, report, figures):
     plots.decay_curve(report, tmp_path / "decay.png")
     plots.similarity_map(half, "Plane1", tmp_path / "map.png", resolution=4)
     assert figures[0].get_suptitle() == f"SME/{report.spec.content_name}"
@@ -173,7 +173,7 @@ def test_decay_curve_of_different_state_dims_warns_that_levels_differ(tmp_path, 
     ("arguments", "message"),
     [(([],), "must be one or more evaluation reports"), (("r", "m"), "measures=")],
 )
-def test_decay_curve_refuses_what_it_cannot_draw(tmp_path, report, arguments, message):
+def test_decay_curve_rejects_invalid_arguments(tmp_path, report, arguments, message):
     reports = report if arguments[0] == "r" else arguments[0]
     measures = ["mae"] if len(arguments) > 1 else ["similarity"]
     with pytest.raises(OptionError, match=message):
@@ -211,16 +211,16 @@ def test_similarity_map_gives_the_policy_the_asked_time(tmp_path):
         ("Default-v1", {}, "state_dim=8: must be 2 for a map"),
         (PLANE, {"epsilon": 0.0}, r"epsilon=0.0: must be in \(0, 100\]"),
         (PLANE, {"epsilon": float("nan")}, r"epsilon=nan: must be in"),
-        (PLANE, {"resolution": 1}, r"resolution=1: must be in \[2, 2000\]"),
+        (PLANE, {"resolution": 1}, r"resolution=1: must be an integer in \[2, 2,000\]"),
         (PLANE, {"time": 1.5}, r"time=1.5: must be in \[0, 1\]"),
     ],
 )
-def test_similarity_map_refuses_arguments_out_of_range(tmp_path, spec, options, message):
+def test_similarity_map_rejects_arguments_out_of_range(tmp_path, spec, options, message):
     with pytest.raises(OptionError, match=message):
         plots.similarity_map(half, spec, tmp_path / "map.png", **options)
 
 
-def test_training_curve_reads_a_csv_and_leaves_out_a_row_cut_short(tmp_path, figures):
+def test_training_curve_reads_a_csv_and_ignores_an_incomplete_row(tmp_path, figures):
     path = tmp_path / "episodes.csv"
     rows = [f"{i},{row['step']},{row['regret']}" for i, row in enumerate(EPISODES)]
     path.write_text("\n".join(["episode,step,regret", *rows, "51,51"]))
@@ -245,14 +245,14 @@ def test_training_curve_is_the_running_median(tmp_path, figures):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "holds no finished episode yet"),
-        ("step,regret\n", "holds no finished episode yet"),
+        ("", "contains no finished episode"),
+        ("step,regret\n", "contains no finished episode"),
         ("a,b\n1,2\n", "must have numbers for step and regret"),
         ("step,regret\n1,x\n", "must have numbers for step and regret"),
         (None, "cannot be read"),
     ],
 )
-def test_training_curve_refuses_what_is_no_log(tmp_path, content, message):
+def test_training_curve_rejects_invalid_logs(tmp_path, content, message):
     path = tmp_path / "episodes.csv"
     if content is not None:
         path.write_text(content)

@@ -11,12 +11,11 @@ import pandas as pd
 
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
-from sme_registry.plots import draw_unit_square, drawing, literal, similarity_on_grid
+from sme_registry.plots import draw_similarity, drawing, literal, map_side, similarity_on_grid
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures.panels import WIDTH, Picture
 
 _EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5
-_LOW, _HIGH = -_EPSILON / 2.0, 1.0 + _EPSILON / 2.0
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
 
@@ -40,17 +39,21 @@ def draw_maps(
         panels = figure.subplots(len(names), len(classes), squeeze=False, sharex=True, sharey=True)
         image: Any = None
         for (y, x), axes in np.ndenumerate(panels):
-            axes.grid(visible=False)
             axes.set_xticks([0, 1])
             axes.set_yticks([0, 1])
             if y == 0:
                 axes.set_title(classes[x])
             if x == 0:
                 axes.set_ylabel(literal(names[y]))
-            if (classes[x], names[y]) in maps:
-                image = _draw_map(axes, *maps[classes[x], names[y]])
-            else:
+            if (classes[x], names[y]) not in maps:
                 axes.set_axis_off()
+                continue
+            similarity, inside = maps[classes[x], names[y]]
+            image = draw_similarity(axes, similarity, _EPSILON)
+            axes.text(
+                0.03, 0.03, f"WD {inside:.2f}", transform=axes.transAxes, fontsize=7.5, bbox=_BOX,
+                color="black",
+            )  # fmt: skip
         bar = figure.colorbar(image, ax=panels, label="similarity r̃", shrink=0.8)
         bar.outline.set_visible(False)
     return Picture(
@@ -68,7 +71,7 @@ def _maps(
     analysis: Analysis, runs: pd.DataFrame, models: Mapping[str, Path]
 ) -> tuple[dict[tuple[str, str], tuple[Any, float]], str]:
     """(class, algorithm) → its median run's map and WD similarity; and the last problem."""
-    side = _LOW + (np.arange(_RESOLUTION) + 0.5) * (_HIGH - _LOW) / _RESOLUTION
+    side = map_side(_EPSILON, _RESOLUTION)
     inside = analysis.results[analysis.results.region == "WD"].drop_duplicates("key")
     similarity = inside.set_index("key").similarity
     maps, problem = {}, ""
@@ -84,16 +87,3 @@ def _maps(
         except SMEError as error:
             problem = f" {error}"
     return maps, problem
-
-
-def _draw_map(axes: Any, similarity: Any, inside: float) -> Any:
-    image = axes.imshow(
-        similarity, origin="lower", extent=(_LOW, _HIGH, _LOW, _HIGH), vmin=0.0, vmax=1.0,
-        cmap="viridis", interpolation="nearest",
-    )  # fmt: skip
-    draw_unit_square(axes, 2.4, 1.0)
-    axes.text(
-        0.03, 0.03, f"WD {inside:.2f}", transform=axes.transAxes, fontsize=7.5, bbox=_BOX,
-        color="black",
-    )  # fmt: skip
-    return image
