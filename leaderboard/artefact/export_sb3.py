@@ -1,13 +1,13 @@
-"""`export_sb3`: a Stable-Baselines3 model as an ONNX file that answers as `evaluate` asks it.
+"""`export_sb3`: a Stable-Baselines3 model as an ONNX file that `evaluate` can run.
 
-Everything between an observation and an action of the unit range is in the graph:
+The graph contains every step from an observation to an action in the unit range:
 
-    x = clip((o − mean) / √(var + ε), ±clip)    in float64, where VecNormalize rescaled them
+    x = clip((o − mean) / √(var + ε), ±clip)    in float64, with VecNormalize
     y = the network's deterministic action
-    a = clip((y + 1)/2, 0, 1)                   where y is squashed, or symmetric, in [−1, 1]
-    a = clip(y, 0, 1)                           else
+    a = clip((y + 1)/2, 0, 1)                   if y is squashed, or symmetric in [−1, 1]
+    a = clip(y, 0, 1)                           otherwise
 
-A file whose actions differ from the model's own is never written.
+A file whose actions differ from the model's is never written.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 OPSET = 17
 TOLERANCE = 1e-6
-# A float32 network is exact to its rounding only: trained TD3s were up to 1.2e-6 off what float64
-# gives, and differed from themselves by 7e-7 when asked row by row. So of 100 actions 99 must be
-# within the tolerance, and the rest within this.
+# Float32 networks are exact only up to rounding: trained TD3s differed from float64 by up to
+# 1.2e-6, and from themselves row by row by 7e-7. So 99 of 100 actions must be within the tolerance,
+# and the others within this.
 _LARGEST_DIFFERENCE = 1e-5
 _CHECKED_ROWS = 1024
-# Its successor takes seconds instead of tenths, and another package.
-_OF_THE_EXPORTER = (
+# Warnings of PyTorch's exporter. Its successor is ten times slower and needs another package.
+_EXPORTER_WARNINGS = (
     "You are using the legacy TorchScript-based ONNX export",
     "The feature will be removed. Please remove usage of this function",
 )
@@ -60,21 +60,22 @@ def export_sb3(
     """Write a model's deterministic policy as an ONNX file, and check it against the model.
 
     Args:
-      model: a PPO, A2C, SAC, TD3 or DDPG model, or the path of its .zip (loading one can run code
-        of whoever made it). Its action space is [0, 1] or [−1, 1] in every channel.
-      path: where to; the folder is made, and an existing file replaced, whole or not at all.
-      vec_normalize: the `VecNormalize` that rescaled observations in training, or the path of
-        what its `save` wrote (the same caution); None takes the model's own environment's, if
-        it has one. A model's .zip does not hold it: give it where there was one.
-      spec: the task, for its widths to be checked; None checks none.
+      model: a PPO, A2C, SAC, TD3 or DDPG model, or the path of its .zip (loading a .zip can run
+        its author's code). Its action space is [0, 1] or [−1, 1] in every channel.
+      path: the file to write, completely or not at all. Its folder is created if it is missing,
+        and an existing file is replaced.
+      vec_normalize: the `VecNormalize` that rescaled observations in training, or the path of its
+        saved file (which can run code too). None takes that of the model's environment, if any. A
+        model's .zip does not contain it.
+      spec: the task, to check the widths; None skips the check.
 
     Returns:
       The path written: input `observations` `[B, S + 2]` float32, output `actions` `[B, A]`
       float32 in [0, 1], opset 17, weights inside.
 
     Raises:
-      PolicyError: the model cannot be loaded, is a team's, has other spaces, or its ONNX form
-        differs from its `predict` by more than 1e-6 beyond float32's own rounding.
+      PolicyError: the model cannot be loaded, is a team's, has other spaces, or its ONNX file
+        differs from its `predict` by more than 1e-6 beyond float32 rounding.
       Rejection: its network needs operators that no board accepts, or is too large.
       OptionError: the file cannot be written.
       MissingDependencyError: Stable-Baselines3, PyTorch, onnx or ONNX Runtime is not installed.
@@ -95,12 +96,12 @@ def export_sb3(
 
 
 def _refuse_team(model: Any) -> None:
-    """Raise where a model is known to be a team's, by its environment or its run's record."""
+    """Raise if the model's environment or its run's record shows that it is a team's."""
     from sme_registry.sb3 import SMETeamVecEnv
 
     if isinstance(model, str | os.PathLike):
         record = None
-        with contextlib.suppress(SMEError):  # a file of that name that is none of ours
+        with contextlib.suppress(SMEError):  # a run.json of another program
             record = RunRecord.read(Path(model).parent)
         of_a_team = record is not None and record.spec.team is not None
     else:
@@ -108,8 +109,8 @@ def _refuse_team(model: Any) -> None:
         of_a_team = isinstance(getattr(env, "unwrapped", None), SMETeamVecEnv)
     if of_a_team:
         raise PolicyError(
-            "model: acts for the agents of a team, from their shared observation. A board is of "
-            "single agents: give a model that was trained on a spec without a team."
+            "model: acts for the agents of a team, from their shared observation. Boards have "
+            "single agents only. Give a model trained on a spec without a team."
         )
 
 
@@ -119,7 +120,8 @@ def _network(model: Any) -> Any:
         from stable_baselines3.common.policies import BasePolicy
     except ImportError:
         raise MissingDependencyError(
-            "export: Stable-Baselines3 is not installed. Run `pip install 'sme-registry[train]'`."
+            "Exporting a model needs Stable-Baselines3, which is not installed. "
+            "Run `pip install 'sme-registry[train]'`."
         ) from None
     network = getattr(model, "policy", None)
     if not isinstance(network, BasePolicy):
@@ -136,69 +138,69 @@ def _widths(network: Any, spec: SMESpec | None) -> tuple[int, int]:
         shape = getattr(getattr(network, f"{what}_space"), "shape", None)
         if shape is None or len(shape) != 1:
             raise PolicyError(
-                f"model: its {what}s have shape {shape}: must be one row of numbers. Give a model "
-                "that was trained on an SME."
+                f"model: its {what}s have shape {shape}: must be vectors. Give a model trained "
+                "on an SME."
             )
         widths.append(int(shape[0]))
     if spec is not None and spec.team is not None:
         raise PolicyError(
-            f"spec: a team of {len(spec.team.agents)}: must be without a team, as boards are."
+            f"spec: a team of {len(spec.team.agents)}: boards have single agents only."
         )
     if spec is not None and widths != [spec.state_dim + 2, spec.action_dim]:
         raise PolicyError(
             f"model: takes {widths[0]} observations to {widths[1]} actions: must be "
-            f"{spec.state_dim + 2} and {spec.action_dim} for this task. Give the model that was "
-            "trained on it."
+            f"{spec.state_dim + 2} and {spec.action_dim} for this task. Give a model trained on "
+            "it."
         )
     return widths[0], widths[1]
 
 
 def _is_symmetric(network: Any) -> bool:
-    """Whether the action space is [−1, 1]; refuses what is neither that nor [0, 1]."""
+    """Whether the action space is [−1, 1] and not [0, 1]; others are rejected."""
     space = network.action_space
     for low in (0.0, -1.0):
         if np.all(getattr(space, "low", None) == low) and np.all(space.high == 1.0):
             return low < 0.0
     raise PolicyError(
         f"model: its action space is {space}: must be [0, 1] or [-1, 1] in every channel. "
-        "Train it on one of them."
+        "Train it on one of these."
     )
 
 
-def _normaliser(model: Any, given: Any, width: int) -> Any:
-    """The VecNormalize that rescales observations; None where nothing does."""
+def _normaliser(model: Any, vec_normalize: Any, width: int) -> Any:
+    """The VecNormalize that rescales observations, or None."""
     from stable_baselines3.common.vec_env import VecNormalize
 
-    if given is None:
-        given = getattr(model, "get_vec_normalize_env", lambda: None)()
-    elif isinstance(given, str | os.PathLike):
+    normaliser = vec_normalize
+    if vec_normalize is None:
+        normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
+    elif isinstance(vec_normalize, str | os.PathLike):
         try:
-            given = pickle.loads(Path(given).read_bytes())
+            normaliser = pickle.loads(Path(vec_normalize).read_bytes())
         except Exception as error:
             raise PolicyError(
-                f"vec_normalize={str(given)!r}: cannot be loaded: {type(error).__name__}: {error}. "
-                "Give the file that `VecNormalize.save` wrote."
+                f"vec_normalize={str(vec_normalize)!r}: cannot be loaded: {type(error).__name__}: "
+                f"{error}. Give a file that `VecNormalize.save` wrote."
             ) from error
-    if given is None:
+    if normaliser is None:
         return None
-    if not isinstance(given, VecNormalize):
+    if not isinstance(normaliser, VecNormalize):
         raise PolicyError(
-            f"vec_normalize={given!r:.80}: must be a VecNormalize or the path of what its `save` "
-            "wrote."
+            f"vec_normalize={normaliser!r:.80}: must be a VecNormalize or the path of a saved one."
         )
-    if not given.norm_obs:
+    if not normaliser.norm_obs:
         return None
-    shape = getattr(getattr(given, "obs_rms", None), "mean", np.empty(0)).shape
+    shape = getattr(getattr(normaliser, "obs_rms", None), "mean", np.empty(0)).shape
     if shape != (width,):
         raise PolicyError(
-            f"vec_normalize: is of observations of shape {shape}: must be {(width,)}, as the "
-            "model's are. Give the one that it was trained with."
+            f"vec_normalize: for observations of shape {shape}: must be {(width,)} for this model. "
+            "Give the one from its training."
         )
-    return given
+    return normaliser
 
 
 def _unit_policy(network: Any, normaliser: Any, symmetric: bool) -> torch.nn.Module:
-    """From observations to actions of the unit range, as this module's head says."""
+    """The module from observations to unit actions, as defined at the head of this file."""
     import torch
 
     class UnitPolicy(torch.nn.Module):
@@ -223,7 +225,7 @@ def _unit_policy(network: Any, normaliser: Any, symmetric: bool) -> torch.nn.Mod
 
 
 def _deterministic(network: Any, x: torch.Tensor) -> torch.Tensor:
-    """The network's `_predict`, past the distributions, whose broadcasting no board accepts."""
+    """The network's `_predict` without distributions, whose broadcasting no board accepts."""
     import torch
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.sac.policies import SACPolicy
@@ -240,7 +242,7 @@ def _deterministic(network: Any, x: torch.Tensor) -> torch.Tensor:
 
 @contextlib.contextmanager
 def _acting(network: Any) -> Iterator[None]:
-    """The network as `predict` has it, without dropout; then as it was."""
+    """Set the network to evaluation mode, as `predict` does, and restore its mode."""
     was_training = network.training
     network.set_training_mode(False)
     try:
@@ -256,8 +258,8 @@ def _to_onnx(policy: Any, width: int) -> bytes:
     stream: Any = io.BytesIO()
     rows = torch.zeros((2, width), device=policy.network.device)
     with warnings.catch_warnings(), torch.no_grad():
-        for said in _OF_THE_EXPORTER:
-            warnings.filterwarnings("ignore", said, DeprecationWarning)
+        for message in _EXPORTER_WARNINGS:
+            warnings.filterwarnings("ignore", message, DeprecationWarning)
         torch.onnx.export(
             policy,
             (rows,),
@@ -274,12 +276,12 @@ def _to_onnx(policy: Any, width: int) -> bytes:
 def _refuse_difference(
     data: bytes, model: Any, normaliser: Any, symmetric: bool, width: int
 ) -> None:
-    """Raise where the file's actions are not the model's, inside the cube or outside it."""
+    """Raise if the file's actions differ from the model's, inside or outside the cube."""
     try:
         import onnxruntime
     except ImportError:
         raise MissingDependencyError(
-            "export: ONNX Runtime is not installed, and needed to check the file. "
+            "Checking the exported file needs ONNX Runtime, which is not installed. "
             "Run `pip install 'sme-registry[leaderboard]'`."
         ) from None
     random = np.random.default_rng(0)
@@ -287,17 +289,17 @@ def _refuse_difference(
     observations: _Rows = np.concatenate([inside, 2.0 * inside[::-1] - np.float32(0.5)])
 
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    found = session.run(None, {"observations": observations})[0]
-    seen = observations if normaliser is None else normaliser.normalize_obs(observations)
-    expected = model.predict(seen, deterministic=True)[0]
+    actions = session.run(None, {"observations": observations})[0]
+    inputs = observations if normaliser is None else normaliser.normalize_obs(observations)
+    expected = model.predict(inputs, deterministic=True)[0]
     if symmetric:
         expected = (expected + 1.0) / 2.0
-    differences = np.abs(found - np.clip(expected, 0.0, 1.0))
+    differences = np.abs(actions - np.clip(expected, 0.0, 1.0))
     difference = float(differences.max())
     typical = float(np.quantile(differences, 0.99))
     if not (typical <= TOLERANCE and difference <= _LARGEST_DIFFERENCE):
         raise PolicyError(
-            f"model: its ONNX form differs from its predict by {difference:.1e}: must be at most "
-            f"{TOLERANCE:g}. Is its policy random, or does it depend on anything but the "
-            "observation? Write the file yourself and compare."
+            f"model: its ONNX file differs from its predict by {difference:.1e}: must be at most "
+            f"{TOLERANCE:g}. Check that its policy is deterministic and depends only on the "
+            "observation, or write the ONNX file yourself."
         )

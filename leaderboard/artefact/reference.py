@@ -1,19 +1,18 @@
-"""The reference policies as ONNX files: the optimum π*, and the constant ½.
+"""The reference policies as ONNX files: the optimal policy π*, and the constant ½.
 
-They go through the same gate, sandbox and scorer as any submission. If the one leaves 0, or the
-other 1, the pipeline is at fault. Source: METHOD, section 1. `B` batch, `S` state_dim, `A`
-action_dim.
+They pass the same gate, sandbox and scorer as every submission. If their scores differ from 0 and
+1, the pipeline is faulty. Source: METHOD, section 1. `B` batch, `S` state_dim, `A` action_dim.
 
     π*(s) = Φ(W_L Φ(… Φ(W_1 s + b_1) …) + b_L)
 
-It is computed in float64: in float32, rounding leaves a regret of 9e-6 at complexity 50.
-ONNX Runtime has no `Erf` of float64. So Φ is a table, with h = 1/512, and between its entries the
-integral of the density φ by the midpoint rule. With c the multiple of h nearest to x:
+Float64 is needed: float32 rounding causes a regret of 9e-6 at complexity 50. ONNX Runtime has no
+`Erf` for float64, so Φ is a table with step h = 1/512, and between its entries the integral of the
+density φ by the midpoint rule. With c the multiple of h nearest to x:
 
     Φ(x) = Φ(c) + (x − c) φ((x + c)/2),  |x − c| ≤ h/2,  within (h/2)³ max |φ″| / 24 = 2e-11
 
 Beyond ±8.5, where x is clipped, Φ is within 1e-17 of 0 or 1. The products come out in units of h,
-so that rounding one gives its place in the table; negative places count from the table's end.
+so rounding one gives its index into the table; negative indices count from the table's end.
 
 Operators: Cast, Gemm, Clip, Round, Sub, Gather, Add, Mul, Exp.
 """
@@ -49,11 +48,11 @@ def optimal_onnx(spec: SMESpec) -> bytes:
 
     Returns:
       The file's bytes: input `observations` `[B, S + 2]` float32, output `actions` `[B, A]`
-      float32 in [0, 1], the nearest float32 to π*(s) but for an error of about 1e-10.
+      float32 in [0, 1], the nearest float32 to π*(s) up to an error of about 1e-10.
 
     Raises:
-      SpecError: the spec is of a team.
-      ResourceLimitError: the task would not fit in memory.
+      SpecError: the spec has a team.
+      ResourceLimitError: the task does not fit in memory.
       MissingDependencyError: the package `onnx` is not installed.
     """
     _refuse_team(spec)
@@ -69,7 +68,7 @@ def optimal_onnx(spec: SMESpec) -> bytes:
     x = graph.node("Cast", ["observations"], "states", to="DOUBLE")
     layers = cast(list[Layer], materialize(spec).layers)
     for index, (W, b) in enumerate(layers):
-        # t/T and r_cum/k have no part in π*.
+        # π* does not depend on t/T and r_cum/k.
         inputs = W if index > 0 else np.hstack([W, np.zeros((len(W), 2))])
         x = _uniform_layer(graph, f"layer_{index}", x, inputs, b)
     graph.node("Cast", [x], "actions", to="FLOAT")
@@ -86,7 +85,7 @@ def constant_onnx(spec: SMESpec) -> bytes:
       The file's bytes, with the interface of `optimal_onnx`.
 
     Raises:
-      SpecError: the spec is of a team.
+      SpecError: the spec has a team.
       MissingDependencyError: the package `onnx` is not installed.
     """
     _refuse_team(spec)
@@ -100,7 +99,7 @@ def constant_onnx(spec: SMESpec) -> bytes:
 def _uniform_layer(
     graph: _Graph, name: str, x: str, W: npt.NDArray[np.float64], b: npt.NDArray[np.float64]
 ) -> str:
-    """Φ(W x + b) of the value `x`; the name of what comes out."""
+    """Add Φ(W x + b) of the value `x`; return the name of the result."""
     weights = graph.constant(f"{name}/W", np.ascontiguousarray(W.T) * _CELLS_PER_UNIT)
     offset = graph.constant(f"{name}/b", b * _CELLS_PER_UNIT)
     product = graph.node("Gemm", [x, weights, offset], f"{name}/product")
@@ -119,14 +118,14 @@ def _uniform_layer(
 
 
 class _Graph:
-    """An ONNX graph under construction, its values known by their names."""
+    """An ONNX graph under construction. Values are referred to by name."""
 
     def __init__(self) -> None:
         try:
             import onnx
         except ImportError:
             raise MissingDependencyError(
-                "onnx: not installed, and needed to write reference policies. "
+                "Writing reference policies needs onnx, which is not installed. "
                 "Run `pip install 'sme-registry[leaderboard]'`."
             ) from None
         self._onnx = onnx
@@ -134,12 +133,12 @@ class _Graph:
         self._constants: list[Any] = []
 
     def constant(self, name: str, value: npt.NDArray[Any]) -> str:
-        """Add an array; its name."""
+        """Add an array; return its name."""
         self._constants.append(self._onnx.numpy_helper.from_array(value, name))
         return name
 
     def node(self, op: str, inputs: Sequence[str], output: str, to: str | None = None) -> str:
-        """Add a node of one output, its name returned; `to` is the type that a Cast makes."""
+        """Add a node with one output; return its name. `to` is the target type of a Cast."""
         attributes = {} if to is None else {"to": getattr(self._onnx.TensorProto, to)}
         self._nodes.append(self._onnx.helper.make_node(op, inputs, [output], **attributes))
         return output
@@ -166,6 +165,6 @@ class _Graph:
 def _refuse_team(spec: SMESpec) -> None:
     if spec.team is not None:
         raise SpecError(
-            f"team: a board is of single agents, and this is a team of {len(spec.team.agents)}. "
+            f"team: {len(spec.team.agents)} agents: boards have single agents only. "
             "Give a spec without a team."
         )

@@ -1,15 +1,15 @@
-"""`BoardDocument`: what a board is of; and the folder in which everything of a board lies.
+"""`BoardDocument`: the definition of a board; `Folder`: the paths of a board's files.
 
     board.json                   the board: suite, protocol, limits, public key
     board.key                    its private key
-    log/00000000.json …          signed, each entry holding the digest of the one before: the truth
-    submissions/<64 hex>.json    as they were signed, by id
-    withdrawals/<64 hex>.json    likewise, by the submission's id
+    log/00000000.json …          signed entries, each with the digest of the one before
+    submissions/<64 hex>.json    signed submissions, by id
+    withdrawals/<64 hex>.json    signed withdrawals, by the submission's id
     results/<64 hex>.json        by the submission's id
     objects/ab/cdef…             artefacts, by the SHA-256 of their bytes
-    index.sqlite                 an index of all these, which `reindex` makes anew
+    index.sqlite                 an index of all these, which `reindex` recreates
 
-One board is of one suite and one protocol; another suite is another board.
+The log is authoritative. A board has one suite and one protocol.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ KEY = "board.key"
 
 
 class Limits(StrictModel):
-    """Of one key, and of the whole board.
+    """Limits of a board.
 
     Attributes:
-      submissions_per_day, upload_bytes_per_day: of one key.
-      waiting_submissions: not scored yet, of all keys together.
-      artefact_bytes: of one artefact.
-      age_days: how old a submission's signature may be.
-      total_bytes: of all objects.
+      submissions_per_day, upload_bytes_per_day: of each key.
+      waiting_submissions: submissions of all keys that are not scored yet.
+      artefact_bytes: size of an artefact.
+      age_days: age of a submission's signature.
+      total_bytes: size of all objects.
     """
 
     submissions_per_day: Annotated[Integer, Field(ge=1)] = 20
@@ -62,12 +62,12 @@ class BoardDocument(Document):
     """`board.json`.
 
     Attributes:
-      title: as the page's header shows it.
+      title: in the header of its pages.
       suite_name: the suite's versioned name, such as `smoke-v1`.
-      protocol_name: likewise, such as `paper-v1`.
-      key: the public key that signs the log.
-      runs_to_rank: fewest runs in each class for an entry to be ranked.
-      draws: of the bootstrap.
+      protocol_name: the protocol's, such as `paper-v1`.
+      key: the public key of the log's signatures.
+      runs_to_rank: runs that a ranked entry needs in each class.
+      draws: number of bootstrap resamples.
     """
 
     schema_version: SchemaVersion = 1
@@ -84,14 +84,14 @@ class BoardDocument(Document):
 
     @property
     def suite_reference(self) -> SuiteReference:
-        """How submissions name this board's suite."""
+        """The board's suite as submissions name it."""
         return SuiteReference(name=self.suite_name, digest=self.suite.digest)
 
     @property
     def instances(self) -> dict[str, tuple[str, SMESpec]]:
         """Class name and spec of each instance, by the spec's digest, in the suite's order.
 
-        Made anew at each call: keep it over a loop.
+        Computed on each access: store it before a loop.
         """
         return {
             spec.digest: (member.name, spec)
@@ -101,7 +101,7 @@ class BoardDocument(Document):
 
 
 class Folder:
-    """The paths of a board; makes and reads nothing by itself.
+    """The paths of a board's files; creates and reads nothing by itself.
 
     Args:
       path: the board's folder.
@@ -122,11 +122,11 @@ class Folder:
         """The board's document.
 
         Raises:
-          BoardError: the folder holds no board, or a broken one.
+          BoardError: the folder contains no valid board.
         """
         if not self.board.is_file():
             raise BoardError(
-                f"{self.path}: holds no board. Make one with `sme-leaderboard init {self.path}`."
+                f"{self.path}: holds no board. Create one with `sme-leaderboard init {self.path}`."
             )
         try:
             return BoardDocument.from_dict(read_json(self.board), str(self.board))
@@ -137,7 +137,7 @@ class Folder:
         """The board's private key.
 
         Raises:
-          BoardError: it is not there.
+          BoardError: it is missing.
         """
         return SigningKey.read(self.key)
 
@@ -164,10 +164,10 @@ class Folder:
 
 
 def hex_of(digest: str) -> str:
-    """The 64 hex digits of a digest, and so a safe file name.
+    """The 64 hex digits of a digest, a safe file name.
 
     Raises:
-      ValueError: it is no digest; whoever asks has to check what comes from outside.
+      ValueError: it is not a digest; callers check untrusted input before.
     """
     digits = digest.removeprefix("sha256:")
     if len(digits) != 64 or not set(digits) <= set("0123456789abcdef"):

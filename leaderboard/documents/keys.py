@@ -1,7 +1,7 @@
-"""Ed25519 keys: who submitted, and which board said so.
+"""Ed25519 keys of submitters and boards.
 
-A key is 32 random bytes; its public half, 64 hex digits, is the identity. A signature is of the
-SHA-256 digest text of a document under a purpose, so that none can be used for another.
+A key is 32 random bytes; its public half, 64 hex digits, is the identity. A signature
+covers the SHA-256 digest of a document and a purpose, and is invalid for any other purpose.
 
     signature = Ed25519(key, "sme-leaderboard/" purpose "/" digest)
 """
@@ -33,7 +33,7 @@ Signature = Annotated[
 
 @dataclass(frozen=True)
 class SigningKey:
-    """A private key; its text is never shown by `repr`.
+    """A private key; `repr` never shows it.
 
     Attributes:
       public: the public half, 64 hex digits.
@@ -48,10 +48,10 @@ class SigningKey:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SigningKey:
-        """The key of a file.
+        """Read a key from a file.
 
         Raises:
-          BoardError: the file is missing, or holds no key.
+          BoardError: the file is missing or contains no key.
         """
         try:
             text = Path(path).read_text("ascii").strip()
@@ -59,14 +59,14 @@ class SigningKey:
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or "not 64 hex digits"
             raise BoardError(
-                f"{path}: no signing key: {reason}. Make one with `sme-leaderboard keygen`."
+                f"{path}: no signing key: {reason}. Create one with `sme-leaderboard keygen`."
             ) from None
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the key into a new file that only its owner can read.
 
         Raises:
-          BoardError: the file exists (a lost key cannot be had back) or cannot be written.
+          BoardError: the file exists (an overwritten key is lost) or cannot be written.
         """
         path = Path(path)
         try:
@@ -74,7 +74,7 @@ class SigningKey:
             handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         except FileExistsError:
             raise BoardError(
-                f"{path}: exists already, and is left as it is. Give another path with --key."
+                f"{path} already exists and is not replaced. Give another path with --key."
             ) from None
         except OSError as error:
             raise BoardError(f"{path}: cannot be written: {error.strerror}.") from None
@@ -98,7 +98,7 @@ class SigningKey:
 
 
 def verifies(public: str, signature: str, purpose: Purpose, digest: str) -> bool:
-    """Whether this signature of this digest is by the key with this public half."""
+    """Whether the signature of this digest and purpose is by this public key."""
     try:
         key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
         key.verify(bytes.fromhex(signature), _message(purpose, digest))

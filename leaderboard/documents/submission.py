@@ -1,8 +1,8 @@
-"""`Submission`: what a submitter signs. It carries policies, by their hashes, and never a score.
+"""`Submission`: the document that a submitter signs. It names policies by hash and has no scores.
 
     id = "sha256:" + hex(SHA-256(canonical JSON of the submission))
 
-A bundle is the folder that is submitted: `submission.json` (a `SignedSubmission`) and one file
+A bundle is the submitted folder: `submission.json` (a `SignedSubmission`) and one file
 `artefacts/<64 hex digits of its SHA-256>.onnx` for each artefact.
 """
 
@@ -32,9 +32,9 @@ ARTEFACTS = "artefacts"
 MAX_BYTES = 64 * 2**10
 MAX_ARTEFACT_BYTES = 8 * 2**20
 MAX_RUNS = 10_000
-"""Runs counted in all. `runs_started` may say any number, and each costs a line of the result."""
+"""Largest total of `runs_started`: each run takes a line of the result."""
 
-Track = Literal["open"]  # sealed seasons will be another
+Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]
 
 _Line = Annotated[str, Field(min_length=1, max_length=80)]
@@ -58,20 +58,20 @@ UtcTime = Annotated[
 
 
 class SuiteReference(StrictModel):
-    """The suite that is meant: its name and version for readers, its digest for certain."""
+    """A suite: its versioned name for readers, its digest as identity."""
 
     name: Name
     digest: Digest
 
 
 class Method(StrictModel):
-    """What was run.
+    """The method that was run.
 
     Attributes:
       name, version: as the board shows them; letters, digits, spaces and `._+-()`.
       family: the kind of method, such as "PPO" or "model-based".
-      knowledge: what it knows of the task beyond its interface: "generic" nothing, "family" that
-        it is an SME and how those are made, "oracle" this task's optimal policy.
+      knowledge: about the task, beyond its interface. "generic": none. "family": that it is an SME,
+        and how SMEs are built. "oracle": the optimal policy of this task.
     """
 
     name: _Line
@@ -81,14 +81,14 @@ class Method(StrictModel):
 
 
 class Submitter(StrictModel):
-    """Who submits; the key is the identity, the name is what the board shows beside it."""
+    """The submitter: the key is the identity, the name is for display."""
 
     name: _Line
     key: PublicKey
 
 
 class Artefact(StrictModel):
-    """A policy's ONNX file, by content."""
+    """The ONNX file of a policy, identified by its content."""
 
     sha256: Digest
     size: Annotated[Integer, Field(ge=1, le=MAX_ARTEFACT_BYTES)]
@@ -101,7 +101,7 @@ class Run(StrictModel):
       spec: digest of the instance.
       seed: of the training run.
       steps: environment steps taken.
-      artefact: the policy; null where the run failed, which then scores 1 in every metric.
+      artefact: the policy; null if the run failed. It then scores 1 in every metric.
     """
 
     spec: Digest
@@ -115,8 +115,8 @@ class Training(StrictModel):
 
     Attributes:
       library: with its version.
-      hyperparameters: where they differ from the library's defaults.
-      hardware: and how long it took.
+      hyperparameters: those that differ from the library's defaults.
+      hardware: with the training time.
     """
 
     library: Annotated[str, Field(max_length=200)] = ""
@@ -125,16 +125,15 @@ class Training(StrictModel):
 
 
 class Submission(Document):
-    """Everything that is signed.
+    """The signed content.
 
     Attributes:
-      runs: at least one for each instance of the suite.
-      runs_started: of each class by name, all runs ever started with this method; those that are
-        not listed in `runs` score 1 in every metric, so that to leave one out gains nothing,
-        unless it was worse than that.
-      created: when it was signed.
-      code: a link to the method's code; null where there is none.
-      statement: anything a reader should know.
+      runs: at least one on each instance of the suite.
+      runs_started: all runs ever started with this method, by class. Runs that are not listed in
+        `runs` score 1 in every metric, so omitting a run helps only if it was worse than that.
+      created: time of signing.
+      code: a link to the method's code, or null.
+      statement: notes for readers.
     """
 
     schema_version: SchemaVersion = 1
@@ -150,7 +149,7 @@ class Submission(Document):
     statement: _Text = ""
 
     def signed(self, key: SigningKey) -> SignedSubmission:
-        """This submission with its signature; the key must be the submitter's."""
+        """This submission, signed with the submitter's key."""
         return SignedSubmission(submission=self, signature=key.sign("submission", self.digest))
 
 
@@ -162,7 +161,7 @@ class SignedSubmission(StrictModel):
 
     @classmethod
     def read(cls, text: bytes) -> SignedSubmission:
-        """The submission of a file's bytes, its signature verified.
+        """Read a submission from the bytes of a file and verify its signature.
 
         Raises:
           Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
@@ -191,23 +190,23 @@ class SignedSubmission(StrictModel):
         ):
             raise Rejection(
                 "bad_signature",
-                f"signature={signed.signature[:16]}…: is not of this submission by the key "
+                f"signature={signed.signature[:16]}…: invalid for this submission and the key "
                 f"{submission.submitter.key[:16]}…. Sign it again after the last change.",
             )
         return signed
 
     @property
     def id(self) -> str:
-        """The submission's digest, which is its id."""
+        """The id of the submission: its digest."""
         return self.submission.digest
 
     def to_bytes(self) -> bytes:
-        """The file's bytes."""
+        """The bytes of the file."""
         return to_json(self.to_dict()).encode()
 
 
 class Withdrawal(Document):
-    """What a submitter signs to take a submission off the board; its page stays, marked so."""
+    """Signed by a submitter to withdraw a submission; its page remains, marked as withdrawn."""
 
     schema_version: SchemaVersion = 1
     submission: Digest
@@ -216,27 +215,27 @@ class Withdrawal(Document):
 
 
 class SignedWithdrawal(StrictModel):
-    """A withdrawal with the signature of the submission's own key."""
+    """A withdrawal, signed with the key of the submission."""
 
     withdrawal: Withdrawal
     signature: Signature
 
 
 def utc(moment: datetime.datetime) -> str:
-    """A moment as documents write it."""
+    """A time as documents write it."""
     return moment.astimezone(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def now() -> str:
-    """The present moment as documents write it."""
+    """The current time as documents write it."""
     return utc(datetime.datetime.now(datetime.UTC))
 
 
 def refuse_countless(started: Mapping[str, int]) -> None:
-    """Refuse more runs than a result can hold.
+    """Reject more runs than fit into a result.
 
     Args:
-      started: how many, by class.
+      started: number of runs by class.
 
     Raises:
       Rejection: `schema`.
@@ -244,6 +243,6 @@ def refuse_countless(started: Mapping[str, int]) -> None:
     if sum(started.values()) > MAX_RUNS:
         raise Rejection(
             "schema",
-            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in all. "
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in total. "
             "Count the runs of this version of the method only.",
         )

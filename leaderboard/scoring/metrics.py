@@ -1,4 +1,4 @@
-"""Scores of a run, and ranks from intervals.
+"""Metrics of a run, and ranks from intervals.
 
 θ of a metric and its 95 % interval are `sme_registry.statistics`' `aggregate` and
 `stratified_bootstrap`: the mean over classes of the interquartile mean within a class. It is not
@@ -21,11 +21,11 @@ Array = npt.NDArray[np.float64]
 def run_metrics(
     normalised_regret: Sequence[float], similarity: Sequence[float] | None, levels: Sequence[float]
 ) -> dict[str, float]:
-    """The metrics of one run by name, as `result` defines them.
+    """The metrics of one run by name, as defined in `documents.result`.
 
     Args:
       normalised_regret: N_m of each region, WD first.
-      similarity: mean r̃ of each region in [0, 1]; None where there is no policy.
+      similarity: mean r̃ of each region, in [0, 1]; None without a policy.
       levels: ε_m, 0 for WD.
 
     Returns:
@@ -56,7 +56,7 @@ def run_metrics(
 def rank_ranges(
     low: npt.ArrayLike, high: npt.ArrayLike
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The best and the worst rank that each entry's interval leaves open; lower scores are better.
+    """The best and the worst rank that each entry's interval allows; lower scores are better.
 
     first = 1 + entries whose interval lies wholly below; last = N − entries wholly above.
 

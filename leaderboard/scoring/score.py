@@ -1,13 +1,13 @@
-"""`score_submission`: a submission and its artefacts to a `Result`, every number recomputed.
+"""`score_submission`: from a submission and its artefacts to a `Result`.
 
-    run → sandbox → evaluate, on states of a seed of its own → N_m → metrics → θ, intervals
+    run → sandbox → evaluate on the run's own states → N_m → metrics → θ, intervals
 
-The states of a run come from a seed that protocol, spec and artefact determine:
+Protocol, spec and artefact determine the seed of a run's states:
 
     seed = first 53 bits of SHA-256(protocol digest, spec digest, artefact digest)
 
-so that anyone can recompute them, and whoever looks for a policy that is lucky on its states has
-to make a new policy for each attempt. What is held at once is one artefact and one batch of states.
+Anyone can recompute it, and each attempt at luckier states needs another policy. Memory holds one
+artefact and one batch of states at a time.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
 """Oracle-like: N̄ at most the first, or N₀ at most the second and |N̄ − N₀| at most the third."""
 
 _NOT_NEGATIVE = ("wd_regret", "ood_regret")
-# Loaded beside the scorer by chance; no number of a result comes from them.
-_BESIDE = ("stable_baselines3", "torch")
+# May be loaded in the same process, but no number of a result depends on them.
+_UNUSED = ("stable_baselines3", "torch")
 
 
 def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str) -> int:
@@ -61,19 +61,20 @@ def score_submission(
     """Score every run of a submission, and the method over its runs.
 
     Args:
-      board: the suite, the protocol, and how many runs and draws.
-      submission: one that `checks` let in.
-      artefact: a file's bytes by its digest.
-      progress: called after each batch with the states done and the states in all.
+      board: the suite, the protocol, and the numbers of runs and bootstrap draws.
+      submission: accepted by `checks`.
+      artefact: returns a file's bytes by its digest.
+      progress: called after each batch with the number of evaluated states and of all states.
 
     Returns:
-      The result, a function of board, submission and artefacts but for float noise. It is a
-      rejection where an artefact, or what it does, is refused.
+      The result, a function of board, submission and artefacts up to floating-point rounding. It
+      is a rejection if an artefact, or its behaviour, is rejected.
 
     Raises:
-      BoardError: a sandbox could not be started, or was ended from outside: nothing is judged.
+      BoardError: a sandbox cannot be started or was ended from outside. The submission is not
+        judged.
       MissingDependencyError: onnxruntime is not installed.
-      What `artefact` and `progress` raise; a `Rejection` becomes the result.
+      Errors of `artefact` and `progress`; a `Rejection` becomes the result.
     """
     try:
         runs, versions = _score_runs(board, submission, artefact, progress)
@@ -92,13 +93,13 @@ def score_submission(
 def result_of(
     board: BoardDocument, submission: str, runs: Sequence[RunScore], versions: dict[str, str]
 ) -> Result:
-    """The result that these runs make: θ, intervals and flags.
+    """The result of scored runs: θ, intervals and flags.
 
     Args:
-      board: the suite, and how many runs and draws.
+      board: the suite, and the numbers of runs and bootstrap draws.
       submission: its id.
-      runs: all that were started, each class at least once.
-      versions: as the result carries them.
+      runs: all runs that were started, at least one of each class.
+      versions: of packages, for the result.
     """
     by_class = {
         member.name: [run for run in runs if run.class_name == member.name]
@@ -111,9 +112,9 @@ def result_of(
         protocol=board.protocol.digest,
         status="scored",
         scores=scores,
-        classes=tuple(_class_score(name, found) for name, found in by_class.items()),
+        classes=tuple(_class_score(name, members) for name, members in by_class.items()),
         runs=tuple(runs),
-        enough_runs=all(len(found) >= board.runs_to_rank for found in by_class.values()),
+        enough_runs=all(len(members) >= board.runs_to_rank for members in by_class.values()),
         oracle_like=_oracle_like(scores),
         versions=versions,
     )
@@ -125,7 +126,7 @@ def _score_runs(
     artefact: Callable[[str], bytes],
     progress: Progress | None,
 ) -> tuple[list[RunScore], dict[str, str]]:
-    """The listed runs in order, then those that were not listed; and what versions they are of."""
+    """The listed runs in order, then the unlisted ones; and the versions of packages."""
     instances = board.instances
     unlisted = never_listed(board, submission, instances)
     policies = {(run.spec, run.artefact.sha256) for run in submission.runs if run.artefact}
@@ -167,11 +168,11 @@ def never_listed(
 
     Args:
       board: the suite.
-      submission: says how many were started.
-      instances: the board's.
+      submission: with the number of runs started.
+      instances: of the board.
 
     Raises:
-      Rejection: `unknown_spec`, `missing_run` or `schema`, where `checks` saw no such submission.
+      Rejection: `unknown_spec`, `missing_run` or `schema`, if `checks` did not accept it.
     """
     listed = dict.fromkeys((member.name for member in board.suite.classes), 0)
     for index, run in enumerate(submission.runs):
@@ -186,8 +187,8 @@ def never_listed(
         if count == 0:
             raise Rejection(
                 "missing_run",
-                f"runs: none of class {name!r}: each instance must have one. List those that "
-                "failed with artefact null.",
+                f"runs: none of class {name!r}: each instance must have one. List failed runs "
+                "with artefact null.",
             )
     started = {
         name: max(submission.runs_started.get(name, 0), count) for name, count in listed.items()
@@ -207,18 +208,18 @@ def _evaluate(
     digest: str,
     progress: Progress,
 ) -> EvaluationReport:
-    """A policy on the states of its own seed."""
+    """Evaluate a policy in the sandbox on the states of its own seed."""
     seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
     protocol = board.protocol.model_copy(update={"seed": seed})
     with Sandbox(data, spec.state_dim + 2, spec.action_dim) as sandbox:
-        asked = 0
+        evaluated = 0
 
         def policy(observations: Observations) -> Actions:
-            nonlocal asked
-            # `evaluate` asks region after region, so these are a region's first states.
-            if asked % protocol.states_per_region == 0:
+            nonlocal evaluated
+            # `evaluate` proceeds region by region, so these are the first states of a region.
+            if evaluated % protocol.states_per_region == 0:
                 sandbox.check_rows(observations)
-            asked += len(observations)
+            evaluated += len(observations)
             return sandbox(observations)
 
         try:
@@ -226,14 +227,14 @@ def _evaluate(
                 policy, spec, protocol, action_range="unit", name=digest, progress=progress
             )
         except PolicyError as error:
-            # What the sandbox raised, which `evaluate` takes for a failure of any callable.
+            # `evaluate` wraps the sandbox's errors like those of any callable.
             if isinstance(error.__cause__, SMEError):
                 raise error.__cause__ from None
             raise
 
 
 def _levels(board: BoardDocument) -> tuple[float, ...]:
-    """ε_m of each region: of its outer face, 0 for WD."""
+    """ε_m of each region's outer face; 0 for WD."""
     return tuple(high for _, high in board.protocol.edges)
 
 
@@ -257,9 +258,9 @@ def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunSc
     """A run without a policy scores 1 in every region and every metric.
 
     Args:
-      board: whose protocol has the regions.
-      class_name: the suite's class that it was started in.
-      spec: digest of the instance; null where the run is not listed.
+      board: its protocol has the regions.
+      class_name: the class of the run.
+      spec: digest of the instance; None if the run is not listed.
     """
     regrets = (1.0,) * len(board.protocol.edges)
     return RunScore(
@@ -285,7 +286,7 @@ def _class_score(name: str, runs: list[RunScore]) -> ClassScore:
 
 
 def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Scores:
-    """θ of each metric and each region, with its interval."""
+    """θ of each metric and each region, with intervals."""
     classes = {
         name: np.array(
             [
@@ -297,10 +298,10 @@ def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Score
     }
     value = aggregate(classes)
     low, high = stratified_bootstrap(classes, draws, seed)
-    # No regret is negative, so an interval's lower end tells nothing below 0.
-    regrets = [metric in _NOT_NEGATIVE for metric in METRICS]
-    regrets += [True] * (len(value) - len(METRICS))
-    low = np.where(regrets, np.maximum(low, 0.0), low)
+    # Regret is never negative, so a lower end below 0 carries no information.
+    not_negative = [metric in _NOT_NEGATIVE for metric in METRICS]
+    not_negative += [True] * (len(value) - len(METRICS))
+    low = np.where(not_negative, np.maximum(low, 0.0), low)
     estimates = [
         Estimate(value=value, low=low, high=high)
         for value, low, high in zip(value.tolist(), low.tolist(), high.tolist(), strict=True)
@@ -319,6 +320,6 @@ def _oracle_like(scores: Scores) -> bool:
 
 def _versions(report: EvaluationReport) -> dict[str, str]:
     return {
-        **{name: found for name, found in report.versions.items() if name not in _BESIDE},
+        **{name: version for name, version in report.versions.items() if name not in _UNUSED},
         "onnxruntime": metadata.version("onnxruntime"),
     }

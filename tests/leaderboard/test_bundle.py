@@ -93,7 +93,7 @@ def test_a_folder_without_a_submission_is_refused(tmp_path):
 def test_a_changed_submission_is_refused(bundle):
     path = bundle.folder / "submission.json"
     path.write_text(path.read_text().replace('"Mine"', '"Yours"'))
-    refused("bad_signature", "is not of this submission", Bundle.read, bundle.folder)
+    refused("bad_signature", "invalid for this submission", Bundle.read, bundle.folder)
 
 
 def test_a_submission_above_the_limit_is_not_read_to_its_end(bundle):
@@ -379,7 +379,7 @@ def test_a_path_that_is_no_run_is_refused(tmp_path, path):
         ),
         ({"code": 3}, SpecError, "code=3: must be an https:// link"),
         ({"code": "https://a b"}, SpecError, "code='https://a b': must be an https:// link"),
-        ({"code": "https://" + "a" * 293}, SpecError, "code='https://a+: must be .* at most 300"),
+        ({"code": "https://" + "a" * 293}, SpecError, "code='https://a+…: must be .* at most 300"),
         ({"runs_started": {"C": 1}}, Rejection, "missing_run: runs_started.C"),
         ({"runs_started": {"A": 1}}, Rejection, "missing_run: runs_started.A=1"),
         ({"knowledge": "all"}, SpecError, "knowledge='all'"),

@@ -152,7 +152,7 @@ def test_a_rejection_exits_with_1_and_its_code() -> None:
 
 def test_invalid_usage_exits_with_2() -> None:
     good("keygen")
-    assert "exists already" in fails(2, "keygen")
+    assert "already exists" in fails(2, "keygen")
     assert "init" in fails(2, "rank", "nowhere")
     assert "no such folder" in fails(
         2, "new", "b", "--runs", "runs/*", "--method", "M", "--submitter", "S"

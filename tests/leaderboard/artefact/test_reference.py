@@ -106,5 +106,5 @@ def test_the_same_spec_gives_the_same_bytes(made):
 @pytest.mark.parametrize("made", [optimal_onnx, constant_onnx])
 def test_a_team_has_no_reference_policy(made):
     team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match=r"team: a board is of single agents.*a team of 2"):
+    with pytest.raises(SpecError, match=r"team: 2 agents: boards have single agents only"):
         made(team)

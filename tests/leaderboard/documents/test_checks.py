@@ -266,7 +266,7 @@ def test_more_runs_started_than_a_result_can_hold_are_refused():
     accepted(runs_started={"A": 9_000, "B": 1_000})
     refused(
         "schema",
-        "runs_started=10001: must be at most 10,000 in all",
+        "runs_started=10001: must be at most 10,000 in total",
         runs_started={"A": 9_000, "B": 1_001},
     )
 

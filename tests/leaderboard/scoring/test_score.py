@@ -349,7 +349,7 @@ def test_a_sandbox_ended_from_outside_judges_nothing() -> None:
         for child in set(children()) - before:
             os.kill(child, signal.SIGKILL)
 
-    with pytest.raises(BoardError, match="through no fault of the model"):
+    with pytest.raises(BoardError, match="not caused by the model"):
         score(LINEAR, LINEAR, LINEAR, progress=end_it)
 
 
