@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +13,7 @@ from rich.table import Table
 from sme_registry.cli.arguments import Force
 from sme_registry.io import write_atomically
 from sme_registry.terminal import err, out, table
+from sme_registry.terminal.templates import environment
 
 if TYPE_CHECKING:
     from sme_registry.training import TrainingResult
@@ -105,44 +105,12 @@ def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
 
 
 def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str:
-    record, report = result.record, result.report
-    lines = [
-        f"# {record.algorithm} on SME/{TASK}",
-        "",
-        f"{record.steps_done:,} steps in {record.wall_seconds / 60:.1f} minutes "
-        f"({record.steps_per_second:.0f} per second), seed {record.seed}, Stable-Baselines3's "
-        f"default hyperparameters. Task `{report.spec_digest}`, protocol "
-        f"`{report.protocol_digest}`.",
-        "",
-        "## Regret during training",
-        "",
-        "Regret is 1 − step reward: what the optimal action would have earned more than the "
-        "action taken. It is exact in every step.",
-        "",
-        "| steps | regret |",
-        "|---|---:|",
-        *(f"| {first:,}–{last:,} | {regret:.3f} |" for first, last, regret in stages),
-        "",
-        "## In and out of distribution",
-        "",
-        f"{report.regions[0].states:,} states per region. r̃ is the similarity to the optimal "
-        "action (1 is optimal); normalised regret is 0 for the optimum and 1 for the constant "
-        "action ½; similarity decay is the share of r̃ lost since WD.",
-        "",
-        "| region | ε | r̃ | normalised regret | similarity decay | linear policy's r̃ |",
-        "|---|---|---:|---:|---:|---:|",
-    ]
-    linear = report.references["linear_least_squares"]
-    for region, reference in zip(report.regions, linear, strict=True):
-        lines.append(
-            f"| {region.name} | {region.epsilon_low:g}–{region.epsilon_high:g} "
-            f"| {region.similarity:.3f} | {region.normalised_regret:.3f} "
-            f"| {region.similarity_decay:.1%} | {reference.similarity:.3f} |"
-        )
-    for figure in result.figures:
-        lines += ["", f"![{figure.stem.replace('_', ' ')}]({figure.name})"]
-    files = ["model.zip", "episodes.csv", "evaluation.json", "run.json"]
-    lines += ["", "## Files", "", *(f"- [{name}]({name})" for name in files)]
-    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
-    lines += ["", f"Versions: {versions}.", ""]
-    return "\n".join(lines).replace(os.sep, "/")
+    template = environment(Path(__file__).parent / "templates", autoescape=False)
+    text = template.get_template("demo.md.jinja").render(
+        task=TASK,
+        record=result.record,
+        report=result.report,
+        stages=stages,
+        figures=result.figures,
+    )
+    return f"{text}\n"

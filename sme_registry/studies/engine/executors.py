@@ -157,6 +157,7 @@ class ConcurrentExecutor(ABC):
 
     def __init__(self, jobs: int | None, run: RunCell, keep_models: bool) -> None:
         self._jobs, self._run, self._keep_models = jobs, run, keep_models
+        self._running: dict[Any, Any] = {}
 
     @property
     @abstractmethod
@@ -164,37 +165,33 @@ class ConcurrentExecutor(ABC):
         """Cells that can run at once."""
 
     @abstractmethod
-    def _session(self) -> AbstractContextManager[Session]:
-        """Open whatever cells run in; leaving it ends all that are still running."""
+    def _session(self) -> AbstractContextManager[None]:
+        """Open what cells run in; leaving it ends those that are still running."""
+
+    @abstractmethod
+    def _start(self, cell: Cell) -> None:
+        """Start a cell and add it to those running."""
+
+    @abstractmethod
+    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+        """Wait up to `POLL_SECONDS`, report progress, and remove the cells that have ended."""
 
     def map(self, cells: Iterator[Cell | None], progress: ReportProgress) -> Iterator[Outcome]:
         """See `Executor.map`."""
         exhausted = False
-        with self._session() as session:
-            while not exhausted or session.running:
-                while not exhausted and len(session.running) < self.workers:
+        with self._session():
+            while not exhausted or self._running:
+                while not exhausted and len(self._running) < self.workers:
                     cell = next(cells, _END)
                     exhausted = cell is _END
                     if not isinstance(cell, Cell):
                         break
-                    session.start(cell)
-                if session.running:
-                    for cell, message in session.ended(progress):
+                    self._start(cell)
+                if self._running:
+                    for cell, message in self._ended(progress):
                         yield message.outcome(cell)
                 elif not exhausted:
                     time.sleep(POLL_SECONDS)
-
-
-class Session(Protocol):
-    """The cells that an executor has running."""
-
-    running: dict[Any, Any]
-
-    def start(self, cell: Cell) -> None:
-        """Start a cell."""
-
-    def ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
-        """Wait up to `POLL_SECONDS`, report progress, and remove the cells that have ended."""
 
 
 _END = object()

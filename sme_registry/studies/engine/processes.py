@@ -1,8 +1,9 @@
 """`Processes`: a process for each cell.
 
-Not a pool of workers: with `concurrent.futures` one dead worker fails every cell that is running,
-and a queue that workers share stays locked for good if one is killed while it writes to it. Here
-each process has a pipe of its own, so whatever ends it ends only its cell.
+Not a pool of workers. With `concurrent.futures`, one dead worker fails every cell that is running.
+The workers of `pebble` survive a killed driver and would go on with cells whose locks are free
+again. Here each process has its own pipe, so its death fails only its cell, and ends with the
+driver.
 """
 
 from __future__ import annotations
@@ -66,35 +67,28 @@ class Processes(ConcurrentExecutor):
         return available_cores() if self._jobs is None else self._jobs
 
     @contextlib.contextmanager
-    def _session(self) -> Iterator[_ProcessSession]:
+    def _session(self) -> Iterator[None]:
         with tempfile.TemporaryDirectory(prefix="sme-study-") as scratch:
-            session = _ProcessSession(self._run, self._keep_models, Path(scratch))
+            self._scratch = Path(scratch)
             try:
-                yield session
+                yield
             finally:
                 with defer_interrupts():
-                    for process in session.running.values():
+                    for process in self._running.values():
                         process.kill()
+                    self._running.clear()
 
-
-class _ProcessSession:
-    """The processes that run now, by the pipe on which they report."""
-
-    def __init__(self, run: RunCell, keep_models: bool, scratch: Path) -> None:
-        self._run, self._keep_models, self._scratch = run, keep_models, scratch
-        self.running: dict[Any, _CellProcess] = {}
-
-    def start(self, cell: Cell) -> None:
+    def _start(self, cell: Cell) -> None:
         with defer_interrupts():  # or a process that has just started would have no owner
             process = _CellProcess.start(self._run, cell, self._keep_models, self._scratch)
-            self.running[process.pipe] = process
+            self._running[process.pipe] = process
 
-    def ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
-        for pipe in connection.wait(list(self.running), POLL_SECONDS):
-            process = self.running[pipe]
+    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+        for pipe in connection.wait(list(self._running), POLL_SECONDS):
+            process = self._running[pipe]
             received = process.receive()
             if isinstance(received, Message):
-                del self.running[pipe]
+                del self._running[pipe]
                 yield process.cell, received
             else:
                 progress(process.cell, *received)

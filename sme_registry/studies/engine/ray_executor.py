@@ -75,18 +75,33 @@ class OnRay(ConcurrentExecutor):
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     @contextlib.contextmanager
-    def _session(self) -> Iterator[_RaySession]:
+    def _session(self) -> Iterator[None]:
         self._connect()
         try:
-            session = _RaySession(self._ray, self._run, self._keep_models)
-            try:
-                yield session
-            finally:
-                session.cancel()
+            self._steps = _start_step_counts(self._ray)
+            self._task = self._ray.remote(num_cpus=1, max_retries=_RETRIES)(_task)
+            yield
         finally:
+            for reference in self._running:
+                self._ray.cancel(reference, force=True)
+            self._running.clear()
             if self._connected_here:
                 self._ray.shutdown()
                 self._connected_here = False
+
+    def _start(self, cell: Cell) -> None:
+        task = self._task.remote(self._steps, self._run, cell, self._keep_models)
+        self._running[task] = cell
+
+    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+        ready, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
+        for reference in ready:
+            cell = self._running.pop(reference)
+            yield cell, self._message(reference, cell)
+        by_key = {cell.digest: cell for cell in self._running.values()}
+        for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
+            if key in by_key:
+                progress(by_key[key], done, total)
 
     def _connect(self) -> None:
         """Connect, unless this process is connected already.
@@ -108,33 +123,6 @@ class OnRay(ConcurrentExecutor):
                 f"ray={self._address!r}: cannot be used: {str(error).splitlines()[0]} {_ADDRESSES}"
             ) from None
         self._connected_here = True
-
-
-class _RaySession:
-    """The tasks that run now, by their Ray reference."""
-
-    def __init__(self, ray: Any, run: RunCell, keep_models: bool) -> None:
-        self._ray, self._run, self._keep_models = ray, run, keep_models
-        self._steps = _start_step_counts(ray)
-        self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_task)
-        self.running: dict[Any, Cell] = {}
-
-    def start(self, cell: Cell) -> None:
-        self.running[self._task.remote(self._steps, self._run, cell, self._keep_models)] = cell
-
-    def ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
-        ready, _ = self._ray.wait(list(self.running), timeout=POLL_SECONDS)
-        for reference in ready:
-            cell = self.running.pop(reference)
-            yield cell, self._message(reference, cell)
-        by_key = {cell.digest: cell for cell in self.running.values()}
-        for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
-            if key in by_key:
-                progress(by_key[key], done, total)
-
-    def cancel(self) -> None:
-        for reference in self.running:
-            self._ray.cancel(reference, force=True)
 
     def _message(self, reference: Any, cell: Cell) -> Message:
         try:
