@@ -49,9 +49,9 @@ def rank(
 ) -> None:
     """Rank the entries by a metric, with the ranks that each entry's interval allows.
 
-    All metrics are normalised regret: 0 is the optimal policy and 1 the constant ½. Only entries
-    whose whole interval of WD regret is below 0.5 are ranked by decay, because a policy that has
-    learned nothing inside the cube has nothing to lose outside it.
+    All metrics are normalised regret: 0 is the optimal policy and 1 the constant ½. OOD decay
+    is ranked only if the upper bound of WD regret is at most 0.5: a policy that has learned nothing
+    inside the cube has nothing to lose outside it.
 
     Examples:
 

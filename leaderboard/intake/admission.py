@@ -93,11 +93,9 @@ def submit_bundle(store: Store, folder: str | os.PathLike[str]) -> str:
     return bundle.signed.id
 
 
-def withdrawal_of(
-    id: str, key: SigningKey, reason: str = "", created: str | None = None
-) -> SignedWithdrawal:
+def withdrawal_of(id: str, key: SigningKey, reason: str = "") -> SignedWithdrawal:
     """A signed withdrawal of a submission; the key must be the one that signed the submission."""
-    withdrawal = Withdrawal(submission=id, created=created or now(), reason=reason)
+    withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
     return SignedWithdrawal(
         withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import sqlite3
 from pathlib import Path
@@ -84,6 +85,17 @@ def test_help_teaches_every_command_with_an_example() -> None:
     for command in COMMANDS:
         assert command in top
         assert f"sme-leaderboard {command}" in good(command, "--help")
+
+
+def test_help_prints_the_examples_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Markdown would remove asterisks and angle brackets."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for command in app.registered_commands:
+        assert command.callback is not None
+        examples = inspect.getdoc(command.callback).partition("Examples:")[2].split("\n\n")
+        shown = " ".join(good(command.name, "--help").split())
+        for example in filter(None, map(str.strip, examples)):
+            assert example in shown
 
 
 def test_from_a_key_to_a_page() -> None:
