@@ -240,7 +240,7 @@ def _runs_of(path: Path, suite: SuiteFile) -> list[_SubmittedRun]:
       OptionError: the path is neither.
     """
     if path.is_dir():
-        folders = sorted(found.parent for found in path.rglob(_RECORD))
+        folders = sorted(record.parent for record in path.rglob(_RECORD))
         if folders:
             return [_trained(folder) for folder in folders]
     elif path.suffix == ".json" and path.is_file():

@@ -50,7 +50,7 @@ an action changes a normalised regret by at most about 4e-4, which changes no ra
 """
 
 _CODES = {
-    child.REFUSED: ("onnx_refused", "must be a model that onnxruntime loads", "Export it anew"),
+    child.REFUSED: ("onnx_refused", "must be a model that onnxruntime loads", "Export it again"),
     child.FAILED: ("run_failed", "must run on any batch of rows", "Run it on 1 and on 100 rows"),
     child.OUTPUT: ("run_output", "must be one float32 action a row", "Export it for this task"),
     child.MEMORY: ("run_memory", "must run within {memory:,} MiB", "Submit a smaller network"),
