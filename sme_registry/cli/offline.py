@@ -79,9 +79,9 @@ def train(
     """
     from sme_registry import offline
     from sme_registry.datasets import open_dataset
-    from sme_registry.offline.hyperparameters import known_algorithm
+    from sme_registry.training import known_algorithm
 
-    algorithm = known_algorithm(algorithm)
+    algorithm = known_algorithm(algorithm, offline.ALGORITHMS)
     opened = open_dataset(dataset, folder)
     if out_folder is None:
         out_folder = Path("runs") / f"{opened.id.rsplit('/', 1)[-1]}-{algorithm}-seed{seed}"

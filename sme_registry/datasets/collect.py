@@ -8,6 +8,7 @@ number of lanes changes the time and not the numbers. A data set is the first N 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -158,20 +159,20 @@ def rollout(
     episode = np.zeros(lanes, np.int64)
     t = np.zeros(lanes, np.int64)
     observation = batch.observe()
-    collected = _Collected(rows)
+    collected, numbers = _Collected(rows), itertools.count()
 
     def begin(ended: npt.NDArray[np.int64]) -> None:
         for lane in ended.tolist():
-            episode[lane] = collected.new_episode()
-            starts.begin(lane, int(episode[lane]))
-            policy.begin(lane, int(episode[lane]))
+            number = episode[lane] = next(numbers)
+            starts.begin(lane, number)
+            policy.begin(lane, number)
         t[ended] = 0
         batch.begin(ended, observation, starts.next(ended))
 
     begin(every)
     s = batch.state
     steps = 0
-    while not collected.complete:
+    while not collected.complete(int(episode.min())):
         # The environment executes exactly what the data set stores: float32 in the unit range.
         action = np.clip(policy.act(s, observation), 0.0, 1.0).astype(np.float32)
         step = batch.advance(action.astype(np.float64))
@@ -187,7 +188,6 @@ def rollout(
         observation = step.observation
         ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended):
-            collected.finish(episode[ended])
             begin(ended)
             s = batch.state
         else:
@@ -212,37 +212,25 @@ class _Collected:
     def __init__(self, wanted: int) -> None:
         self._wanted = wanted
         self._parts: list[Rows] = []
-        self._rows_of = np.zeros(1024, np.int64)
-        self._finished = np.zeros(1024, bool)
-        self._episodes = 0
+        self._rows_of = np.zeros(1024, np.int64)  # by episode
         self._first_running, self._settled = 0, 0
         self.count = 0
 
-    def new_episode(self) -> int:
-        """The index of the next episode."""
-        if self._episodes + 1 == len(self._finished):  # keep one entry that is never finished
-            self._rows_of = np.concatenate([self._rows_of, np.zeros_like(self._rows_of)])
-            self._finished = np.concatenate([self._finished, np.zeros_like(self._finished)])
-        self._episodes += 1
-        return self._episodes - 1
-
     def add(self, rows: Rows) -> None:
-        """Add one step of some lanes; no episode twice."""
+        """Add one step of some lanes, with no episode twice."""
         self._parts.append(rows)
+        last = int(rows.episode.max(initial=0))
+        if last >= len(self._rows_of):
+            self._rows_of = np.pad(self._rows_of, (0, last))
         self._rows_of[rows.episode] += 1
         self.count += len(rows.t)
 
-    def finish(self, episodes: npt.NDArray[np.int64]) -> None:
-        """Mark episodes as finished."""
-        self._finished[episodes] = True
-        while self._finished[self._first_running]:
-            self._settled += int(self._rows_of[self._first_running])
-            self._first_running += 1
-
-    @property
-    def complete(self) -> bool:
-        """Whether no running or future episode can contribute one of the first `wanted` rows."""
-        return self._settled + int(self._rows_of[self._first_running]) >= self._wanted
+    def complete(self, first_running: int) -> bool:
+        """Whether no later episode than the first running one can contribute a wanted row."""
+        self._settled += int(self._rows_of[self._first_running : first_running].sum())
+        self._first_running = first_running
+        running = int(self._rows_of[first_running : first_running + 1].sum())
+        return self._settled + running >= self._wanted
 
     def rows(self) -> Rows:
         """The first `wanted` rows, by episode and step."""

@@ -76,15 +76,6 @@ _FIELDS: dict[str, type[BCHyperparameters] | type[IQLHyperparameters]] = {
 }
 
 
-def known_algorithm(name: str) -> str:
-    """The exact name of an offline algorithm, whose case does not matter.
-
-    Raises:
-      UnknownNameError: no such algorithm; lists all, and suggests a similar one.
-    """
-    return algorithms.known_algorithm(name, ALGORITHMS)
-
-
 def resolve_hyperparameters(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
     """The hyperparameters of an algorithm: its defaults, with changes.
 
@@ -93,7 +84,7 @@ def resolve_hyperparameters(algorithm: str, changes: Mapping[str, Any] | None) -
       OptionError: `changes` is not a mapping.
       SpecError: a field is unknown, or its value is out of range.
     """
-    kind = _FIELDS[known_algorithm(algorithm)]
+    kind = _FIELDS[algorithms.known_algorithm(algorithm, ALGORITHMS)]
     if changes is not None and not isinstance(changes, Mapping):
         raise OptionError(f"hyperparameters={changes!r:.60}: must be a mapping of names to values.")
     return kind.from_dict(dict(changes or {}), "hyperparameters")

@@ -32,12 +32,13 @@ from sme_registry.io import (
     versions,
     write_atomically,
 )
-from sme_registry.offline.hyperparameters import known_algorithm, resolve_hyperparameters
+from sme_registry.offline.hyperparameters import ALGORITHMS, resolve_hyperparameters
 from sme_registry.offline.learn import Section, learn
 from sme_registry.offline.record import BehaviourQuality, Evaluation, OfflineRecord
 from sme_registry.offline.source import check_task, data_source
 from sme_registry.spec import ProtocolLike, SpecLike
 from sme_registry.task import Task, materialize
+from sme_registry.training import known_algorithm
 from sme_registry.training.evaluation import DECAY_CURVE, EVALUATION, write_evaluation
 from sme_registry.training.record import PACKAGES
 
@@ -117,7 +118,7 @@ def train_offline(
       PolicyError: the training diverged.
       MissingDependencyError: PyTorch is not installed, or Minari, which files require.
     """
-    algorithm = known_algorithm(algorithm)
+    algorithm = known_algorithm(algorithm, ALGORITHMS)
     settings = resolve_hyperparameters(algorithm, hyperparameters)
     steps = integer_in("steps", steps, 1, MAX_STEPS)
     seed = integer_in("seed", seed, 0, 2**53 - 1)
