@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from sme_registry import statistics
 from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.report import tables
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.classes import ALL, SEVERAL
 from sme_registry.studies.report.frames import window
@@ -174,6 +176,12 @@ def test_of_no_result_there_are_no_numbers(study):
     assert empty.results.empty
     for name in TABLES:
         assert getattr(empty, name).empty
+
+
+def test_the_documentation_names_every_column_of_the_tables(study):
+    documented = set(re.findall(r"\w+", str(tables.__doc__)))
+    for name in (*TABLES, "counts", "missing"):
+        assert not {*getattr(study[2], name)} - documented
 
 
 def test_every_metric_says_which_way_is_worse():
