@@ -198,13 +198,18 @@ def _wide(
       across: the column whose values become columns.
       entry: the text of a row.
     """
-    keys = [*index, across]
-    text = rows[keys].assign(text=[entry(row) for row in rows.itertuples()])
-    wide = text.set_index(keys).text.unstack(across, sort=False).fillna(ABSENT)
-    wide = wide[list(dict.fromkeys(text[across]))].reset_index().rename(columns=index)
-    if "ν" in wide:
-        wide["ν"] = [f"{nu:g}" for nu in wide["ν"]]
-    return wide.rename_axis(columns=None)
+    lines: dict[tuple[Any, ...], dict[str, str]] = {}
+    for row in rows.itertuples():
+        place = tuple(getattr(row, name) for name in index)
+        lines.setdefault(place, {})[getattr(row, across)] = entry(row)
+    columns = [*index.values(), *dict.fromkeys(rows[across])]
+    wide = pd.DataFrame(
+        [dict(zip(index.values(), place, strict=True)) | line for place, line in lines.items()],
+        columns=columns,
+    )
+    if "nu" in index:
+        wide[index["nu"]] = wide[index["nu"]].map("{:g}".format)
+    return wide.fillna(ABSENT)
 
 
 def _change(row: Any, digits: int) -> str:
