@@ -23,7 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.datasets.recipe import Behaviour, DatasetRecipe
-from sme_registry.envs.batch import Batch, Observation
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.task import Task, draw
 from sme_registry.task.draw import Array

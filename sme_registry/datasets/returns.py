@@ -26,8 +26,9 @@ import numpy.typing as npt
 from scipy.special import stdtrit
 
 from sme_registry.datasets.arrays import Transitions
-from sme_registry.envs.batch import Batch, Observation
-from sme_registry.envs.options import initial_states
+from sme_registry.envs.arguments import initial_states
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.rollouts import LANES

@@ -21,7 +21,7 @@ from sme_registry.diagnosis.document import (
     SquaredError,
     TimeDependence,
 )
-from sme_registry.envs.shared import Observation
+from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, references
 from sme_registry.evaluation.regions import expansion, observations, region_name
 from sme_registry.spec import EvaluationProtocol

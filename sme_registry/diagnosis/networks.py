@@ -18,8 +18,8 @@ import numpy as np
 
 from sme_registry.compiled import engine
 from sme_registry.diagnosis.document import CapacityProbe
-from sme_registry.envs import actions
-from sme_registry.envs.shared import Observation
+from sme_registry.envs import arguments
+from sme_registry.envs.types import Observation
 from sme_registry.errors import MissingDependencyError
 from sme_registry.evaluation import Policy
 from sme_registry.task import Task, streams
@@ -50,7 +50,7 @@ def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | 
     def explore(observation: Observation) -> Array:
         predicted: tuple[Any, Any] = model.predict(observation, deterministic=False)
         shape = (len(observation), policy.action_dim)
-        a = actions.checked(predicted[0], shape, policy.action_range == "symmetric")
+        a = arguments.to_unit(predicted[0], shape, policy.action_range == "symmetric")
         if noise is not None:  # added to actions in [−1, 1], one environment after another
             a += 0.5 * np.array([np.ravel(noise())[: shape[1]] for _ in range(shape[0])], float)
         return np.asarray(np.clip(a, 0.0, 1.0))

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from sme_registry.diagnosis.document import POLICY, OnPolicy, RewardSignal, Score, Training
 from sme_registry.diagnosis.measure import MAX_NUMBERS
 from sme_registry.diagnosis.subject import Log
-from sme_registry.envs.batch import Batch, Mask, Observation
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Mask, Observation
 from sme_registry.evaluation import Policy, references
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array

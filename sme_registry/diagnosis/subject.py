@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import JsonValue
 
-from sme_registry.envs.shared import Observation
+from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, load_sb3
 from sme_registry.io import read_json

@@ -1,8 +1,8 @@
-"""`Batch`: episodes side by side, of a single agent or a team; what all batched environments share.
+"""`Batch`: parallel episodes of a single agent or a team, the core of all batched environments.
 
-It holds the numbers of `B` lanes (state, steps done, each agent's r_cum) and steps them by the
-engine. What a lane is shown, and what happens at its end, is the business of its environment.
-A team of n agents is stepped as one: its joint observation is s, t/T and every agent's r_cum/k.
+It holds the state, completed steps and r_cum of `B` lanes, and steps them with the compiled engine.
+Each environment decides what its agents observe and what happens at the end of an episode. A team
+of n agents is stepped as one: its joint observation is s, t/T and every agent's r_cum/k.
 """
 
 from __future__ import annotations
@@ -10,20 +10,15 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sme_registry.compiled import engine
 from sme_registry.compiled.values import ROWS
-from sme_registry.envs.actions import not_finite
+from sme_registry.envs.arguments import not_finite_error
 from sme_registry.envs.initial_states import InitialStates
+from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.task import Task, observe
 from sme_registry.task.memory import refuse_above_limit
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-Lanes = npt.NDArray[np.int64]
-Observation = npt.NDArray[np.float32]
 
 _FLOAT64 = np.dtype(np.float64)
 
@@ -48,13 +43,13 @@ class BatchStep(NamedTuple):
 
 
 class Batch:
-    """`lanes` episodes of one task, side by side.
+    """`lanes` episodes of one task, stepped together.
 
     Args:
       task: the task.
       lanes: B, at least 1.
-      reuse: write each step into the arrays of the step before the last, for whoever copies what
-        it hands out anyway; a small batch spends a fifth of its time on fresh arrays.
+      reuse: write each step into the arrays of the step before the last, for environments that
+        copy their results anyway; a small batch spends a fifth of its time on fresh arrays.
 
     Raises:
       ResourceLimitError: a batch this large would not fit in memory.
@@ -107,19 +102,19 @@ class Batch:
     @property
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
-        return self._s.T.copy()  # also where the transpose is contiguous as it stands
+        return self._s.T.copy()  # a copy even where the transpose is contiguous
 
     def observe(self) -> Observation:
-        """The joint observations of all lanes as they stand, `[B, S + 1 + n]`."""
+        """The present joint observations of all lanes, `[B, S + 1 + n]`."""
         return observe(self.task.spec, self.state, self._t, self._accumulated.T)
 
     def begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
-        """Put lanes at the start of an episode, and write what is observed there.
+        """Put lanes at the start of an episode, and write their observations.
 
         Args:
-          lanes: which.
+          lanes: indices of the lanes.
           observation: `[B, S + 1 + n]`, written in the rows of these lanes.
-          states: `[len(lanes), S]` where to begin; None draws from each lane's generator.
+          states: `[len(lanes), S]` initial states; None draws from each lane's generator.
         """
         S = self.task.spec.state_dim
         if states is None:
@@ -131,7 +126,7 @@ class Batch:
         observation[lanes, S:] = 0.0
 
     def place(self, states: Array, t: Lanes, accumulated: Array) -> None:
-        """Put every lane where an episode can be, also in its middle; `observe` says what is seen.
+        """Put every lane at any point of an episode; `observe` gives the observations there.
 
         Args:
           states: `[B, S]` in [0, 1].
@@ -149,9 +144,9 @@ class Batch:
           actions: `[B, A]` float64 of the unit range; clipped.
 
         Raises:
-          ActionError: of another shape, or not finite; nothing has moved then.
+          ActionError: of another shape, or not finite; no lane has changed then.
         """
-        # Machine code reads memory as it is told to: anything but this would be misread.
+        # Machine code does not check shape, dtype and layout: any other would be misread.
         if actions.shape != self._shapes[2]:
             raise ActionError(
                 f"action of shape {actions.shape}: must be of shape {self._shapes[2]}."
@@ -168,6 +163,6 @@ class Batch:
             self._s, self._t, self._accumulated, actions,
             moved, result.observation, result.optimal, result.values, ended,
         ):  # fmt: skip
-            raise not_finite()
+            raise not_finite_error()
         self._s = moved
         return result

@@ -1,35 +1,35 @@
 """`SMETeamEnv`: a team's task as a PettingZoo environment, each agent with its exact regret.
 
 Agent i owns a_i action channels and observes the state channels O_i, t/T, and its own r_cum/k.
-What it is paid is of its own channels (`reward="individual"`) or of all (`"team"`). Its optimal
-policy maps what *it* observes to its own channels, so its regret is exact and can be brought to 0.
+It is paid for its own channels (`reward="individual"`) or for all (`"team"`). Its optimal policy
+maps what *it* observes to its own channels, so its regret is exact and can reach 0.
 A task without a team is a team of one, `agent_0`. Source: METHOD, section 5.
 """
 
 from __future__ import annotations
 
-import os
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any, ClassVar, Literal, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
-from sme_registry.envs import actions as action_ranges
-from sme_registry.envs.batch import Array, Batch, BatchStep, Observation
-from sme_registry.envs.options import checked_seed, initial_states
+from sme_registry.envs import arguments
+from sme_registry.envs.base import RENDER_MODES, RenderMixin
+from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.envs.types import Array, Lanes, Observation
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
-from sme_registry.spec import SMESpec
+from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.task import Task, load_task
 
-_ONE = np.zeros(1, np.int64)  # the only lane
+_ONLY_LANE: Lanes = np.zeros(1, np.int64)
 
 
 def observed_columns(task: Task) -> tuple[npt.NDArray[np.int64], ...]:
-    """For each agent, the columns of the joint observation that it sees: O_i, t/T, its r_cum/k."""
+    """For each agent, the columns of the joint observation it observes: O_i, t/T, its r_cum/k."""
     S = task.spec.state_dim
     return tuple(
         np.array([*channels, S, S + 1 + agent], np.int64)
@@ -37,7 +37,7 @@ def observed_columns(task: Task) -> tuple[npt.NDArray[np.int64], ...]:
     )
 
 
-class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: ignore[misc]
+class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: ignore[misc]
     """A team in parallel: every agent acts at every step, and all end together.
 
     Observation of agent i: `[|O_i| + 2]` float32 in [0, 1]. Action: `[a_i]`, in [0, 1]
@@ -55,24 +55,22 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
       SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "name": "sme_v1",
-        "render_modes": ["human", "rgb_array"],
+        "render_modes": RENDER_MODES,
         "render_fps": 10,
         "is_parallelizable": True,
     }
 
     def __init__(
         self,
-        spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Team2-v1",
+        spec: SpecLike = "Team2-v1",
         *,
-        action_range: Literal["unit", "symmetric"] = "unit",
+        action_range: ActionRange = "unit",
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
-        self.render_mode = render_mode
+        self._set_render_mode(render_mode)
         self._task = load_task(spec, **overrides)
         self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
@@ -80,7 +78,7 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         ends = np.cumsum([len(part) for part in columns]).tolist()
         self.possible_agents = list(self._task.names)
         parts = [slice(*part) for part in pairwise([0, *ends])]
-        self._seen = list(zip(self.possible_agents, parts, strict=True))
+        self._observed_parts = list(zip(self.possible_agents, parts, strict=True))
         self._parts = [
             (agent, name, own)
             for agent, (name, own) in enumerate(
@@ -89,51 +87,40 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         ]
         self.agents: list[str] = []
         self._begun = False
-        self._renderer: Any = None
 
         self._action_spaces, self._observation_spaces = {}, {}
         for agent, name, own in self._parts:
             width = own.stop - own.start
-            self._action_spaces[name], self._rescaled = action_ranges.space(action_range, width)
+            self._action_spaces[name], self._rescaled = arguments.action_space(action_range, width)
             self._observation_spaces[name] = gymnasium.spaces.Box(
                 0.0, 1.0, (len(columns[agent]),), np.float32
             )
-        self._arrange()
-        self._joint_space, _ = action_ranges.space(action_range, self.sme_spec.action_dim)
+        self._allocate()
+        self._joint_space, _ = arguments.action_space(action_range, self.sme_spec.action_dim)
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
-    def _arrange(self) -> None:
+    def _allocate(self) -> None:
         """The joint action `[1, A]`, and each agent's part of it: a view to write into."""
         self._joint_action = np.zeros((1, self.sme_spec.action_dim))
         row = self._joint_action[0]
         self._slots = [(name, row[own].shape, row[own]) for _, name, own in self._parts]
 
-    # A copied view is a view no longer: the parts are laid out again where the copy lives.
+    # The copy of a view is no view: the copy allocates both again.
     def __getstate__(self) -> dict[str, Any]:
         dropped = ("_joint_action", "_slots")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._arrange()
-
-    @property
-    def task(self) -> Task:
-        """The drawn task: W, b, each agent's layers, the equations, and credit."""
-        return self._task
-
-    @property
-    def sme_spec(self) -> SMESpec:
-        """The spec of the task that is really run, overrides included."""
-        return self._task.spec
+        self._allocate()
 
     def observation_space(self, agent: str) -> gymnasium.spaces.Box:
         """The space of an agent's observations, the same object each time."""
-        return self._observation_spaces[self._known(agent)]
+        return self._observation_spaces[self._checked_agent(agent)]
 
     def action_space(self, agent: str) -> gymnasium.spaces.Box:
         """The space of an agent's actions, the same object each time."""
-        return self._action_spaces[self._known(agent)]
+        return self._action_spaces[self._checked_agent(agent)]
 
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy), whatever each agent observes of it."""
@@ -143,12 +130,12 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
-        """Begin an episode at a state drawn uniformly from the cube, or at a given one.
+        """Begin an episode at a state drawn uniformly from the cube, or at one of your choice.
 
         Args:
-          seed: seeds the environment's generator; None goes on with the present one.
+          seed: seeds the environment's generator; None continues its stream.
           options: `{"state": s}` begins at s `[S]`, each entry in [0, 1]. Others are ignored, as
-            PettingZoo's are, but for those that look like a mistyped "state".
+            in PettingZoo, except those that look like a mistyped "state".
 
         Returns:
           Each agent's observation, and an empty info for each.
@@ -162,17 +149,17 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             if name != "state" and did_you_mean(str(name), ["state"]):
                 raise OptionError(f"options={{{name!r}: …}}: unknown option. Did you mean 'state'?")
         if options and "state" in options:
-            states = initial_states(options["state"], (self.sme_spec.state_dim,))[None]
-        seed = checked_seed(seed)
+            states = arguments.initial_states(options["state"], (self.sme_spec.state_dim,))[None]
+        seed = arguments.checked_seed(seed)
         if seed is not None:
             self._batch.initial_states.seed(0, seed)
         observation = self._batch.observe()
-        self._batch.begin(_ONE, observation, states)
+        self._batch.begin(_ONLY_LANE, observation, states)
         self.agents = self.possible_agents[:]
         self._begun = True
         if self.render_mode is not None:
-            self._frame(None)
-        return self._shown(observation), {name: {} for name in self.agents}
+            self._record(self._joint_view(), None)
+        return self._by_agent(observation), {name: {} for name in self.agents}
 
     def step(
         self, actions: dict[str, npt.NDArray[Any]]
@@ -194,8 +181,8 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
 
         Raises:
           ActionError: an agent is missing or unknown, or its action is of the wrong shape, not
-            numbers, or not finite; says whose. Nothing has moved then.
-          EpisodeError: there is no episode under way.
+            numbers, or not finite; the message names the agent. The state is unchanged then.
+          EpisodeError: no episode is running.
         """
         joint = self._joint(actions)
         try:
@@ -208,10 +195,10 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
-            self._frame((joint, done))
+            self._record_step(joint, done)
         names, n = self.possible_agents, len(self.possible_agents)
         return (
-            self._shown(done.observation),
+            self._by_agent(done.observation),
             dict(zip(names, values[3 * n : 4 * n])),  # noqa: B905  # a keyword costs a percent
             dict.fromkeys(names, terminated),
             dict.fromkeys(names, truncated),
@@ -219,9 +206,9 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
         )
 
     def _infos(self, optimal: Array, values: list[float]) -> dict[str, dict[str, Any]]:
-        """Each agent's info, of the values `[5 · n]` of `BatchStep`."""
+        """Each agent's info, from the values `[5 · n]` of a `BatchStep`."""
         if self._rescaled:
-            optimal = action_ranges.to_range(optimal, self._rescaled)
+            optimal = arguments.from_unit(optimal, self._rescaled)
         n = len(self.possible_agents)
         return {
             name: {
@@ -234,74 +221,74 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             for agent, name, own in self._parts
         }
 
-    def _shown(self, observation: Observation) -> dict[str, Observation]:
-        """What each agent sees of the joint observation; fresh arrays, apart from each other."""
-        seen = observation.take(self._every_column)  # of the one row that there is
-        return {name: seen[part] for name, part in self._seen}
+    def _by_agent(self, observation: Observation) -> dict[str, Observation]:
+        """Each agent's part of the joint observation, in fresh arrays."""
+        observed = observation.take(self._every_column)  # of the only row
+        return {name: observed[part] for name, part in self._observed_parts}
 
     def _joint(self, actions: dict[str, npt.NDArray[Any]]) -> Array:
         """The joint action `[1, A]`, float64 of the unit range."""
         if not self.agents:
-            what = "has ended" if self._begun else "has not begun"
-            raise EpisodeError(f"step: the episode {what}. Call reset() first.")
-        for name, shape, own in self._slots:
+            phase = "has ended" if self._begun else "has not begun"
+            raise EpisodeError(f"step: the episode {phase}. Call reset() first.")
+        for name, shape, part in self._slots:
             try:
                 action = actions[name]
             except (KeyError, TypeError, IndexError):
-                raise self._bad_keys(actions) from None
-            # Most actions are arrays as they should be, and checking costs as much as the step.
-            usual = type(action) is np.ndarray and action.dtype.char in "fd"
-            own[...] = action if usual and action.shape == shape else self._checked(name, action)
+                raise self._wrong_agents(actions) from None
+            # Most actions are valid arrays, and the full check costs as much as the step.
+            valid = type(action) is np.ndarray and action.dtype.char in "fd"
+            part[...] = action if valid and action.shape == shape else self._checked(name, action)
         if len(actions) != len(self.possible_agents):
-            raise self._bad_keys(actions)
+            raise self._wrong_agents(actions)
         return (self._joint_action + 1.0) / 2.0 if self._rescaled else self._joint_action
 
     def _checked(self, name: str, action: Any) -> Array:
         """One agent's action as float64, in the environment's range."""
         try:
-            return action_ranges.checked(action, self._action_spaces[name].shape, rescaled=False)
+            return arguments.to_unit(action, self._action_spaces[name].shape, rescaled=False)
         except ActionError as error:
             raise ActionError(f"{name}: {error}") from None
 
     def check_action(self, agent: str, action: npt.NDArray[Any]) -> None:
-        """Raise what `step` would raise of this action.
+        """Raise what `step` would raise for this action.
 
         Args:
-          agent: whose it is.
+          agent: whose action it is.
           action: `[a_i]`, finite.
 
         Raises:
           ActionError: of the wrong shape, not numbers, or not finite.
           OptionError: there is no such agent.
         """
-        if not np.isfinite(self._checked(self._known(agent), action)).all():
-            raise ActionError(f"{agent}: {action_ranges.not_finite()}")
+        if not np.isfinite(self._checked(self._checked_agent(agent), action)).all():
+            raise ActionError(f"{agent}: {arguments.not_finite_error()}")
 
-    def _bad_keys(self, actions: Any) -> ActionError:
-        """What to raise where the actions are not one for each agent."""
+    def _wrong_agents(self, actions: Any) -> ActionError:
+        """The error where there is not exactly one action for each agent."""
         if not isinstance(actions, dict):
             return ActionError(
                 f"actions={actions!r:.60}: must be a dict from each agent's name to its action."
             )
         missing = [name for name in self.possible_agents if name not in actions]
         unknown = [name for name in actions if name not in self.possible_agents]
-        said = []
+        problems = []
         if missing:
-            said.append(f"{', '.join(missing)}: action missing.")
+            problems.append(f"{', '.join(missing)}: action missing.")
         if unknown:
             hint = did_you_mean(str(unknown[0]), missing or self.possible_agents)
-            said.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
+            problems.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
         return ActionError(
-            f"actions: {' '.join(said)} Give one for each of {', '.join(self.possible_agents)}."
+            f"actions: {' '.join(problems)} Give one for each of {', '.join(self.possible_agents)}."
         )
 
     def _not_finite(self, joint: Array) -> ActionError:
         for _, name, own in self._parts:
             if not np.isfinite(joint[0, own]).all():
-                return ActionError(f"{name}: {action_ranges.not_finite()}")
-        return action_ranges.not_finite()
+                return ActionError(f"{name}: {arguments.not_finite_error()}")
+        return arguments.not_finite_error()
 
-    def _known(self, agent: str) -> str:
+    def _checked_agent(self, agent: str) -> str:
         if agent not in self._action_spaces:
             raise OptionError(
                 f"agent={agent!r}: no such agent.{did_you_mean(str(agent), self.possible_agents)} "
@@ -309,45 +296,21 @@ class SMETeamEnv(ParallelEnv[str, Observation, npt.NDArray[Any]]):  # type: igno
             )
         return agent
 
-    def _frame(self, last: tuple[Array, BatchStep] | None) -> None:
-        """Draw the team as one: all channels, and the mean over the agents of their numbers."""
-        if self._renderer is None:
-            from sme_registry.envs.rendering import Renderer
+    def _joint_view(self) -> SimpleNamespace:
+        """What a renderer needs of an environment, of all agents together."""
+        return SimpleNamespace(state=self.state(), action_space=self._joint_space)
 
-            self._renderer = Renderer(self.sme_spec, cast(str, self.render_mode), self.metadata)
-        shown = SimpleNamespace(state=self.state(), action_space=self._joint_space)
-        if last is None:
-            self._renderer.record(shown, None)
-            return
-        joint, done = last
+    def _record_step(self, joint: Array, done: BatchStep) -> None:
+        """Record a step of the team as one: all channels, and the means over the agents."""
         similarity, step_reward, regret, _, accumulated = done.values[:, :, 0].mean(axis=1).tolist()
         info = {
-            "optimal_action": action_ranges.to_range(done.optimal[0], self._rescaled),
+            "optimal_action": arguments.from_unit(done.optimal[0], self._rescaled),
             "similarity": similarity,
             "step_reward": step_reward,
             "regret": regret,
             "accumulated_reward": accumulated,
         }
-        self._renderer.record(shown, (action_ranges.to_range(joint[0], self._rescaled), info))
-
-    def render(self) -> Any:
-        """The frame of this step: `[H, W, 3]` uint8 for "rgb_array"; None for "human", shown.
-
-        Raises:
-          EpisodeError: before the first reset.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn("render() needs a render_mode, given when the team is made.")
-            return None
-        if self._renderer is None:
-            raise EpisodeError("render: the episode has not begun. Call reset() first.")
-        return self._renderer.frame()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._record(self._joint_view(), (arguments.from_unit(joint[0], self._rescaled), info))
 
     def __repr__(self) -> str:
         return f"SMETeamEnv({self.sme_spec.content_name}, {len(self.possible_agents)} agents)"

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.envs import actions as action_ranges
-from sme_registry.envs.batch import Array, Batch, Mask
-from sme_registry.envs.naming import renamed_by_content
-from sme_registry.envs.options import checked_seed, initial_states, refuse_unknown, single_agent
-from sme_registry.envs.single import Observation
-from sme_registry.errors import EpisodeError, OptionError, WrapperError
-from sme_registry.spec import SMESpec
+from sme_registry.envs import arguments
+from sme_registry.envs.base import GymnasiumMixin, check_time_limit
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Array, Lanes, Mask, Observation
+from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.document import plain_number
-from sme_registry.task import Task, load_task
+from sme_registry.task import load_task
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Gymnasium's enum, given as itself or as its string.
+    """Gymnasium's enum, from itself or its string.
 
     Raises:
       OptionError: neither.
@@ -33,11 +30,11 @@ def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError:
-        known = ", ".join(repr(known.value) for known in AutoresetMode)
+        known = ", ".join(repr(member.value) for member in AutoresetMode)
         raise OptionError(f"autoreset_mode={mode!r}: must be one of {known}.") from None
 
 
-class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
+class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     """`num_envs` lanes of one task, bit-equal to as many `SMEEnv`s with the same seeds.
 
     Spaces, rewards and `info` are those of `SMEEnv` with a leading axis `[B]`; as in Gymnasium each
@@ -59,10 +56,10 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
 
     def __init__(
         self,
-        spec: SMESpec | dict[str, Any] | str | os.PathLike[str] = "Default-v1",
+        spec: SpecLike = "Default-v1",
         num_envs: int = 1,
         *,
-        action_range: Literal["unit", "symmetric"] = "unit",
+        action_range: ActionRange = "unit",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -73,23 +70,20 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
         if render_mode is not None:
             raise OptionError(
-                f"render_mode={render_mode!r}: a batch is not rendered. Make a single "
-                "environment to look at an episode."
+                f"render_mode={render_mode!r}: must be None: a batch cannot be rendered. Make a "
+                "single environment to watch an episode."
             )
         self.mode = _autoreset_mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
         self.render_mode = None
-        self._task = single_agent(load_task(spec, **overrides))
+        self._task = arguments.single_agent(load_task(spec, **overrides))
         sme = self._task.spec
-        if max_episode_steps is not None and max_episode_steps < sme.horizon:
-            raise WrapperError(
-                f"max_episode_steps={max_episode_steps}: must be at least the horizon, "
-                f"{sme.horizon}. Make the task itself shorter: horizon={max_episode_steps}."
-            )
+        if max_episode_steps is not None:
+            check_time_limit(max_episode_steps, sme.horizon)
         self._batch = Batch(self._task, num_envs)
         self.num_envs = num_envs
         S, A = sme.state_dim, sme.action_dim
-        self.single_action_space, self._rescaled = action_ranges.space(action_range, A)
+        self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (S + 2,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -99,28 +93,9 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         self._all_begun, self._any_ended = False, False
 
     @property
-    def task(self) -> Task:
-        """The drawn task: W, b, layers and the equations."""
-        return self._task
-
-    @property
-    def sme_spec(self) -> SMESpec:
-        """The spec of the task that is really run, overrides included."""
-        return self._task.spec
-
-    @property
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._batch.state
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's spec; a derived task goes by its content, never by the name it came from."""
-        return self.__dict__.get("_env_spec")
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._env_spec = renamed_by_content(value, self.sme_spec)
 
     def reset(
         self,
@@ -131,9 +106,9 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         """Begin an episode in every lane, or in those of `options["reset_mask"]`.
 
         Args:
-          seed: n seeds lane i with n + i; a list seeds each lane; None goes on.
+          seed: n seeds lane i with n + i; a list seeds each lane; None continues the streams.
           options: `{"state": s}` begins at s, `[S]` or `[B, S]`; `{"reset_mask": mask}` resets
-            the lanes where `mask` `[B]` is True and leaves the others.
+            the lanes where `mask` `[B]` is True and leaves the others as they are.
 
         Returns:
           Observations `[B, S + 2]` and an empty dict.
@@ -141,7 +116,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
         """
-        refuse_unknown(options, ("state", "reset_mask"))
+        arguments.refuse_unknown_options(options, ("state", "reset_mask"))
         options = options or {}
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
@@ -149,11 +124,11 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
         states = None
         if "state" in options:
             S = self.sme_spec.state_dim
-            given = np.asarray(options["state"], dtype=object)
-            one_for_all = given.ndim == 1
-            states = initial_states(options["state"], (S,) if one_for_all else (self.num_envs, S))
+            one_for_all = np.asarray(options["state"], dtype=object).ndim == 1
+            shape = (S,) if one_for_all else (self.num_envs, S)
+            states = arguments.initial_states(options["state"], shape)
             states = np.broadcast_to(states, (self.num_envs, S))[lanes]
-        # All is checked: only now anything moves.
+        # Every argument is checked: from here on, the state changes.
         for lane, lane_seed in zip(lanes, seeds, strict=True):
             if lane_seed is not None:
                 self._batch.initial_states.seed(int(lane), lane_seed)
@@ -175,39 +150,39 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
           Observations `[B, S + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]`, infos.
 
         Raises:
-          ActionError: wrong shape, not numbers, or not finite; nothing has moved then.
+          ActionError: wrong shape, not numbers, or not finite; the states are unchanged then.
           EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
         """
         B, A = self.num_envs, self.sme_spec.action_dim
         if not self._all_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
-        resting, any_resting = self._ended, self._any_ended
-        if any_resting and self.mode is AutoresetMode.DISABLED:
-            first = np.flatnonzero(resting)[0]
+        ended_before, any_ended_before = self._ended, self._any_ended
+        if any_ended_before and self.mode is AutoresetMode.DISABLED:
+            first = np.flatnonzero(ended_before)[0]
             raise EpisodeError(
-                f"step: the episodes of {resting.sum()} lanes have ended (the first is lane "
+                f"step: the episodes of {ended_before.sum()} lanes have ended (the first is lane "
                 f"{first}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
             )
-        # In mode NEXT_STEP what is passed for the resting lanes is ignored.
-        acted = action_ranges.checked(
-            actions, (B, A), self._rescaled, ignored=resting if any_resting else None
+        # In mode NEXT_STEP the actions of lanes that have ended are ignored.
+        unit_actions = arguments.to_unit(
+            actions, (B, A), self._rescaled, ignored=ended_before if any_ended_before else None
         )
 
-        observation, optimal, values, terminated, truncated = self._batch.advance(acted)
+        observation, optimal, values, terminated, truncated = self._batch.advance(unit_actions)
         similarity, step_reward, regret, reward, accumulated = values[:, 0]
         info = {
-            "optimal_action": action_ranges.to_range(optimal, self._rescaled),
+            "optimal_action": arguments.from_unit(optimal, self._rescaled),
             "similarity": similarity,
             "step_reward": step_reward,
             "regret": regret,
             "accumulated_reward": accumulated,
         }
         live = None
-        if any_resting:
-            live = ~resting
+        if any_ended_before:
+            live = ~ended_before
             for array in (reward, terminated, truncated):
-                array[resting] = 0
-            self._begin(np.flatnonzero(resting), observation)
+                array[ended_before] = 0
+            self._begin(np.flatnonzero(ended_before), observation)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
         if any_ended and self.mode is AutoresetMode.SAME_STEP:
@@ -215,8 +190,8 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             final = np.full(B, None, dtype=object)
             for lane in np.flatnonzero(ended):
                 final[lane] = observation[lane].copy()
-            everyone = {"final_obs": final, "final_info": _masked(info, ended)}
-            infos |= {**everyone, "_final_obs": ended.copy(), "_final_info": ended.copy()}
+            final_infos = {"final_obs": final, "final_info": _masked(info, ended)}
+            infos |= {**final_infos, "_final_obs": ended.copy(), "_final_info": ended.copy()}
             self._begin(np.flatnonzero(ended), observation)
         else:
             infos = _masked(info, live)
@@ -224,9 +199,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
                 self._ended, self._any_ended = ended, any_ended
         return observation, reward, terminated, truncated, infos
 
-    def _begin(
-        self, lanes: npt.NDArray[np.int64], observation: Observation, states: Array | None = None
-    ) -> None:
+    def _begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
         """Put lanes at the start of an episode, and write what they observe."""
         self._batch.begin(lanes, observation, states)
         self._ended[lanes] = False
@@ -238,7 +211,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
             return seeds
         seed = plain_number(seed)
         if not isinstance(seed, list | tuple | np.ndarray):
-            first = checked_seed(seed) or 0
+            first = arguments.checked_seed(seed) or 0
             seeds[:] = [first + lane for lane in range(self.num_envs)]
             return seeds
         if len(seed) != self.num_envs:
@@ -246,7 +219,7 @@ class SMEVectorEnv(VectorEnv[Observation, Array, Array]):
                 f"seed={seed!r:.60}: must be an integer, None, or a list of one for each of the "
                 f"{self.num_envs} lanes."
             )
-        seeds[:] = [checked_seed(lane_seed) for lane_seed in seed]
+        seeds[:] = [arguments.checked_seed(lane_seed) for lane_seed in seed]
         return seeds
 
     def _mask(self, mask: Any) -> Mask:

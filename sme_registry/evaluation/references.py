@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.envs.shared import Observation
+from sme_registry.envs.types import Observation
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 from sme_registry.task.draw import Array

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.batch import Array, Batch, Observation
-from sme_registry.envs.options import initial_states, single_agent
+from sme_registry.envs.arguments import initial_states, single_agent
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Array, Observation
 from sme_registry.task import Task, streams
 
 LANES = 4096

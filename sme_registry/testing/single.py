@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sme_registry.envs import SMEEnv, SMEVectorEnv
-from sme_registry.envs.actions import to_range
+from sme_registry.envs.arguments import from_unit
 from sme_registry.registration import env_spec
 from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike
 from sme_registry.task import load_spec, materialize
@@ -198,7 +198,7 @@ def check_optimum(task: SpecLike, *, single: MakeSingle = SMEEnv, seed: int = 0)
         env.reset(seed=seed)
         returned, steps, ended = 0.0, 0, False
         while not ended:
-            action = to_range(definition.optimal_action(env.state), action_range == "symmetric")
+            action = from_unit(definition.optimal_action(env.state), action_range == "symmetric")
             _, reward, terminated, truncated, info = env.step(action)
             returned, steps, ended = returned + float(reward), steps + 1, terminated or truncated
             expect_near("the optimum's regret", info["regret"], 0.0, 1e-9)
@@ -279,7 +279,7 @@ def check_vector(
             expect_same(f"{where}: reset", batch.reset(seed=seed), singles.reset(seed=seed))
             for t in range(min(spec.horizon + 5, MAX_STEPS)):
                 action = mixed_actions(definition.optimal_action(batch.state), rng)
-                action = to_range(action, action_range == "symmetric")
+                action = from_unit(action, action_range == "symmetric")
                 got, expected = batch.step(action), singles.step(action)
                 expect_same(f"{where}: step {t + 1}", got, expected)
                 ended = got[2] | got[3]
@@ -309,7 +309,7 @@ def check_env_spec(task: SpecLike) -> None:
 
 def _next_action(env: Any, rng: np.random.Generator) -> npt.NDArray[np.float32]:
     action = mixed_actions(env.task.optimal_action(env.state), rng)
-    return to_range(action, bool(env.action_space.low[0] < 0.0)).astype(np.float32)
+    return from_unit(action, bool(env.action_space.low[0] < 0.0)).astype(np.float32)
 
 
 def _play(env: Any, reset_seed: int, seed: int) -> list[Any]:

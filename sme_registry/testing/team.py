@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper, parallel_to_aec
 from scipy.special import ndtr
 
-from sme_registry.envs.actions import to_range
+from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.spec import ACTION_RANGES, SpecLike
 from sme_registry.task import Task, load_spec, materialize, observe, step
@@ -120,7 +120,7 @@ def check_team_definition(
             done = step(definition, s, np.array([t]), r_cum, joint[None])
             observations, rewards, terminated, truncated, infos = env.step(actions)
             expect_equal("the next state", env.state(), done.state[0])
-            optimal = to_range(done.optimal_action[0], symmetric)
+            optimal = from_unit(done.optimal_action[0], symmetric)
             for agent, (name, owned) in enumerate(
                 zip(definition.names, definition.owned, strict=True)
             ):
@@ -168,7 +168,7 @@ def check_team_optimum(
                 x = s[list(channels)]
                 for W, b in layers:
                     x = ndtr(W @ x + b)
-                actions[name] = to_range(x, action_range == "symmetric")
+                actions[name] = from_unit(x, action_range == "symmetric")
             _, rewards, _, _, infos = env.step(actions)
             steps += 1
             for name, reward in rewards.items():
@@ -257,7 +257,7 @@ def _team_actions(env: Any, rng: np.random.Generator) -> dict[str, npt.NDArray[n
     """`mixed_actions` by agent, in the environment's range."""
     joint = mixed_actions(env.task.optimal_action(env.state()), rng)
     symmetric = env.action_space(env.task.names[0]).low[0] < 0.0
-    joint = to_range(joint, bool(symmetric)).astype(np.float32)
+    joint = from_unit(joint, bool(symmetric)).astype(np.float32)
     return {name: joint[owned] for name, owned in zip(env.task.names, env.task.owned, strict=True)}
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sme_registry.envs import SMEEnv
-from sme_registry.envs.single import Observation
+from sme_registry.envs.types import Observation
 from sme_registry.sb3 import LanesVecEnv
 from sme_registry.spec import SMESpec
 
@@ -47,13 +47,13 @@ class MonitoredVecEnv(LanesVecEnv):
     def reset(self) -> Observation:
         """Begin an episode with the seed and options set before; observations `[1, S + 2]`."""
         observation, _ = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
-        self._has_begun()
+        self._clear_reset_arguments()
         return observation[None]
 
     def step_wait(self) -> Any:
         """One step; see `SMEVecEnv.step_wait`."""
         begun = time.thread_time()
-        observation, reward, terminated, truncated, info = self._env.step(self._waiting()[0])
+        observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
         self.regret += info["regret"]
         ended = terminated or truncated
         info["TimeLimit.truncated"] = truncated and not terminated

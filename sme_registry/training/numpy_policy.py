@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs.shared import Observation
+from sme_registry.envs.types import Observation
 from sme_registry.errors import SpecError
 from sme_registry.evaluation import Policy, as_policy
 from sme_registry.spec import SMESpec

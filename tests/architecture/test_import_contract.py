@@ -47,7 +47,7 @@ def test_the_import_contract_holds() -> None:
         ("spec/document.py", "from sme_registry.task import Task"),
         ("errors.py", "def _late():\n    import sme_registry.registration"),
         ("task/step.py", "import torch"),
-        ("envs/options.py", "def _late():\n    import matplotlib.pyplot"),
+        ("envs/arguments.py", "def _late():\n    import matplotlib.pyplot"),
         ("compiled/engine.py", "import numba"),
         ("envs/single.py", "import pygame"),
         ("evaluation/references.py", "def _late():\n    import torch"),

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sme_registry.envs.shared import Observation as Observations
+from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import MissingDependencyError, PolicyError
 
 

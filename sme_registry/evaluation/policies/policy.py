@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from sme_registry.envs import actions
-from sme_registry.envs.shared import Observation as Observations
+from sme_registry.envs import arguments
+from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import ActionError, PolicyError
 from sme_registry.evaluation.policies import sb3
 from sme_registry.evaluation.policies.npz import OfflinePolicy
@@ -47,9 +47,9 @@ class Policy:
         try:
             returned = self.act(observations)
             shape = (len(observations), self.action_dim)
-            a = actions.checked(returned, shape, self.action_range == "symmetric")
+            a = arguments.to_unit(returned, shape, self.action_range == "symmetric")
             if not np.isfinite(a).all():
-                raise actions.not_finite()
+                raise arguments.not_finite_error()
             return a
         except ActionError as error:
             raise PolicyError(

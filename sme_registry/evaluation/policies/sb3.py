@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.envs.shared import Observation as Observations
+from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import MissingDependencyError, PolicyError
 
 _LOW = {"unit": 0.0, "symmetric": -1.0}

@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from sme_registry.envs.shared import Observation as Observations
 from sme_registry.envs.shared import shared_observation_of
+from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import PolicyError, did_you_mean
 from sme_registry.evaluation.policies.policy import Interface, Policy, prepare
 from sme_registry.spec import ActionRange, SMESpec

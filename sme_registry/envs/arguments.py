@@ -1,0 +1,134 @@
+"""Checks of the arguments of environments: action ranges and actions, seeds, options, states.
+
+The action range "unit" is [0, 1], the paper's; "symmetric" is [−1, 1], rescaled by a = (u + 1)/2,
+which SB3 prefers. The range changes learning, not the task: it belongs to a run's record, not to
+the task's digest.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.envs.types import Array, Mask
+from sme_registry.errors import ActionError, OptionError, SpecError, StateError, did_you_mean
+from sme_registry.spec.document import plain_number
+from sme_registry.task import Task
+
+
+def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.Box, bool]:
+    """The action space `[A]` of a range, and whether its actions must be rescaled.
+
+    Raises:
+      OptionError: not "unit" or "symmetric".
+    """
+    if action_range not in ("unit", "symmetric"):
+        raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
+    low = 0.0 if action_range == "unit" else -1.0
+    return gymnasium.spaces.Box(low, 1.0, (action_dim,), np.float32), low < 0.0
+
+
+def to_unit(
+    action: Any, shape: tuple[int, ...], rescaled: bool, ignored: Mask | None = None
+) -> Array:
+    """Actions of an environment as contiguous float64 of the unit range; not clipped.
+
+    Whether they are finite is checked by the step, which reads each of them anyway.
+
+    Args:
+      action: what the user passed.
+      shape: what it must have.
+      rescaled: whether the environment's range is [−1, 1].
+      ignored: `[B]` rows to set to zero.
+
+    Raises:
+      ActionError: not numbers, or of another shape.
+    """
+    try:
+        array = np.asarray(action)
+    except ValueError:
+        raise ActionError(f"action={action!r:.80}: must be an array of shape {shape}.") from None
+    if array.dtype.kind not in "fiu":
+        raise ActionError(f"action={action!r:.80}: must be numbers, got dtype {array.dtype}.")
+    if array.shape != shape:
+        raise ActionError(f"action of shape {array.shape}: must be of shape {shape}.")
+    array = np.array(array, dtype=np.float64, order="C")
+    if ignored is not None:
+        array[ignored] = 0.0
+    return (array + 1.0) / 2.0 if rescaled else array
+
+
+def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:
+    """Actions of the unit range in the environment's range."""
+    return unit if not rescaled else 2.0 * unit - 1.0
+
+
+def not_finite_error() -> ActionError:
+    """The error of a step that refused its actions."""
+    return ActionError("action: has NaN or infinite entries. Give finite numbers.")
+
+
+def checked_seed(seed: Any) -> int | None:
+    """A seed of an environment's generator: None, or an integer of at least 0.
+
+    Raises:
+      OptionError: neither.
+    """
+    if seed is None:
+        return None
+    seed = plain_number(seed)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise OptionError(f"seed={seed!r:.60}: must be an integer of at least 0, or None.")
+    return seed
+
+
+def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
+    """Raise on an option that does not exist.
+
+    Raises:
+      OptionError: names the option and the nearest known one.
+    """
+    for name in options or {}:
+        if name not in known:
+            raise OptionError(
+                f"options={{{name!r}: …}}: unknown option.{did_you_mean(str(name), known)} "
+                f"Known: {', '.join(known)}."
+            )
+
+
+def initial_states(state: Any, shape: tuple[int, ...]) -> Array:
+    """States at which episodes begin, as float64 of `shape`, each entry in [0, 1].
+
+    Raises:
+      StateError: not numbers, of another shape, or outside the cube.
+    """
+    try:
+        array = np.asarray(state, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise StateError(f"state={state!r:.80}: must be an array of shape {shape}.") from None
+    if array.shape != shape:
+        raise StateError(f"state of shape {array.shape}: must be of shape {shape}.")
+    outside = ~((array >= 0.0) & (array <= 1.0))
+    if outside.any():
+        raise StateError(
+            f"state: entry {array[outside][0]!r:.30} lies outside [0, 1]. An episode begins inside "
+            "the cube; to ask the task about states outside it, use env.unwrapped.task."
+        )
+    return array
+
+
+def single_agent(task: Task) -> Task:
+    """The task, which must have a single agent.
+
+    Raises:
+      SpecError: it is for a team; says how to make that.
+    """
+    if len(task.policies) > 1:
+        raise SpecError(
+            f"team: this task is for {len(task.policies)} agents and Gymnasium's environments are "
+            "for one. Use sme_registry.make_parallel or sme_registry.make_aec."
+        )
+    return task

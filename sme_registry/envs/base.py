@@ -1,0 +1,124 @@
+"""What environments have in common: their task, their names in Gymnasium, and rendering."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+from sme_registry.envs.naming import renamed_by_content
+from sme_registry.errors import EpisodeError, OptionError, WrapperError
+from sme_registry.spec import SMESpec
+from sme_registry.task import Task
+
+RENDER_MODES = ["human", "rgb_array"]
+
+
+class TaskMixin:
+    """The task of an environment."""
+
+    _task: Task
+
+    @property
+    def task(self) -> Task:
+        """The drawn task: W, b, the layers of each agent, and the equations."""
+        return self._task
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """The spec of the task that is run, overrides included."""
+        return self._task.spec
+
+
+class GymnasiumMixin(TaskMixin):
+    """A task's environment in Gymnasium's registry."""
+
+    _env_spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's spec; a derived task has an id of its own, by its content."""
+        return self._env_spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._env_spec = renamed_by_content(value, self.sme_spec)
+
+
+class RenderMixin(TaskMixin):
+    """Frames of an episode; pygame is imported when the first is recorded."""
+
+    metadata: dict[str, Any]
+    render_mode: str | None
+    _renderer: Any = None
+
+    def _set_render_mode(self, render_mode: str | None) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise OptionError(f"render_mode={render_mode!r}: must be None, 'human' or 'rgb_array'.")
+        self.render_mode = render_mode
+
+    def _record(self, env: Any, last: tuple[Any, dict[str, Any]] | None) -> None:
+        """Record a reset or a step, in an environment with a render mode; see `Renderer.record`."""
+        if self._renderer is None:
+            from sme_registry.envs.rendering import Renderer
+
+            assert self.render_mode is not None
+            self._renderer = Renderer(self.sme_spec, self.render_mode, self.metadata)
+        self._renderer.record(env, last)
+
+    def render(self) -> Any:
+        """The frame of this step: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
+
+        Raises:
+          EpisodeError: before the first reset.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() needs a render_mode, such as "
+                'sme_registry.make(..., render_mode="rgb_array").'
+            )
+            return None
+        if self._renderer is None:
+            raise EpisodeError("render: the episode has not begun. Call reset() first.")
+        return self._renderer.frame()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def refuse_short_time_limit(horizon: int) -> None:
+    """Raise where the `reset` that calls this was called by a TimeLimit below the horizon.
+
+    Such a wrapper ends an episode before its last payout. An environment has no reference to its
+    wrappers, which may be added at any time; but each calls the `reset` of the environment inside
+    it, so the callers' frames up to the first that is no reset belong to the wrappers (and to
+    Gymnasium's function that checks a first reset).
+
+    Raises:
+      WrapperError: says how to make the task itself shorter.
+    """
+    frame = sys._getframe(2)
+    while frame is not None and "reset" in frame.f_code.co_name:
+        wrapper = frame.f_locals.get("self")
+        if isinstance(wrapper, gymnasium.wrappers.TimeLimit):
+            check_time_limit(wrapper._max_episode_steps, horizon)
+        frame = frame.f_back  # type: ignore[assignment]  # typed as never None
+
+
+def check_time_limit(max_episode_steps: int, horizon: int) -> None:
+    """Raise on a time limit below the horizon.
+
+    Raises:
+      WrapperError: says how to make the task itself shorter.
+    """
+    if max_episode_steps < horizon:
+        raise WrapperError(
+            f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "
+            "shorter TimeLimit would end the episode before its last payout. Make the task itself "
+            f"shorter: horizon={max_episode_steps}."
+        )
