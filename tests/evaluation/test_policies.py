@@ -152,6 +152,8 @@ def test_a_prepared_policy_is_accepted_as_it_is():
     assert (again.name, again.action_range) == ("mine", "symmetric")
     assert judged(prepared) == judged(constant(-0.5, 1.0), action_range="symmetric", name="mine")
     assert as_policy(prepared, SPEC, name="other").name == "other"
+    with pytest.raises(PolicyError, match="its actions have 2 entries: must be 1"):
+        evaluate(prepared, SPEC.derive(action_dim=1), PROTOCOL)
 
 
 def test_a_policy_is_named_after_its_function():

@@ -207,6 +207,9 @@ def test_agents_of_a_team_may_have_policies_by_name():
     prepared = as_policy("linear", SPEC)
     assert as_policy(prepared, SPEC) is prepared
     assert (prepared.name, evaluate(prepared, SPEC, SMALL).policy) == ("linear", "linear")
+    for other in (SPEC.derive(team=None), "Team2"):
+        with pytest.raises(PolicyError, match=r"acts for the agents left_0 \(1 channels\), "):
+            evaluate(prepared, other, SMALL)
 
 
 def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():

@@ -34,7 +34,7 @@ def as_policy(
         `[B, |O_i| + 2]` to its actions `[B, a_i]`; or one of the above that all agents share,
         from shared observations `[B, S + 2 + n]` (`envs.shared`) to `[B, max a_i]`, of which the
         agent's first a_i entries count.
-        What this function returned is accepted, too.
+        A policy that this function returned is accepted as well; that of a team keeps its range.
       spec: the task it is for.
       action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1]; None takes an SB3
         model's own action space, and "unit" for any other policy.
@@ -53,6 +53,7 @@ def as_policy(
         policy, name = _named(policy, spec), name or _display_name(policy)
     options = {"action_range": action_range, "name": name}
     if isinstance(policy, TeamPolicy):
+        policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
     if spec.team is None:
         S, A = spec.state_dim, spec.action_dim

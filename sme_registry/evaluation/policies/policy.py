@@ -100,6 +100,11 @@ def prepare(
       MissingDependencyError: the library that loads the file is not installed.
     """
     if isinstance(policy, Policy):
+        if policy.action_dim != interface.action_dim:
+            raise PolicyError(
+                f"policy {policy.name!r}: its actions have {policy.action_dim} entries: must be "
+                f"{interface.action_dim} for {interface.description}. Prepare it for this task."
+            )
         return replace(
             policy,
             name=name or policy.name,

@@ -71,6 +71,21 @@ class TeamPolicy:
             joint.append(a[:, : member.action_dim])
         return np.concatenate(joint, axis=1)
 
+    def check_team(self, spec: SMESpec) -> None:
+        """Check that a task has the agents that this policy was prepared for.
+
+        Raises:
+          PolicyError: it has other agents, or none.
+        """
+        prepared = [(member.agent, member.action_dim) for member in self.members]
+        agents = [] if spec.team is None else draw.agents(spec)
+        if prepared != [(agent.name, agent.action_dim) for agent in agents]:
+            raise PolicyError(
+                f"policy {self.name!r}: it acts for the agents "
+                f"{', '.join(f'{agent} ({dim} channels)' for agent, dim in prepared)}, and this "
+                "task has others. Prepare it for this task."
+            )
+
 
 def separate_policies(
     policies: Mapping[str, Any],
