@@ -23,7 +23,7 @@ THRESHOLDS = {
     "slope_learnt": 0.7,  # slope on a part of π*, at least
     "slope_unlearnt": 0.3,  # at most
     "nonlinear_variance": 0.1,  # share of π*'s variance, at least
-    "similarity_loss": 0.1,  # from WD to the outermost shell
+    "similarity_loss": 10.0,  # points, from WD to the outermost shell
     "on_policy_ratio": 1.25,  # of normalised regret on policy and in uniform states
     "on_policy_difference": 0.05,  # between the two
     "time_ratio": 1.25,  # of the error late and early in episodes

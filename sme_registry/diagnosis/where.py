@@ -66,7 +66,7 @@ def _state_region(case: Case) -> Outcome:
 def _out_of_distribution(case: Case) -> Outcome:
     inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
-    loss = ood.mae - wd.mae
+    loss = 100.0 * (ood.mae - wd.mae)
     return Outcome(
         "similarity_lost" if loss >= _T["similarity_loss"] else "similarity_kept",
         {

@@ -1,360 +1,451 @@
-"""Which property of the task breaks an algorithm, and how sure are we? The tables in words.
+"""Findings of a study: which property of the task breaks each algorithm, and how sure that is.
 
-What is said follows from the contrasts of normalised regret within distribution. A change is
-`shown` where its 95 % interval leaves out 0 and there are `ENOUGH_RUNS` pairs, an `indication`
-where there are fewer, and otherwise open: no sentence turns an open one into "has no effect".
+They follow from the contrasts of normalised regret within distribution. A change counts if its 95 %
+interval excludes 0; it is an indication if it rests on fewer than `ENOUGH_RUNS` pairs. Any other
+change is open, which does not mean that it is none. `templates/findings.jinja` has the words.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
-from sme_registry.diagnosis.questions import THRESHOLDS
+from pydantic import Field
+
+from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
+from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL, AXES
+from sme_registry.studies.report.offline_findings import THRESHOLDS as OFFLINE
+from sme_registry.studies.report.offline_findings import OfflineFindings, offline_findings
+from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
 from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
 
-Contrast = Any  # a row of the table, as a named tuple
-Aggregate = Any
+__all__ = [
+    "THRESHOLDS",
+    "AlgorithmFinding",
+    "Best",
+    "Caveats",
+    "Contrast",
+    "Findings",
+    "OutOfDistribution",
+    "Rival",
+    "findings",
+]
 
-WD, OOD = "wd_regret", "ood_regret"
-_NOT_LEARNT = THRESHOLDS["unlearnt"]  # of the constant's regret: nothing to speak of was learnt
-_BROKEN, _HURT = 0.2, 0.05  # of the constant's regret: how much is called what
+THRESHOLDS = {
+    "unlearnt": DIAGNOSIS["unlearnt"],  # normalised regret, at least: almost nothing was learnt
+    "broken": 0.2,  # change of normalised regret, at least
+    "hurt": 0.05,  # at least; a smaller one hurts slightly
+    "probability": 0.5,  # of improvement, for the better of two algorithms
+    "enough_runs": float(ENOUGH_RUNS),  # with fewer runs or pairs a change is an indication
+    "interval_runs": float(OFFLINE_INTERVAL),  # with fewer an improvement has no interval
+    **OFFLINE,
+}
+_WD, _OOD = "wd_regret", "ood_regret"
+_CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
+
+_Part = TypeVar("_Part")
+_Tuple = Annotated[tuple[_Part, ...], Field(strict=False)]
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What is said of an algorithm.
+class Contrast(StrictModel):
+    """The change of normalised regret from the first class to another.
+
+    Attributes:
+      class_name: the other class.
+      axis: the field in which the classes differ; `SEVERAL`; or "".
+      setting: the class's values of the fields that differ, such as "k = 25".
+      base, level: IQM of the normalised regret on the first class and on this one.
+      change: IQM of the differences between runs of equal number.
+      low, high: ends of its 95 % interval; None for a single pair of runs.
+      pairs: pairs of runs.
+      enough_pairs: whether there are at least `ENOUGH_RUNS`.
+      verdict: "open" unless the interval excludes 0.
+    """
+
+    class_name: str
+    axis: str
+    setting: str
+    base: Real
+    level: Real
+    change: Real
+    low: Real | None
+    high: Real | None
+    pairs: Integer
+    enough_pairs: bool
+    verdict: Literal["worse", "better", "open"]
+
+
+class OutOfDistribution(StrictModel):
+    """The class that costs most regret out of distribution, and larger changes that are open."""
+
+    worst: Contrast
+    larger: _Tuple[Contrast]
+
+
+class AlgorithmFinding(StrictModel):
+    """Which property of the task breaks an algorithm.
+
+    Lists hold one contrast an axis, its largest; the largest of them is first.
 
     Attributes:
       algorithm: its name.
-      headline: the answer, one sentence or two.
-      points: what else there is to it, and how sure it is.
+      verdict: by the largest change for the worse; "none_shown" if there is none, and
+        "no_contrasts" if no run on the first class has a partner on another.
+      base_wd_regret: normalised regret on the first class; None if it has no run there.
+      base_unlearnt: whether almost nothing was learnt on the first class.
+      worst: the largest change for the worse.
+      larger: larger changes that are open.
+      certainty: whether `worst` is certainly the worst: "indication" with few pairs; "rivals" if
+        the intervals of other axes allow a larger change; "only_axis" if no other was varied.
+      rivals: those other axes.
+      position: of the level on `worst.class_name` among the references; None without a linear one.
+      linear_wd_regret, base_linear_wd_regret: normalised regret of the linear policy there and on the
+        first class.
+      harder_to_fit: whether the linear policy's regret rises by more than the threshold "hurt".
+      also_worse: changes for the worse on other axes.
+      better: changes for the better.
+      open: axes without a change for the worse, apart from `larger`.
+      out_of_distribution: likewise for the mean over the shells; None if no change is certain.
+      highest_change: the highest end of an interval; None if no contrast has an interval.
+      largest_single: the largest change of a single pair of runs.
     """
 
     algorithm: str
-    headline: str
-    points: tuple[str, ...]
+    verdict: Literal["broken", "hurt", "slightly_hurt", "none_shown", "no_contrasts"]
+    base_wd_regret: Real | None = None
+    base_unlearnt: bool = False
+    worst: Contrast | None = None
+    larger: _Tuple[Contrast] = ()
+    certainty: Literal["indication", "rivals", "only_axis", "certain"] | None = None
+    rivals: _Tuple[Contrast] = ()
+    position: (
+        Literal["worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"]
+        | None
+    ) = None
+    linear_wd_regret: Real | None = None
+    base_linear_wd_regret: Real | None = None
+    harder_to_fit: bool = False
+    also_worse: _Tuple[Contrast] = ()
+    better: _Tuple[Contrast] = ()
+    open: _Tuple[Contrast] = ()
+    out_of_distribution: OutOfDistribution | None = None
+    highest_change: Real | None = None
+    largest_single: Contrast | None = None
 
 
-def findings(analysis: Analysis) -> list[Finding]:
-    """The answer for each algorithm that learns."""
-    return [_finding(analysis, algorithm) for algorithm in analysis.learners]
+class Rival(StrictModel):
+    """An algorithm compared with the best one.
+
+    Attributes:
+      algorithm: its name.
+      probability: that a run of the best algorithm beats one of this algorithm.
+      low, high: ends of its 95 % interval; None if a class has a single run.
+      verdict: "open" if the interval reaches down to 0.5; "indication" with few runs.
+    """
+
+    algorithm: str
+    probability: Real
+    low: Real | None
+    high: Real | None
+    verdict: Literal["better", "indication", "open"]
 
 
-def caveats(analysis: Analysis) -> list[str]:
-    """What holds for everything that is said: how many runs, how many comparisons."""
-    done, missing = len(analysis.runs), len(analysis.missing)
-    said = []
-    if missing:
-        failed = int((analysis.missing.error != "").sum())
-        why = f", of which {failed} failed" if failed else ""
-        said.append(
-            f"{missing} of the plan's {done + missing} runs are not there yet{why}. They are in no "
-            "number, and the table of runs names them."
-        )
-    pairs = [
-        row.pairs for row in analysis.contrasts.itertuples() if row.algorithm in analysis.learners
-    ]
-    if pairs and min(pairs) < ENOUGH_RUNS:
-        said.append(
-            f"Some contrasts rest on as few as {min(pairs)} {_plural(min(pairs), 'pair')} of runs. "
-            "A 95 % bootstrap interval of 2 runs holds the truth in only 32–62 % of cases and of 3 "
-            "in 48–86 %, depending on how runs spread; from 4 on in 94–98 %. Under "
-            f"{ENOUGH_RUNS} pairs, this report calls a change an indication at most."
-        )
-    contrasts = [
-        row
-        for row in analysis.contrasts.itertuples()
-        if row.metric == WD and not math.isnan(row.low)
-    ]
-    contrasts = [row for row in contrasts if row.algorithm in analysis.learners]
-    if len(contrasts) > 1:
-        said.append(
-            f"There are {len(contrasts)} contrasts within distribution, each with an interval of "
-            f"its own: were there no effects at all, about {max(1, round(0.05 * len(contrasts)))} "
-            "of them would still leave out 0 by chance."
-        )
-    if any("policy_init" in _differing(analysis, name) for name in analysis.classes):
-        said.append(
-            "Some classes also have another policy_init than the first, which their depth asks "
-            "for; that is part of their contrasts."
-        )
-    return said
+class Best(StrictModel):
+    """The best algorithm over all classes, among those with equal data.
+
+    Attributes:
+      algorithm: its name.
+      nu, transitions: of the data that all of them learnt from; None for online algorithms.
+      classes: on which all algorithms have runs.
+      iqm: of 1 − WD regret, mean over classes: 1 is the optimum, 0 the constant ½.
+      low, high: ends of its 95 % interval; None if a class has a single run.
+      rivals: the other algorithms.
+    """
+
+    algorithm: str
+    nu: Real | None
+    transitions: Integer | None
+    classes: Integer
+    iqm: Real
+    low: Real | None
+    high: Real | None
+    rivals: _Tuple[Rival]
 
 
-def comparison(analysis: Analysis) -> str:
-    """Which does best over all classes of those with equal data, and whether that is settled."""
-    data = training_data(analysis.runs)
-    rows = [
-        row
-        for row in analysis.aggregates.itertuples()
-        if (row.group, row.metric, row.statistic) == (ALL, WD, "iqm")
-        and row.algorithm in analysis.learners
-    ]
-    said = [_budgets(analysis, [row.algorithm for row in rows])]
-    for equal in dict.fromkeys(data[row.algorithm] for row in rows):
-        own = [row for row in rows if data[row.algorithm] == equal]
-        if len(own) > 1:
-            said.append(_best(analysis, own, equal))
-    return " ".join(filter(None, said))
+class Caveats(StrictModel):
+    """What limits all findings.
+
+    Attributes:
+      planned, missing, failed: runs of the plan; failed ones are missing, too.
+      fewest_pairs: of a contrast; None without contrasts.
+      intervals: of contrasts within distribution.
+      false_findings: how many of them exclude 0 by chance if nothing has an effect.
+      other_policy_init: classes whose policy_init also differs from the first class's.
+    """
+
+    planned: Integer
+    missing: Integer
+    failed: Integer
+    fewest_pairs: Integer | None
+    intervals: Integer
+    false_findings: Integer
+    other_policy_init: _Tuple[str]
 
 
-def _best(analysis: Analysis, rows: Sequence[Aggregate], data: tuple[float, int] | None) -> str:
-    """Which of some algorithms does best."""
-    best = max(rows, key=lambda row: row.value)
-    among = f"of those on {data[1]:,} transitions of ν = {data[0]:g}, " if data else ""
-    text = (
-        f"Over the {best.classes} {_plural(best.classes, 'class', 'classes')} where all have runs, "
-        f"{among}{best.algorithm} scores highest within distribution: {best.value:.2f}"
-        f"{_interval(best.low, best.high)}, where 1 is the optimum and 0 the constant ½."
+class Findings(StrictModel):
+    """What a study found, as data.
+
+    Attributes:
+      study: name and version of the plan.
+      digest: of the plan.
+      base: the plan's first class, with which the others are contrasted.
+      thresholds: see `THRESHOLDS`.
+      algorithms: those that learn.
+      steps: training steps of each algorithm that is compared, if they differ; otherwise empty.
+      best: one for each data set that algorithms share.
+      caveats: what limits all findings.
+      offline: what learning from data adds; None without such runs.
+    """
+
+    schema_version: SchemaVersion = 1
+    study: str
+    digest: Digest
+    base: str
+    thresholds: dict[str, Real]
+    algorithms: _Tuple[AlgorithmFinding]
+    steps: dict[str, Integer]
+    best: _Tuple[Best]
+    caveats: Caveats
+    offline: OfflineFindings | None
+
+
+def findings(analysis: Analysis) -> Findings:
+    """The findings of a study, from its tables."""
+    compared = _aggregates(analysis)
+    return Findings(
+        study=analysis.file.versioned_name,
+        digest=analysis.file.digest,
+        base=analysis.base,
+        thresholds=THRESHOLDS,
+        algorithms=tuple(_algorithm(analysis, algorithm) for algorithm in analysis.learners),
+        steps=_steps(analysis, [row.algorithm for row in compared]),
+        best=tuple(_best(analysis, compared)),
+        caveats=_caveats(analysis),
+        offline=offline_findings(analysis) if analysis.has_offline_runs else None,
     )
-    names = {row.algorithm for row in rows}
-    for row in analysis.improvements.itertuples():
-        pair = {row.first, row.second}
-        if (row.group, row.metric) != (ALL, WD) or best.algorithm not in pair:
-            continue
-        other = (pair - {best.algorithm}).pop()
-        if other not in names:
-            continue
-        value, low, high = row.probability, row.low, row.high
-        if row.first == other:
-            value = 1.0 - value
-            low, high = 1.0 - high, 1.0 - low
-        if not low > 0.5:
-            sure = ", which leaves open which of the two is better"
-        else:
-            sure = "" if row.fewest_runs >= ENOUGH_RUNS else ", an indication from few runs"
-        text += (
-            f" A run of it beats one of {other} with probability {value:.2f}"
-            f"{_interval(low, high)}{sure}."
-        )
-    return text
 
 
-def _budgets(analysis: Analysis, algorithms: Sequence[str]) -> str:
-    """How long each of some algorithms was trained, where that differs."""
-    steps = {run.algorithm: run.steps for run in analysis.runs.itertuples()}
-    alike: dict[int, list[str]] = {}
-    for name in algorithms:
-        alike.setdefault(steps[name], []).append(name)
-    if len(alike) < 2:
-        return ""
-    (first, names), *others = alike.items()
-    text = f"{_and(names)} {_plural(len(names), 'was', 'were')} trained for {first:,} steps"
-    return text + "".join(f", {_and(names)} for {count:,}" for count, names in others) + "."
-
-
-def _finding(analysis: Analysis, algorithm: str) -> Finding:
-    rows = _rows(analysis, algorithm, WD)
-    if not rows:
-        return Finding(
-            algorithm,
-            f"Nothing can be said of {algorithm} yet: it has no runs of one number on the first "
-            f"class, {analysis.base}, and on another.",
-            (),
-        )
-    points = []
-    base = _level(analysis, analysis.base, algorithm)
-    if base is not None and base.iqm >= _NOT_LEARNT:
-        points.append(
-            f"It has learnt next to nothing on the first class itself: its normalised regret there "
-            f"is {base.iqm:.2f}, and the constant action's 1. What has not been learnt cannot "
-            "break, so the contrasts say little: they need a longer budget."
-        )
-    worse = [row for row in rows if row.verdict == "worse"]
-    if not worse:
-        better = [row for row in rows if row.verdict == "better"]
-        found = f"; {_listed(analysis, better)} lower it" if better else ""
-        ends = [row.high for row in rows if not math.isnan(row.high)]
-        still = ": the intervals say what is still possible" if ends else ""
-        headline = (
-            f"No class has been shown to make {algorithm} worse within distribution{found}. "
-            f"That is no proof of the contrary{still}."
-        )
-        if ends:
-            points.append(f"The largest upper end is {_signed(max(ends))}.")
-        alone = [row for row in rows if math.isnan(row.high)]
-        if alone:
-            most = max(alone, key=lambda row: row.change)
-            points.append(
-                "A single pair of runs has no interval; the largest change of such a pair is "
-                f"{_signed(most.change)} ({most.class_name})."
-            )
-        return Finding(algorithm, headline, tuple(points))
-    top = max(worse, key=lambda row: row.change)
-    larger = _larger(rows, top)
-    headline = (
-        f"{algorithm} is {_verb(top.change, most=not larger)} by {_property(analysis, top)}: on "
-        f"{top.class_name} its normalised regret within distribution goes from {top.base:.2f} to "
-        f"{top.level:.2f}, a change of {_signed(top.change)} (95 % interval {_signed(top.low)} to "
-        f"{_signed(top.high)}, {top.pairs} pairs of runs).{_uncertain(analysis, larger)}"
+def _algorithm(analysis: Analysis, algorithm: str) -> AlgorithmFinding:
+    contrasts = _contrasts(analysis, algorithm, _WD)
+    if not contrasts:
+        return AlgorithmFinding(algorithm=algorithm, verdict="no_contrasts")
+    base_wd_regret, base_linear = _level(analysis, analysis.base, algorithm)
+    fields: dict[str, Any] = {
+        "algorithm": algorithm,
+        "base_wd_regret": base_wd_regret,
+        "base_unlearnt": base_wd_regret is not None and base_wd_regret >= THRESHOLDS["unlearnt"],
+        "better": tuple(c for c in contrasts if c.verdict == "better"),
+        "highest_change": max((c.high for c in contrasts if c.high is not None), default=None),
+        "largest_single": _largest(c for c in contrasts if c.high is None),
+    }
+    worst = _largest(c for c in contrasts if c.verdict == "worse")
+    if worst is None:
+        return AlgorithmFinding(verdict="none_shown", **fields)
+    larger = _larger(contrasts, worst)
+    rivals = _rivals(contrasts, worst)
+    _, linear = _level(analysis, worst.class_name, algorithm)
+    rise = 0.0 if linear is None or base_linear is None else linear - base_linear
+    worse = _largest_of_each_axis(c for c in contrasts if c.verdict == "worse")
+    return AlgorithmFinding(
+        verdict=_severity(worst.change),
+        worst=worst,
+        larger=larger,
+        certainty=_certainty(contrasts, worst, rivals),
+        rivals=rivals,
+        position=_position(worst.level, linear),
+        linear_wd_regret=linear,
+        base_linear_wd_regret=base_linear,
+        harder_to_fit=rise > THRESHOLDS["hurt"],
+        also_worse=tuple(c for c in worse if c.axis != worst.axis),
+        open=tuple(
+            c for c in _largest_of_each_axis(contrasts) if c.verdict != "worse" and c not in larger
+        ),
+        out_of_distribution=_out_of_distribution(analysis, algorithm),
+        **fields,
     )
-    points += [_certainty(analysis, top, rows), _severity(analysis, top)]
-    others = [row for row in _worst_of_each_axis(worse) if row.axis != top.axis]
-    settled = [row for row in others if row.enough_pairs]
-    if settled:
-        points.append(f"It is also made worse by {_listed(analysis, settled)}.")
-    if len(settled) < len(others):
-        few = [row for row in others if not row.enough_pairs]
-        points.append(
-            f"There are indications, no more, that it is made worse by {_listed(analysis, few)}."
-        )
-    still_open = [
-        row for row in _worst_of_each_axis(rows) if row.verdict != "worse" and row not in larger
-    ]
-    if still_open:
-        points.append(
-            f"Not shown to make it worse: {_listed(analysis, still_open)}. Where an interval is "
-            "wide, that is for want of runs."
-        )
-    outside = [row for row in _rows(analysis, algorithm, OOD) if row.verdict == "worse"]
-    if outside:
-        far = max(outside, key=lambda row: row.change)
-        larger = _larger(_rows(analysis, algorithm, OOD), far)
-        costs = "makes it worse" if larger else "costs it most"
-        if far.axis == top.axis:
-            text = f"Out of distribution the same property {costs}"
-        else:
-            text = f"Out of distribution it is {_property(analysis, far)} that {costs}"
-        points.append(f"{text}: {_listed(analysis, [far])}.{_uncertain(analysis, larger)}")
-    return Finding(algorithm, headline, tuple(filter(None, points)))
 
 
-def _larger(rows: Iterable[Contrast], top: Contrast) -> list[Contrast]:
-    """What costs more than the largest change that is certain, of each axis its worst."""
-    return _worst_of_each_axis(row for row in rows if row.change > top.change)
+def _severity(change: float) -> Literal["broken", "hurt", "slightly_hurt"]:
+    if change >= THRESHOLDS["broken"]:
+        return "broken"
+    return "hurt" if change >= THRESHOLDS["hurt"] else "slightly_hurt"
 
 
-def _uncertain(analysis: Analysis, larger: Sequence[Contrast]) -> str:
-    return f" Larger still, but not certain: {_listed(analysis, larger)}." if larger else ""
-
-
-def _severity(analysis: Analysis, top: Contrast) -> str:
-    """Where the policies end up, between the references."""
-    level = _level(analysis, top.class_name, top.algorithm)
-    linear = level.linear if level is not None else None
-    if top.level > 2.0 - _NOT_LEARNT:
-        return f"At {top.level:.2f} it is worse than the constant action ½, which scores 1."
-    if top.level >= _NOT_LEARNT:
-        return f"At {top.level:.2f} it is about where the constant action ½ is, which scores 1."
-    if linear is None:
-        return ""
-    relation = "worse" if top.level > linear else "still better"
-    text = (
-        f"At {top.level:.2f} it is {relation} than the linear policy fitted to the optimum, which "
-        f"has {linear:.2f} there, and better than the constant ½, which has 1."
-    )
-    before = _level(analysis, analysis.base, top.algorithm)
-    if before is not None and linear - before.linear > _HURT:
-        text += (
-            f" The linear policy's own regret rises from {before.linear:.2f}: the optimum itself "
-            "is harder to fit there."
-        )
-    return text
-
-
-def _certainty(analysis: Analysis, top: Contrast, rows: Sequence[Contrast]) -> str:
-    """How sure it is that this is the worst."""
-    if not top.enough_pairs:
-        return (
-            f"How sure? Not very: {top.pairs} pairs of runs are few, and this is an indication, "
-            f"not a finding. {ENOUGH_RUNS} or more would settle more."
-        )
-    rivals = _worst_of_each_axis(
-        row
-        for row in rows
-        if row.axis != top.axis and (math.isnan(row.high) or row.high >= top.low)
-    )
+def _certainty(
+    contrasts: Sequence[Contrast], worst: Contrast, rivals: Sequence[Contrast]
+) -> Literal["indication", "rivals", "only_axis", "certain"]:
+    if not worst.enough_pairs:
+        return "indication"
     if rivals:
-        return (
-            "How sure? That it hurts, its interval shows. That nothing else hurts more is not "
-            f"settled: no interval rules it out of {_listed(analysis, rivals)}."
-        )
-    if len({row.axis for row in rows}) == 1:
-        return "How sure? That it hurts, its interval shows; no other axis was varied."
-    return (
-        f"How sure? Its interval begins at {_signed(top.low)}, above where every other axis' "
-        "ends, so that among the axes varied here it is the worst."
-    )
+        return "rivals"
+    return "only_axis" if len({c.axis for c in contrasts}) == 1 else "certain"
 
 
-def _level(analysis: Analysis, class_name: str, algorithm: str) -> Any:
-    for row in analysis.levels.itertuples():
-        if (row.class_name, row.algorithm, row.metric) == (class_name, algorithm, WD):
-            return row
-    return None
+def _position(
+    level: float, linear: float | None
+) -> (
+    Literal["worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"]
+    | None
+):
+    """Where a normalised regret is among the constant's, which is 1, and the linear policy's."""
+    if level > 2.0 - THRESHOLDS["unlearnt"]:
+        return "worse_than_constant"
+    if level >= THRESHOLDS["unlearnt"]:
+        return "like_constant"
+    if linear is None:
+        return None
+    return "worse_than_linear" if level > linear else "better_than_linear"
 
 
-def _rows(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
+def _out_of_distribution(analysis: Analysis, algorithm: str) -> OutOfDistribution | None:
+    contrasts = _contrasts(analysis, algorithm, _OOD)
+    worst = _largest(c for c in contrasts if c.verdict == "worse")
+    if worst is None:
+        return None
+    return OutOfDistribution(worst=worst, larger=_larger(contrasts, worst))
+
+
+def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
+    rows = analysis.contrasts
+    rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
     return [
-        row
-        for row in analysis.contrasts.itertuples()
-        if (row.algorithm, row.metric) == (algorithm, metric)
+        Contrast(
+            class_name=row.class_name,
+            axis=row.axis,
+            setting=analysis.classes[row.class_name].label,
+            base=row.base,
+            level=row.level,
+            change=row.change,
+            low=_known(row.low),
+            high=_known(row.high),
+            pairs=row.pairs,
+            enough_pairs=bool(row.enough_pairs),
+            verdict=row.verdict,
+        )
+        for row in rows.itertuples()
     ]
 
 
-def _worst_of_each_axis(rows: Iterable[Contrast]) -> list[Contrast]:
-    """For each axis the class that costs most, dearest axis first."""
-    found: dict[str, Contrast] = {}
-    for row in sorted(rows, key=lambda row: row.change, reverse=True):
-        found.setdefault(row.axis or row.class_name, row)
-    return list(found.values())
+def _level(
+    analysis: Analysis, class_name: str, algorithm: str
+) -> tuple[float | None, float | None]:
+    """WD regret of an algorithm on a class, and that of the linear policy."""
+    rows = analysis.levels
+    place = (rows.class_name == class_name) & (rows.algorithm == algorithm) & (rows.metric == _WD)
+    row = next(rows[place].itertuples(), None)
+    return (None, None) if row is None else (row.iqm, _known(row.linear))
 
 
-def _listed(analysis: Analysis, rows: Sequence[Contrast]) -> str:
-    """`complexity L (complexity-10: +0.13, interval +0.12 to +0.15)`, …"""
-    parts = []
-    for row in rows:
-        interval = (
-            "a single pair, no interval"
-            if math.isnan(row.low)
-            else f"interval {_signed(row.low)} to {_signed(row.high)}"
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _largest(contrasts: Iterable[Contrast]) -> Contrast | None:
+    return max(contrasts, key=lambda c: c.change, default=None)
+
+
+def _largest_of_each_axis(contrasts: Iterable[Contrast]) -> tuple[Contrast, ...]:
+    """For each axis the contrast with the largest change, in falling order."""
+    largest: dict[str, Contrast] = {}
+    for contrast in sorted(contrasts, key=lambda c: c.change, reverse=True):
+        largest.setdefault(contrast.axis or contrast.class_name, contrast)
+    return tuple(largest.values())
+
+
+def _larger(contrasts: Iterable[Contrast], worst: Contrast) -> tuple[Contrast, ...]:
+    """Changes that are larger than the largest certain one."""
+    return _largest_of_each_axis(c for c in contrasts if c.change > worst.change)
+
+
+def _rivals(contrasts: Iterable[Contrast], worst: Contrast) -> tuple[Contrast, ...]:
+    """Changes on other axes that may be larger than the worst one, by their intervals."""
+    low = worst.low or 0.0
+    return _largest_of_each_axis(
+        c for c in contrasts if c.axis != worst.axis and (c.high is None or c.high >= low)
+    )
+
+
+def _aggregates(analysis: Analysis) -> list[Any]:
+    """The rows of learners over all classes."""
+    rows = analysis.aggregates
+    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
+    return [row for row in rows.itertuples() if row.algorithm in analysis.learners]
+
+
+def _steps(analysis: Analysis, algorithms: Sequence[str]) -> dict[str, int]:
+    steps = dict(zip(analysis.runs.algorithm, analysis.runs.steps.tolist(), strict=True))
+    compared = {algorithm: steps[algorithm] for algorithm in algorithms}
+    return compared if len(set(compared.values())) > 1 else {}
+
+
+def _best(analysis: Analysis, rows: Sequence[Any]) -> Iterable[Best]:
+    data = training_data(analysis.runs)
+    for shared in dict.fromkeys(data[row.algorithm] for row in rows):
+        alike = [row for row in rows if data[row.algorithm] == shared]
+        if len(alike) < 2:
+            continue
+        best = max(alike, key=lambda row: row.value)
+        nu, transitions = shared or (None, None)
+        yield Best(
+            algorithm=best.algorithm,
+            nu=nu,
+            transitions=transitions,
+            classes=best.classes,
+            iqm=best.value,
+            low=_known(best.low),
+            high=_known(best.high),
+            rivals=tuple(_improvements(analysis, best.algorithm, {row.algorithm for row in alike})),
         )
-        few = "" if row.enough_pairs or math.isnan(row.low) else f", only {row.pairs} pairs"
-        parts.append(
-            f"{_property(analysis, row)} ({row.class_name}: {_signed(row.change)}, {interval}{few})"
-        )
-    return ", ".join(parts)
 
 
-def _property(analysis: Analysis, row: Contrast) -> str:
-    """What the class changes, as a reader calls it."""
-    if row.axis in AXES:
-        return AXES[row.axis][1]
-    label = analysis.classes[row.class_name].label
-    return f"several axes at once ({label})" if label else f"the class {row.class_name}"
+def _improvements(analysis: Analysis, best: str, among: set[str]) -> Iterable[Rival]:
+    rows = analysis.improvements
+    for row in rows[(rows.group == ALL) & (rows.metric == _WD)].itertuples():
+        pair = {row.first, row.second}
+        if best not in pair or not pair <= among:
+            continue
+        probability, low, high = row.probability, _known(row.low), _known(row.high)
+        if row.second == best:
+            probability = 1.0 - probability
+            low, high = (None if end is None else 1.0 - end for end in (high, low))
+        verdict: Literal["better", "indication", "open"] = "open"
+        if low is not None and low > THRESHOLDS["probability"]:
+            verdict = "better" if row.fewest_runs >= ENOUGH_RUNS else "indication"
+        (other,) = pair - {best}
+        yield Rival(algorithm=other, probability=probability, low=low, high=high, verdict=verdict)
 
 
-def _differing(analysis: Analysis, class_name: str) -> list[str]:
+def _caveats(analysis: Analysis) -> Caveats:
+    rows, missing = analysis.contrasts, analysis.missing
+    rows = rows[rows.algorithm.isin(analysis.learners)]
+    intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
+    return Caveats(
+        planned=len(analysis.runs) + len(missing),
+        missing=len(missing),
+        failed=int((missing.error != "").sum()),
+        fewest_pairs=None if rows.empty else int(rows.pairs.min()),
+        intervals=intervals,
+        false_findings=max(1, round(_CHANCE * intervals)),
+        other_policy_init=tuple(
+            name for name in analysis.classes if "policy_init" in _also_differing(analysis, name)
+        ),
+    )
+
+
+def _also_differing(analysis: Analysis, class_name: str) -> list[str]:
     """Fields in which a class differs from the first, besides the one it is contrasted by."""
     info, base = analysis.classes[class_name], analysis.classes[analysis.base]
     return [name for name in AXES if info.setting[name] != base.setting[name] and name != info.axis]
-
-
-def _verb(change: float, *, most: bool) -> str:
-    verb = "broken" if change >= _BROKEN else "hurt"
-    return f"{verb}{' most' if most else ''}{'' if change >= _HURT else ', though little,'}"
-
-
-def _interval(low: float, high: float) -> str:
-    return "" if math.isnan(low) else f" ({low:.2f} to {high:.2f})"
-
-
-def _signed(value: float) -> str:
-    """`+0.44`, `−0.02`, `0.00`."""
-    text = f"{value:+.2f}"
-    return "0.00" if text in ("+0.00", "-0.00") else text.replace("-", "−")
-
-
-def _and(names: Sequence[str]) -> str:
-    """`PPO, TD3 and SAC`."""
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
-
-
-def _plural(count: int, one: str, many: str = "") -> str:
-    return one if count == 1 else many or f"{one}s"

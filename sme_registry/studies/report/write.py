@@ -1,6 +1,7 @@
 """`write_report`: a study's folder to its report.
 
-    REPORT/index.html           the page: words, figures and tables, nothing outside it
+    REPORT/index.html           the page: findings, figures and tables, nothing outside it
+    REPORT/findings.json        the findings as data
     REPORT/figures/*.png .pdf   the figures, at the width of a printed page
     REPORT/tables/*.csv         every number
     REPORT/tables/*.tex         what a paper prints
@@ -15,11 +16,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sme_registry.errors import OptionError
-from sme_registry.io import write_atomically
+from sme_registry.io import to_json, write_atomically
 from sme_registry.studies.engine.ledger import REPORT, Ledger
 from sme_registry.studies.report.analysis import analyse
 from sme_registry.studies.report.exports import csv_tables, text_tables
 from sme_registry.studies.report.figures import draw_figures
+from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import plan_file
 from sme_registry.studies.report.page import page
 
@@ -73,7 +75,9 @@ def write_report(
     target = Path(folder) / REPORT if out is None else Path(out)
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        contents["index.html"] = page(analysis, figures, absent, tables)
+        found = findings(analysis)
+        contents["index.html"] = page(analysis, found, figures, absent, tables)
+        contents["findings.json"] = to_json(found.to_dict())
     for ending in ("png", "pdf"):
         if ending in formats:
             contents |= {f"figures/{x.name}.{ending}": x.files[ending] for x in figures}

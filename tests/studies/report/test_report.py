@@ -1,10 +1,9 @@
-"""`sme study report`: whole, deterministic, in words that its numbers bear out."""
+"""`sme study report` writes complete and deterministic files."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
-import math
 import re
 import shutil
 from html.parser import HTMLParser
@@ -16,10 +15,10 @@ import pytest
 from typer.testing import CliRunner
 
 from sme_registry.errors import OptionError
+from sme_registry.io import read_json
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
-from sme_registry.studies.report.findings import caveats, comparison, findings
-from sme_registry.studies.report.tables import ENOUGH_RUNS, contrast_verdict
+from sme_registry.studies.report.findings import Findings, findings
 
 pytest.importorskip("matplotlib")
 
@@ -85,15 +84,6 @@ def analysis(finished: Path) -> Analysis:
     return analyse(file, ledger.results(), draws=300)
 
 
-def without(finished: Path, leave_out: Any) -> Analysis:
-    ledger = Ledger(finished)
-    file = ledger.plan_file()
-    assert file is not None
-    gone = {planned.cell.digest for planned in file.plan.cells if leave_out(planned)}
-    results = {key: result for key, result in ledger.results().items() if key not in gone}
-    return analyse(file, results, draws=300)
-
-
 def test_every_figure_is_there_in_every_format(written: Path):
     for ending, signature in SIGNATURES.items():
         files = {path.stem: path for path in (written / "figures").glob(f"*.{ending}")}
@@ -123,6 +113,15 @@ def test_the_page_says_where_its_numbers_come_from(written: Path, analysis: Anal
     assert "numpy" in text
     assert "Beta on k-25, run 3: failed: ValueError: <b>bad</b>" in text  # as text, not as a tag
     assert "Beta on k-25, run 4" in text
+
+
+def test_the_findings_are_written_as_data(written: Path, finished: Path):
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    failures = {key: failure.error for key, failure in ledger.failures().items()}
+    read = Findings.from_dict(read_json(written / "findings.json"), "findings.json")
+    assert read == findings(analyse(file, ledger.results(), failures))
 
 
 def test_the_same_results_give_the_same_report(finished: Path, written: Path, tmp_path: Path):
@@ -161,150 +160,6 @@ def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path):
         for row in rows:
             assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1]) - 1
             assert not re.search(r"(?<!\\)[_%#]", row)
-
-
-def test_the_words_name_what_each_learner_was_made_to_suffer_from(analysis: Analysis):
-    alpha, beta = findings(analysis)
-    assert (alpha.algorithm, beta.algorithm) == ("Alpha", "Beta")
-    assert alpha.headline.startswith("Alpha is broken most by minimum reward r_min: on r_min-0_5")
-    assert "5 pairs of runs" in alpha.headline
-    assert "among the axes varied here it is the worst" in alpha.points[0]
-    assert beta.headline.startswith("Beta is broken most by reward interval k: on k-25")
-
-
-def contrasted(analysis: Analysis, *changes: tuple[str, str, dict[str, Any]]) -> Analysis:
-    """With other contrasts of Alpha, each by its class and metric."""
-    rows = analysis.contrasts.copy()
-    for class_name, metric, fields in changes:
-        at = (rows.class_name == class_name) & (rows.algorithm == "Alpha") & (rows.metric == metric)
-        for name, value in fields.items():
-            rows.loc[at, name] = value
-    rows["enough_pairs"] = rows.pairs >= ENOUGH_RUNS
-    rows["verdict"] = [contrast_verdict(r.change, r.low, r.high) for r in rows.itertuples()]
-    return dataclasses.replace(analysis, contrasts=rows)
-
-
-ALONE = {"low": math.nan, "high": math.nan, "pairs": 1}
-
-
-def test_the_words_name_what_looks_worse_than_what_is_certain(analysis: Analysis):
-    alpha, _ = findings(
-        contrasted(
-            analysis,
-            ("complexity-10", "wd_regret", {"change": 1.06, **ALONE}),
-            ("complexity-10", "ood_regret", {"change": 1.01, **ALONE}),
-        )
-    )
-    assert alpha.headline.startswith("Alpha is broken by minimum reward r_min: on r_min-0_5")
-    larger = "Larger still, but not certain: complexity L (complexity-10: +{}, a single pair"
-    assert larger.format("1.06") in alpha.headline
-    assert "the worst" not in alpha.points[0]
-    assert not any("Not shown" in point and "complexity-10" in point for point in alpha.points)
-    (outside,) = (point for point in alpha.points if point.startswith("Out of distribution"))
-    assert "the same property makes it worse: minimum reward r_min" in outside
-    assert larger.format("1.01") in outside
-    assert "most" not in alpha.headline + outside
-
-
-def test_an_axis_with_a_class_that_is_shown_still_has_its_open_ones_listed(analysis: Analysis):
-    alpha, _ = findings(
-        contrasted(
-            analysis,
-            ("k-25", "wd_regret", {"change": 0.05, "low": 0.02, "high": 0.08}),
-            ("complexity-10", "wd_regret", {"axis": "k", "change": 0.1, **ALONE}),
-        )
-    )
-    (still_open,) = (point for point in alpha.points if point.startswith("Not shown"))
-    assert "reward interval k (complexity-10: +0.10, a single pair, no interval)" in still_open
-
-
-def test_nothing_is_called_the_worst_beside_what_has_no_interval(analysis: Analysis):
-    assert "the worst" in findings(analysis)[0].points[0]
-    alone = contrasted(analysis, ("complexity-10", "wd_regret", {"change": 0.01, **ALONE}))
-    sure = findings(alone)[0].points[0]
-    assert "no interval rules it out of complexity L (complexity-10: +0.01, a single pair" in sure
-
-
-@pytest.mark.parametrize(
-    ("level", "words"),
-    [(0.95, "is about where the constant"), (1.25, "is worse than the constant")],
-)
-def test_the_words_say_where_a_broken_policy_ends_up(analysis: Analysis, level: float, words: str):
-    ended = contrasted(analysis, ("r_min-0_5", "wd_regret", {"level": level}))
-    assert f"At {level:.2f} it {words} action ½" in " ".join(findings(ended)[0].points)
-
-
-def test_the_words_say_when_runs_are_few(analysis: Analysis):
-    beta = findings(analysis)[1]
-    assert "an indication, not a finding" in beta.points[0]
-    assert any("as few as 3 pairs" in caveat for caveat in caveats(analysis))
-
-
-def test_the_words_say_when_the_worst_is_not_settled(finished: Path):
-    """Without r_min and k, what Alpha is left with makes hardly a difference."""
-    cut = without(finished, lambda p: p.class_name in ("r_min-0_5",) and p.algorithm == "Alpha")
-    alpha = findings(cut)[0]
-    assert "broken" not in alpha.headline
-    text = alpha.headline + " ".join(alpha.points)
-    assert "not settled" in text or "no proof of the contrary" in text or "though little" in text
-
-
-def test_the_words_claim_nothing_from_one_run(finished: Path):
-    cut = without(finished, lambda p: p.run > 0)
-    for finding in findings(cut):
-        assert finding.headline.startswith("No class has been shown")
-        assert finding.headline.endswith("That is no proof of the contrary.")
-        rows = [
-            row for row in cut.contrasts.itertuples()
-            if (row.algorithm, row.metric) == (finding.algorithm, "wd_regret")
-        ]  # fmt: skip
-        most = max(rows, key=lambda row: row.change)
-        assert finding.points[-1] == (
-            "A single pair of runs has no interval; the largest change of such a pair is "
-            f"+{most.change:.2f} ({most.class_name})."
-        )
-        assert not any("upper end" in point for point in finding.points)
-
-
-def test_the_words_keep_upper_ends_apart_from_changes_without_one(finished: Path):
-    cut = without(finished, lambda p: p.run > 0)
-    ends = {"change": 0.01, "low": -0.02, "high": 0.04, "pairs": 2}
-    alpha, _ = findings(contrasted(cut, ("k-25", "wd_regret", ends)))
-    assert alpha.headline.endswith("the intervals say what is still possible.")
-    assert alpha.points[-2] == "The largest upper end is +0.04."
-    assert alpha.points[-1].startswith("A single pair of runs has no interval")
-
-
-def test_the_words_say_when_there_is_nothing_to_contrast(finished: Path):
-    cut = without(finished, lambda p: p.class_name == "default")
-    assert [f.headline[:24] for f in findings(cut)] == [
-        "Nothing can be said of A",
-        "Nothing can be said of B",
-    ]
-
-
-def test_the_words_say_when_the_first_class_was_not_learnt(analysis: Analysis):
-    levels = analysis.levels.copy()
-    levels.loc[(levels.class_name == "default") & (levels.metric == "wd_regret"), "iqm"] = 0.97
-    for finding in findings(dataclasses.replace(analysis, levels=levels)):
-        assert "learnt next to nothing" in finding.points[0]
-
-
-def test_the_comparison_leaves_open_what_the_runs_leave_open(analysis: Analysis):
-    text = comparison(analysis)
-    assert "scores highest" in text
-    blurred = analysis.improvements.assign(low=0.1, high=0.9)
-    text = comparison(dataclasses.replace(analysis, improvements=blurred))
-    assert "leaves open which of the two is better" in text
-
-
-def test_the_comparison_says_who_was_trained_for_longer(analysis: Analysis):
-    assert "trained for" not in comparison(analysis)
-
-    runs = analysis.runs.copy()
-    runs.loc[runs.algorithm == "Alpha", "steps"] = 4000
-    text = comparison(dataclasses.replace(analysis, runs=runs))
-    assert text.startswith("Alpha was trained for 4,000 steps, Beta for 40. Over the 5 classes")
 
 
 def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):

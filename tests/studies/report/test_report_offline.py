@@ -1,4 +1,4 @@
-"""Learning from data in a study's report: made-up scores, and what is said of them."""
+"""Learning from data in a study's report, with synthetic scores."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.figures.offline import draw_offline
-from sme_registry.studies.report.findings import comparison
-from sme_registry.studies.report.offline import offline_words
+from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.offline_findings import Learner, offline_findings
 from sme_registry.studies.report.write import write_report
 
 CLASSES: dict[str, dict[str, Any]] = {"shallow": {}, "deep": {"complexity": 3}}
@@ -121,31 +121,50 @@ def test_settings_besides_nu_tell_learners_apart() -> None:
     ] * 2  # fmt: skip
 
 
-def test_words_say_who_imitates_who_surpasses_and_who_collapses(analysis: Analysis) -> None:
-    text = " ".join(offline_words(analysis))
-    assert "The behaviour policies are near 1 − ν/6 everywhere: +0.002 off at most" in text
-    assert "BC is near the behaviour policy at shallow (ν = 0, 0.5)" in text
-    assert "BC collapses on the deepest class, deep (2 values of ν, 10 runs)" in text
-    assert "IQL is nowhere near" in text
-    assert "surpass its data at shallow (ν = 0, 0.5), by +0.050." in text
-    assert "fall behind its data at deep (ν = 0, 0.5), by −0.400." in text
-    assert "IQL collapses on the deepest class" in text
-    assert "no more than 0.02 better than the constant ½" in text
-    assert "indication" not in text
+def of_learner(analysis: Analysis, name: str) -> Learner:
+    return next(each for each in offline_findings(analysis).learners if each.name == name)
+
+
+def places(found: Any) -> list[tuple[str, float]]:
+    return [(place.class_name, place.nu) for place in found]
+
+
+def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis: Analysis) -> None:
+    behaviour = offline_findings(analysis).behaviour
+    assert behaviour.far == ()
+    assert behaviour.farthest.difference == pytest.approx(0.002)
+    shallow, deep = (([(name, nu) for nu in NUS]) for name in CLASSES)
+    bc, iql = (of_learner(analysis, name) for name in ("BC", "IQL"))
+    assert (bc.verdict, iql.verdict) == ("near_at_some", "near_at_none")
+    assert places(bc.near) == shallow
+    assert iql.surpasses
+    assert places(iql.places["above"]) == shallow
+    assert [place.difference for place in iql.places["above"]] == pytest.approx([0.05, 0.05])
+    assert places(iql.places["below"]) == deep
+    assert [place.difference for place in iql.places["below"]] == pytest.approx([-0.4, -0.4])
+    for learner in (bc, iql):
+        assert learner.depth is not None
+        assert (learner.depth.verdict, learner.depth.class_name) == ("collapses", "deep")
+        assert (len(learner.depth.places), learner.depth.runs) == (2, 10)
+        assert not learner.depth.few_runs
+        assert not {"above_few", "below_few", "single_above"} & set(learner.places)
+    assert iql.depth is not None
+    assert places(iql.depth.at_constant) == deep
 
 
 @pytest.mark.parametrize("runs", [1, 3, 4])
-def test_of_few_runs_nothing_is_called_shown(
+def test_few_runs_give_indications_at_most(
     file: StudyFile, done: dict[str, CellResult], runs: int
 ) -> None:
     few = first_runs(file, done, runs)
     assert set(few.offline.low.isna()) == {runs < 4}
-    text = " ".join(offline_words(few))
-    assert "It is shown" not in text
-    assert ("All of its few runs surpass their data" in text) == (runs > 1)
-    assert ("A single run, no more than a hint" in text) == (runs == 1)
-    assert ("It has not been shown to surpass its data" in text) == (runs == 1)
-    assert "With so few runs this is an indication." in text
+    iql = of_learner(few, "IQL")
+    assert not {"above", "below"} & set(iql.places)
+    assert ("above_few" in iql.places) == (runs > 1)
+    assert ("single_above" in iql.places) == (runs == 1)
+    assert iql.surpasses == (runs > 1)
+    assert iql.depth is not None
+    assert iql.depth.few_runs
     (picture,) = draw_offline(few, ("svg",))
     assert ("there is no interval" in picture.caption) == (runs < 4)
     assert ("bootstrap intervals of the mean" in picture.caption) == (runs == 4)
@@ -156,15 +175,17 @@ def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
     pairs = set(zip(rows["first"], rows["second"], strict=True))
     learners = {("BC (0)", "IQL (0)"), ("BC (0.5)", "IQL (0.5)")}
     assert pairs == learners
-    text = comparison(analysis)
-    for nu in ("0", "0.5"):
-        assert f"of those on 1,000 transitions of ν = {nu}, BC ({nu}) scores highest" in text
-        assert f"A run of it beats one of IQL ({nu})" in text
-    assert text.count("A run of it beats") == 2
+    best = findings(analysis).best
+    assert [(b.algorithm, b.nu, b.transitions) for b in best] == [
+        ("BC (0)", 0.0, 1000), ("BC (0.5)", 0.5, 1000),
+    ]  # fmt: skip
+    assert [[rival.algorithm for rival in b.rivals] for b in best] == [["IQL (0)"], ["IQL (0.5)"]]
 
 
-def test_the_words_say_what_the_names_stand_for(analysis: Analysis) -> None:
-    assert "BC (0) learnt from data of ν = 0. The behaviour policy" in offline_words(analysis)[0]
+def test_findings_have_an_example_of_an_algorithm_and_its_nu(analysis: Analysis) -> None:
+    found = offline_findings(analysis)
+    assert (found.example, found.nu) == ("BC (0)", 0.0)
+    assert (found.fewest_runs, found.most_runs) == (5, 5)
 
 
 def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
@@ -209,7 +230,7 @@ def test_the_report_has_it_first_and_in_every_format(
     for ending in ("png", "pdf"):
         assert (out / "figures" / f"offline-improvement.{ending}").exists()
     page = (out / "index.html").read_text()
-    assert page.index('<section id="offline"') < page.index('<section id="words"')
+    assert page.index('<section id="offline"') < page.index('<section id="findings"')
     assert page.count('id="table-offline"') == page.count('id="figure-offline-improvement"') == 1
     for name in ("offline", "offline-improvement"):
         text = (out / "tables" / f"{name}.tex").read_text()
@@ -245,5 +266,5 @@ def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
     found = analyse(file, ledger.results(), draws=100)
     assert found.offline.empty
     assert not found.has_offline_runs
-    assert offline_words(found) == []
+    assert findings(found).offline is None
     assert draw_offline(found, ("svg",)) == []
