@@ -212,7 +212,6 @@ SYNONYMS = {
     "mean_similarity": "similarity",
     "error": "mae",
     "score": "similarity, or what a leaderboard ranks by",
-    "change": "improvement",
     "quality": "nu",
     "return": "episode_return",
 }

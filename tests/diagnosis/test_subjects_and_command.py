@@ -143,8 +143,8 @@ def test_the_command_accepts_any_policy_with_its_task(tmp_path: Path) -> None:
     against = sme("diagnose", "linear", "-t", "Default", "--against", "constant", *options)
     assert json.loads(against.stdout)["comparison"]["spec_fields"] == {}
     assert "--task Default" in refused("diagnose", "linear")
-    assert "needs --task" in refused("diagnose", tmp_path, "--set", "k=1")
-    assert "Give one of them" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
+    assert "--task" in refused("diagnose", tmp_path, "--set", "k=1")
+    assert "--cell" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
 
 
 def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ class AlgorithmFinding(StrictModel):
         the intervals of other axes allow a larger change; "only_axis" if no other was varied.
       rivals: those other axes.
       position: of the level on `worst.class_name` among the references; None without a linear one.
-      linear_wd_regret, base_linear_wd_regret: normalised regret of the linear policy there and on the
+      linear_wd_regret, base_linear_wd_regret: WD regret of the linear policy there and on the
         first class.
       harder_to_fit: whether the linear policy's regret rises by more than the threshold "hurt".
       also_worse: changes for the worse on other axes.
