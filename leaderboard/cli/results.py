@@ -258,7 +258,7 @@ def verify(
 
     from leaderboard.scoring.verify import verify as verify_board
 
-    with Progress("verifying", 1, console=err(), unit="rows", shown=not json) as progress:
+    with Progress("verifying", 1, console=err(), unit="rows", enabled=not json) as progress:
         report = verify_board(
             board, rescore=rescore, seed=seed, contains=contains, progress=progress.update_of
         )

@@ -109,7 +109,7 @@ def make(
 
     spec = load(task).derive(**changes(set_))
     with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
-        made = make_dataset(
+        dataset = make_dataset(
             spec,
             nu,
             mix=None if not mix else [_weighted(text) for text in mix],
@@ -124,10 +124,10 @@ def make(
             progress=progress.update_of,
         )
     if json:
-        print_json(_summary(made))
+        print_json(_summary(dataset))
     else:
-        _print(made)
-    err().print(f"wrote {escape(str(made.path))}{os.sep}", soft_wrap=True)
+        _print(dataset)
+    err().print(f"wrote {escape(str(dataset.path))}{os.sep}", soft_wrap=True)
 
 
 def _weighted(text: str) -> tuple[Any, float]:

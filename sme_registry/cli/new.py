@@ -58,7 +58,7 @@ def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
                 ],
             )
     hints = typing.get_type_hints(command, include_extras=True)
-    own = [
+    others = [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in inspect.signature(command).parameters.items()
         if name != "fields"
@@ -67,10 +67,10 @@ def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def with_options(**values: Any) -> None:
         texts = {name: values.pop(name) for name in options}
-        given = {name: json_or_text(text) for name, text in texts.items() if text is not None}
-        command(fields=given, **values)
+        fields = {name: json_or_text(text) for name, text in texts.items() if text is not None}
+        command(fields=fields, **values)
 
-    parameters = [own[0], *options.values(), *own[1:]]
+    parameters = [others[0], *options.values(), *others[1:]]
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_options.__annotations__ = {each.name: each.annotation for each in parameters}
     return with_options

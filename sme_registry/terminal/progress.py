@@ -30,7 +30,7 @@ class Progress:
       console: where to print; None for standard error. If it is no terminal, lines replace bars.
       unit: what a step is, in the plural.
       seconds_left: estimates the time left; by default it follows from the rate.
-      shown: False shows nothing.
+      enabled: False shows nothing.
     """
 
     def __init__(
@@ -42,12 +42,12 @@ class Progress:
         console: Console | None = None,
         unit: str = "steps",
         seconds_left: Callable[[], float] | None = None,
-        shown: bool = True,
+        enabled: bool = True,
     ) -> None:
         self._title, self._unit = title, unit
         self._total, self._done_before, self._done = total, done, done
         self._console = console or Console(stderr=True)
-        self._seconds_left, self._shown = seconds_left, shown
+        self._seconds_left, self._enabled = seconds_left, enabled
         self._note = self._printed = ""
         self._parts: dict[str, float] = {}
         self._start = self._last = self._printed_at = time.monotonic()
@@ -56,7 +56,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         self._start = self._last = time.monotonic()
-        if self._shown and self._console.is_terminal:
+        if self._enabled and self._console.is_terminal:
             self._bars = Bars(
                 TextColumn("{task.description}"),
                 BarColumn(bar_width=24),
@@ -80,7 +80,7 @@ class Progress:
         if self._bars is not None:
             self._draw()
             self._bars.stop()
-        elif self._shown and error is None and self._done_before < self._done >= self._total:
+        elif self._enabled and error is None and self._done_before < self._done >= self._total:
             self._print()
 
     def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
@@ -122,7 +122,7 @@ class Progress:
 
     def message(self, text: str) -> None:
         """Print a line of its own, above the bars."""
-        if self._shown:
+        if self._enabled:
             self._console.print(escape(text), highlight=False, soft_wrap=True)
 
     def _remove(self, name: str) -> None:
@@ -133,7 +133,7 @@ class Progress:
     def _refresh(self) -> None:
         now = time.monotonic()
         pause = SECONDS_BETWEEN_LINES if self._bars is None else _SECONDS_BETWEEN_BARS
-        if not self._shown or now - self._last < pause:
+        if not self._enabled or now - self._last < pause:
             return
         self._last = now
         if self._bars is not None:

@@ -64,7 +64,7 @@ def learn(
             current().write(folder)
 
     title, total = f"training {record.algorithm}", _total_steps(record, model, first_step)
-    with Progress(title, total, done=first_step, console=console, shown=progress) as bar:
+    with Progress(title, total, done=first_step, console=console, enabled=progress) as bar:
         callback = RunCallback(log, bar, save_checkpoint, record.checkpoint_every, names)
         try:
             if first_step < record.steps:

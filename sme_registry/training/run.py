@@ -227,7 +227,7 @@ def _evaluate(
 ) -> tuple[EvaluationReport, tuple[Path, ...]]:
     """Evaluate the trained model; write its report and the figures of the run."""
     states = record.protocol.states_per_region * len(record.protocol.edges)
-    with Progress("evaluating", states, console=console, unit="states", shown=progress) as bar:
+    with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
         report = evaluate(
             model,
             record.spec,

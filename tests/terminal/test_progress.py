@@ -60,7 +60,7 @@ def test_running_parts_are_named_in_a_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_nothing_is_printed_where_nothing_is_to_be_shown_or_done() -> None:
     text = io.StringIO()
-    with Progress("training", 10, console=Console(file=text), shown=False) as progress:
+    with Progress("training", 10, console=Console(file=text), enabled=False) as progress:
         progress.update(10)
     with Progress("scoring", 0, console=Console(file=text)):
         pass

@@ -50,24 +50,11 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
       OptionError: ν is missing, or a number is out of range.
       SpecError: so is the recipe or a hyperparameter; or D > 0, where episodes differ in length.
     """
-    begun = time.thread_time()
-    if cell.spec.D > 0:
-        raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
+    start = time.thread_time()
     settings: dict[str, Any] = dict(cell.hyperparameters)
-    if "nu" not in settings:
-        raise OptionError("hyperparameters.nu: is required. Give a number in [0, 1], such as 0.5.")
-    nu, transitions = settings.pop("nu"), settings.pop("transitions", TRANSITIONS)
+    nu: Any = settings.get("nu")
+    recipe = _recipe(cell, settings)
     batch_size = settings.pop("batch_size", BATCH_SIZE)
-    recipe = DatasetRecipe.from_dict(
-        {
-            "spec": cell.spec,
-            "behaviours": [{"kind": "mixture", "nu": nu, "weight": 1.0}],
-            "transitions": transitions,
-            "seed": cell.seed,
-            "protocol": cell.protocol,
-        },
-        "data set",
-    )
     data = collect(recipe, materialize(cell.spec), {})
     collected = time.thread_time()
     result = train_offline(
@@ -83,35 +70,58 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
         protocol=cell.protocol,
         progress=lambda done, total, _: progress(done, total),
     )
+    end = time.thread_time()
     record, T = result.record, cell.spec.horizon
-    ended = time.thread_time()
+    evaluations = record.evaluations
     training = record.cpu_ms_per_step * cell.steps / 1e3
     return CellResult(
         key=cell.digest,
         cell=cell,
         curve=LearningCurve(
-            steps=tuple(score.step for score in record.evaluations),
-            episode_return=tuple(score.episode_return for score in record.evaluations),
-            regret=tuple(1.0 - score.episode_return / T for score in record.evaluations),
-            similarity=tuple(score.similarity for score in record.evaluations),
-            length=(float(T),) * len(record.evaluations),
+            steps=tuple(each.step for each in evaluations),
+            episode_return=tuple(each.episode_return for each in evaluations),
+            regret=tuple(1.0 - each.episode_return / T for each in evaluations),
+            similarity=tuple(each.similarity for each in evaluations),
+            length=(float(T),) * len(evaluations),
         ),
         report=result.report,
         offline=OfflineResult(
             nu=nu,
-            transitions=transitions,
+            transitions=recipe.transitions,
             dataset_digest=record.dataset_digest,
             behaviour_similarity=record.behaviour.similarity,
             behaviour_similarity_sd=record.behaviour.similarity_sd,
             similarity=record.similarity,
-            similarity_sd=record.evaluations[-1].similarity_sd,
+            similarity_sd=evaluations[-1].similarity_sd,
         ),
         timing=Timing(
-            total=ended - begun,
+            total=end - start,
             training=training,
-            environment=collected - begun,
-            evaluation=max(0.0, ended - collected - training),
+            environment=collected - start,
+            evaluation=max(0.0, end - collected - training),
             steps_per_second=cell.steps / max(training, 1e-9),
         ),
         versions=record.versions,
+    )
+
+
+def _recipe(cell: Cell, settings: dict[str, Any]) -> DatasetRecipe:
+    """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`.
+
+    Raises:
+      OptionError, SpecError: see `run_offline`.
+    """
+    if cell.spec.D > 0:
+        raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
+    if "nu" not in settings:
+        raise OptionError("hyperparameters.nu: is required. Give a number in [0, 1], such as 0.5.")
+    return DatasetRecipe.from_dict(
+        {
+            "spec": cell.spec,
+            "behaviours": [{"kind": "mixture", "nu": settings.pop("nu"), "weight": 1.0}],
+            "transitions": settings.pop("transitions", TRANSITIONS),
+            "seed": cell.seed,
+            "protocol": cell.protocol,
+        },
+        "data set",
     )

@@ -123,7 +123,7 @@ class _StudyRun:
         executor: Executor,
         console: Console,
         retry_failed: bool,
-        shown: bool,
+        progress: bool,
     ) -> None:
         self._file, self._ledger, self._executor = file, ledger, executor
         self._planned = planned
@@ -146,7 +146,7 @@ class _StudyRun:
             console=console,
             unit="cells",
             seconds_left=self.seconds_left,
-            shown=shown,
+            enabled=progress,
         )
         ledger.warn = self._progress.message
 
