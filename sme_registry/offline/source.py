@@ -11,6 +11,7 @@ import numpy as np
 from sme_registry.datasets import Dataset, Transitions, open_dataset
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.evaluation import resolve_protocol
+from sme_registry.offline.record import BehaviourQuality
 from sme_registry.spec import EvaluationProtocol, ProtocolLike, SMESpec, SpecLike
 from sme_registry.task import Task, load_spec
 
@@ -35,6 +36,23 @@ class DataSource:
     protocol: EvaluationProtocol
     dataset_id: str | None
     recipe_digest: str | None
+
+    def record_fields(self) -> dict[str, Any]:
+        """The fields of an `OfflineRecord` that describe the data and the task."""
+        similarities, step_rewards = self.transitions.similarities, self.transitions.step_rewards
+        return {
+            "dataset": self.dataset_id,
+            "dataset_digest": self.transitions.digest,
+            "recipe_digest": self.recipe_digest,
+            "transitions": len(self.transitions),
+            "spec": self.spec,
+            "spec_digest": self.spec.digest,
+            "behaviour": BehaviourQuality(
+                similarity=float(similarities.mean()),
+                similarity_sd=float(similarities.std()),
+                step_reward=float(step_rewards.mean()),
+            ),
+        }
 
 
 def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None) -> DataSource:

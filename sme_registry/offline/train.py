@@ -34,7 +34,7 @@ from sme_registry.io import (
 )
 from sme_registry.offline.hyperparameters import ALGORITHMS, resolve_hyperparameters
 from sme_registry.offline.learn import Section, learn
-from sme_registry.offline.record import BehaviourQuality, Evaluation, OfflineRecord
+from sme_registry.offline.record import Evaluation, OfflineRecord
 from sme_registry.offline.source import check_task, data_source
 from sme_registry.spec import ProtocolLike, SpecLike
 from sme_registry.task import Task, materialize
@@ -133,14 +133,18 @@ def train_offline(
     )
     target = None if folder is None else claim_folder(folder, _FILES, force=force)
 
-    start, start_cpu, learning = time.perf_counter(), time.process_time(), 0.0
-    about = {
+    arguments: dict[str, Any] = {
         "algorithm": algorithm,
+        "hyperparameters": settings.to_dict(),
         "seed": seed,
         "steps": steps,
-        "dataset_digest": transitions.digest,
-        "spec_digest": source.spec.digest,
+        "batch_size": batch_size,
+        "episodes": episodes,
     }
+    data_fields = source.record_fields()
+    about = {name: arguments[name] for name in ("algorithm", "seed", "steps")}
+    about |= {name: data_fields[name] for name in ("dataset_digest", "spec_digest")}
+    start, start_cpu, learning = time.perf_counter(), time.process_time(), 0.0
     done: list[Evaluation] = []
 
     def report_progress(step: int) -> None:
@@ -154,19 +158,8 @@ def train_offline(
         states = start_states(seed, len(done), episodes, source.spec.state_dim)
         done.append(_evaluation(policy, task, states, section))
     record = OfflineRecord(
-        algorithm=algorithm,  # type: ignore[arg-type]
-        hyperparameters=settings.to_dict(),
-        seed=seed,
-        steps=steps,
-        batch_size=batch_size,
-        episodes=episodes,
-        dataset=source.dataset_id,
-        dataset_digest=transitions.digest,
-        recipe_digest=source.recipe_digest,
-        transitions=len(transitions),
-        spec=source.spec,
-        spec_digest=source.spec.digest,
-        behaviour=_behaviour(transitions),
+        **arguments,
+        **data_fields,
         evaluations=tuple(done),
         wall_seconds=round(time.perf_counter() - start, 3),
         cpu_seconds=round(time.process_time() - start_cpu, 3),
@@ -189,14 +182,6 @@ def _evaluation(
         similarity_sd=result.similarity_sd,
         episode_return=float(result.episode_return.mean()),
         losses=section.losses,
-    )
-
-
-def _behaviour(transitions: Transitions) -> BehaviourQuality:
-    return BehaviourQuality(
-        similarity=float(transitions.similarities.mean()),
-        similarity_sd=float(transitions.similarities.std()),
-        step_reward=float(transitions.step_rewards.mean()),
     )
 
 

@@ -38,7 +38,7 @@ def test_a_row_cut_short_and_rows_after_the_checkpoint_are_dropped(tmp_path: Pat
     assert read_episodes(path) == [episode(1), episode(2)]
 
 
-def test_a_csv_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_csv_with_other_columns_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "episodes.csv"
     path.write_text("a,b\n1,2\n")
     with pytest.raises(OptionError, match="columns"):

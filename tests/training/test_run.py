@@ -50,7 +50,7 @@ def test_the_record_describes_the_run(run: TrainingResult) -> None:
     assert record.steps_per_second == pytest.approx(150 / record.wall_seconds, rel=0.01)
 
 
-def test_the_logged_episodes_are_whole_and_their_regret_is_exact(run: TrainingResult) -> None:
+def test_logged_episodes_are_complete_and_their_regret_is_exact(run: TrainingResult) -> None:
     rows = list(csv.DictReader(io.StringIO((run.folder / "episodes.csv").read_text())))
     assert [int(row["episode"]) for row in rows] == [1, 2, 3, 4, 5, 6, 7]
     assert [int(row["step"]) for row in rows] == [20, 40, 60, 80, 100, 120, 140]
@@ -107,7 +107,7 @@ def test_on_policy_algorithms_finish_their_rollout_over_all_lanes(tmp_path: Path
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "DDPG"])
-def test_every_algorithm_trains_and_is_evaluated(algorithm: str, tmp_path: Path) -> None:
+def test_every_algorithm_trains(algorithm: str, tmp_path: Path) -> None:
     result = short(tmp_path / "run", algorithm=algorithm, steps=120, num_envs=2)
     assert result.report.policy == algorithm
     assert result.record.steps_done >= 120
@@ -126,7 +126,7 @@ def test_the_thread_count_of_torch_is_restored(run: TrainingResult, tmp_path: Pa
         torch.set_num_threads(before)
 
 
-def test_a_finished_run_is_refused_unless_forced(run: TrainingResult, tmp_path: Path) -> None:
+def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
     for resume in (False, True):
@@ -162,7 +162,7 @@ def test_a_folder_with_other_files_is_never_touched(force: bool, tmp_path: Path)
         ({"protocol": {"states": 4}}, "states=4"),
     ],
 )
-def test_bad_input_is_a_typed_error_and_makes_no_folder(
+def test_invalid_arguments_raise_typed_errors_and_create_no_folder(
     change: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SMEError, match=message):
@@ -189,7 +189,7 @@ def test_without_matplotlib_a_run_has_no_figures(
     assert result.record.status == "finished"
 
 
-def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_a_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
     with pytest.raises(OptionError, match="is a file"):
         short(tmp_path / "run")
@@ -203,7 +203,7 @@ def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
         ({"state_dim": 0}, SpecError),
     ],
 )
-def test_a_task_that_cannot_be_drawn_makes_no_folder(
+def test_a_task_that_cannot_be_drawn_creates_no_folder(
     task: Any, error: type[Exception], tmp_path: Path
 ) -> None:
     with pytest.raises(error):

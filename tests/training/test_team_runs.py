@@ -31,7 +31,7 @@ def team_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
     return train(TEAM, steps=1000, folder=folder, protocol=PROTOCOL, progress=False)
 
 
-def test_a_team_is_trained_by_ppo_and_the_record_says_how(team_run: TrainingResult) -> None:
+def test_a_team_is_trained_by_ppo_and_the_record_has_its_settings(team_run: TrainingResult) -> None:
     record = RunRecord.read(team_run.folder)
     assert record == team_run.record
     assert record is not None
@@ -110,9 +110,7 @@ def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
     assert (regrets[-2:].mean(axis=0) < 0.7 * regrets[:2].mean(axis=0)).all()
 
 
-def test_a_teams_run_that_stopped_goes_on_with_its_columns(
-    team_run: TrainingResult, tmp_path: Path
-) -> None:
+def test_a_teams_run_resumes_with_its_columns(team_run: TrainingResult, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     copy_files(team_run.folder, folder)
     team_run.record.updated(status="running").write(folder)
