@@ -21,20 +21,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import prod
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
-from leaderboard.artefact.wire import (
-    FIXED32,
-    FIXED64,
-    LENGTH,
-    VARINT,
-    Budget,
-    BudgetError,
-    WireError,
-    fields,
-    signed,
-    varints,
-)
+from leaderboard.artefact import schema
+from leaderboard.artefact.wire import Budget, BudgetError, WireError, fields, signed, varints
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
 
@@ -126,123 +116,6 @@ def inspect(data: bytes, observation_dim: int, action_dim: int) -> ModelFacts:
         ) from None
 
 
-class _Field(NamedTuple):
-    """A known field of a message: name, allowed wire types, and whether it may repeat."""
-
-    name: str
-    types: tuple[int, ...]
-    many: bool = False
-
-
-class _Rejected(NamedTuple):
-    """A field that is not allowed: the code, and what to do."""
-
-    name: str
-    code: str
-    remedy: str
-
-
-_Schema = dict[int, _Field | _Rejected]
-
-
-def _one(type: int, names: dict[int, str]) -> _Schema:
-    """Fields with one value: a number, or (`LENGTH`) text, bytes or a message."""
-    return {number: _Field(name, (type,)) for number, name in names.items()}
-
-
-def _many(type: int, names: dict[int, str]) -> _Schema:
-    """Fields that may repeat; numbers may also be packed."""
-    types = (type,) if type == LENGTH else (type, LENGTH)
-    return {number: _Field(name, types, many=True) for number, name in names.items()}
-
-
-def _rejected(reason: tuple[str, str], names: dict[int, str]) -> _Schema:
-    """Fields that are not allowed: code and remedy."""
-    return {number: _Rejected(name, *reason) for number, name in names.items()}
-
-
-_SUBGRAPH = "onnx_subgraph", "Export the network alone, its functions inlined"
-_SPARSE = "onnx_tensor", "Store it as a dense tensor"
-_NOT_PLAIN = "onnx_tensor", "Export the network as plain operators with tensors inside the file"
-_NO_TENSOR = "onnx_interface", "Export the network with plain tensors"
-_EXTERNAL = "onnx_external_data", "Export with external_data=False"
-
-_MODEL = {
-    **_one(VARINT, {1: "ir_version", 5: "model_version"}),
-    **_one(LENGTH, {2: "producer_name", 3: "producer_version", 4: "domain", 6: "doc_string"}),
-    **_one(LENGTH, {7: "graph"}),
-    **_many(LENGTH, {8: "opset_import", 14: "metadata_props"}),
-    **_rejected(_SUBGRAPH, {20: "training_info", 25: "functions"}),
-}
-_OPSET = {**_one(LENGTH, {1: "domain"}), **_one(VARINT, {2: "version"})}
-_GRAPH = {
-    **_one(LENGTH, {2: "name", 10: "doc_string"}),
-    **_many(LENGTH, {1: "node", 5: "initializer", 11: "input", 12: "output", 13: "value_info"}),
-    **_many(LENGTH, {16: "metadata_props"}),
-    **_rejected(_NOT_PLAIN, {14: "quantization_annotation"}),
-    **_rejected(_SPARSE, {15: "sparse_initializer"}),
-}
-_NODE = {
-    **_one(LENGTH, {3: "name", 4: "op_type", 6: "doc_string", 7: "domain"}),
-    **_many(LENGTH, {1: "input", 2: "output", 5: "attribute", 9: "metadata_props"}),
-    **_rejected(_SUBGRAPH, {8: "overload"}),
-}
-_ATTRIBUTE = {
-    **_one(LENGTH, {1: "name", 4: "s", 5: "t", 13: "doc_string"}),
-    **_one(FIXED32, {2: "f"}),
-    **_one(VARINT, {3: "i", 20: "type"}),
-    **_many(FIXED32, {7: "floats"}),
-    **_many(VARINT, {8: "ints"}),
-    **_many(LENGTH, {9: "strings"}),
-    **_rejected(_SUBGRAPH, {6: "g", 11: "graphs", 21: "ref_attr_name"}),
-    **_rejected(_NOT_PLAIN, {10: "tensors", 14: "tp", 15: "type_protos"}),
-    **_rejected(_SPARSE, {22: "sparse_tensor", 23: "sparse_tensors"}),
-}
-_TENSOR = {
-    **_one(VARINT, {2: "data_type", 14: "data_location"}),
-    **_one(LENGTH, {8: "name", 9: "raw_data", 12: "doc_string"}),
-    **_many(VARINT, {1: "dims", 5: "int32_data", 7: "int64_data"}),
-    **_many(FIXED32, {4: "float_data"}),
-    **_many(FIXED64, {10: "double_data"}),
-    **_many(LENGTH, {16: "metadata_props"}),
-    **_rejected(_NOT_PLAIN, {3: "segment", 6: "string_data", 11: "uint64_data"}),
-    **_rejected(_EXTERNAL, {13: "external_data"}),
-}
-_VALUE_INFO = {
-    **_one(LENGTH, {1: "name", 2: "type", 3: "doc_string"}),
-    **_many(LENGTH, {4: "metadata_props"}),
-}
-_VALUE_TYPE = {
-    **_one(LENGTH, {1: "tensor_type", 6: "denotation"}),
-    **_rejected(_NO_TENSOR, {4: "sequence_type", 5: "map_type", 7: "opaque_type"}),
-    **_rejected(_NO_TENSOR, {8: "sparse_tensor_type", 9: "optional_type"}),
-}
-_TENSOR_TYPE = {**_one(VARINT, {1: "elem_type"}), **_one(LENGTH, {2: "shape"})}
-_SHAPE = _many(LENGTH, {1: "dim"})
-_DIMENSION = {**_one(VARINT, {1: "dim_value"}), **_one(LENGTH, {2: "dim_param", 3: "denotation"})}
-
-# The field with an attribute's value, by the attribute's type.
-_ATTRIBUTE_VALUES = {1: "f", 2: "i", 3: "s", 4: "t", 6: "floats", 7: "ints", 8: "strings"}
-
-
-class _Type(NamedTuple):
-    """A type of tensors: its name, the bytes of an entry, and the field of data that is not raw."""
-
-    name: str
-    size: int
-    field: str
-
-
-_TYPES = {
-    1: _Type("float32", 4, "float_data"),
-    6: _Type("int32", 4, "int32_data"),
-    7: _Type("int64", 8, "int64_data"),
-    9: _Type("bool", 1, "int32_data"),
-    11: _Type("float64", 8, "double_data"),
-}
-_DATA = ("raw_data", *dict.fromkeys(type.field for type in _TYPES.values()))
-
-
 class _Inspection:
     """The inspection of one file: each method reads and checks one kind of message."""
 
@@ -254,7 +127,7 @@ class _Inspection:
         self._operators: set[str] = set()
 
     def model(self, data: memoryview, observation_dim: int, action_dim: int) -> ModelFacts:
-        model = self._read(data, _MODEL, "model")
+        model = self._read(data, schema.MODEL, "model")
         ir_version = model.get("ir_version", 0)
         if ir_version not in IR_VERSIONS:
             _refuse(
@@ -266,7 +139,7 @@ class _Inspection:
         opset = self._opset(model["opset_import"])
         if "graph" not in model:
             raise WireError("no graph")
-        graph = self._read(model["graph"], _GRAPH, "graph")
+        graph = self._read(model["graph"], schema.GRAPH, "graph")
         self._limit("nodes", len(graph["node"]), MAX_NODES)
         self._limit("tensors", len(graph["initializer"]), MAX_TENSORS)
         for node in graph["node"]:
@@ -288,7 +161,7 @@ class _Inspection:
         )
 
     def _opset(self, imports: list[memoryview]) -> int:
-        opsets = [self._read(each, _OPSET, "opset_import") for each in imports]
+        opsets = [self._read(each, schema.OPSET, "opset_import") for each in imports]
         domains = [bytes(each.get("domain", b"")) for each in opsets]
         if len(opsets) != 1 or domains[0] not in _ONNX_DOMAINS:
             _refuse(
@@ -308,7 +181,7 @@ class _Inspection:
         return version
 
     def _node(self, message: memoryview) -> None:
-        node = self._read(message, _NODE, "node")
+        node = self._read(message, schema.NODE, "node")
         domain, operator = bytes(node.get("domain", b"")), _text(node.get("op_type", b""))
         if domain not in _ONNX_DOMAINS:
             _refuse(
@@ -332,24 +205,26 @@ class _Inspection:
             self._attribute(attribute, operator)
 
     def _attribute(self, message: memoryview, operator: str) -> None:
-        attribute = self._read(message, _ATTRIBUTE, "attribute")
+        attribute = self._read(message, schema.ATTRIBUTE, "attribute")
         name = _text(attribute.get("name", b""))
         self._names("attribute", attribute.get("name", b""), *attribute["strings"])
         held = {
-            field for field in _ATTRIBUTE_VALUES.values() if attribute.get(field) not in (None, [])
+            field
+            for field in schema.ATTRIBUTE_VALUES.values()
+            if attribute.get(field) not in (None, [])
         }
-        expected = _ATTRIBUTE_VALUES.get(attribute.get("type", 0))
+        expected = schema.ATTRIBUTE_VALUES.get(attribute.get("type", 0))
         # An empty list has no field; a single value always has one.
         if expected is None or not held <= {expected} or not (held or expected.endswith("s")):
             raise WireError(f"attribute {name!r} of {operator} has a value of another type")
         if expected == "t":
             self._limit("tensors", self._tensors + 1, MAX_TENSORS)
             self._tensor(attribute["t"])
-        if operator == "Cast" and name == "to" and attribute.get("i") not in _TYPES:
+        if operator == "Cast" and name == "to" and attribute.get("i") not in schema.TYPES:
             _refuse_type("to", attribute.get("i"), "Cast")
 
     def _tensor(self, message: memoryview) -> None:
-        tensor = self._read(message, _TENSOR, "tensor")
+        tensor = self._read(message, schema.TENSOR, "tensor")
         name = _text(tensor.get("name", b""))
         self._names("tensor", tensor.get("name", b""))
         if tensor.get("data_location", 0) != 0:
@@ -359,7 +234,7 @@ class _Inspection:
                 "must be inside the file",
                 "Export with external_data=False",
             )
-        type = _TYPES.get(tensor.get("data_type", 0))
+        type = schema.TYPES.get(tensor.get("data_type", 0))
         if type is None:
             _refuse_type("data_type", tensor.get("data_type", 0), f"tensor {name!r}")
         dims = [signed(dim) for dim in self._integers(tensor["dims"])]
@@ -388,9 +263,9 @@ class _Inspection:
         self._tensors += 1
         self._parameters += entries
 
-    def _entries(self, tensor: dict[str, Any], type: _Type, name: str) -> int:
+    def _entries(self, tensor: dict[str, Any], type: schema.Type, name: str) -> int:
         """Number of entries in a tensor's data."""
-        held = [field for field in _DATA if tensor.get(field) not in (None, [])]
+        held = [field for field in schema.DATA if tensor.get(field) not in (None, [])]
         if not set(held) <= {"raw_data", type.field} or len(held) > 1:
             _refuse(
                 "onnx_tensor",
@@ -412,17 +287,17 @@ class _Inspection:
 
     def _value(self, message: memoryview) -> tuple[str, int, list[int | None]] | None:
         """Name, element type and shape (open lengths are None) of a value; None if untyped."""
-        value = self._read(message, _VALUE_INFO, "value")
+        value = self._read(message, schema.VALUE_INFO, "value")
         self._names("value", value.get("name", b""))
-        type = self._read(value.get("type", memoryview(b"")), _VALUE_TYPE, "type")
+        type = self._read(value.get("type", memoryview(b"")), schema.VALUE_TYPE, "type")
         if "tensor_type" not in type:
             return None
-        tensor = self._read(type["tensor_type"], _TENSOR_TYPE, "tensor_type")
-        shape = self._read(tensor.get("shape", memoryview(b"")), _SHAPE, "shape")
+        tensor = self._read(type["tensor_type"], schema.TENSOR_TYPE, "tensor_type")
+        shape = self._read(tensor.get("shape", memoryview(b"")), schema.SHAPE, "shape")
         self._limit("dimensions", len(shape["dim"]), MAX_RANK)
         lengths: list[int | None] = []
         for each in shape["dim"]:
-            dim = self._read(each, _DIMENSION, "dim")
+            dim = self._read(each, schema.DIMENSION, "dim")
             if "dim_value" in dim and "dim_param" in dim:
                 raise WireError("a dimension with a length and a symbol")
             length = signed(dim["dim_value"]) if "dim_value" in dim else None
@@ -443,18 +318,20 @@ class _Inspection:
         name, type, shape = value
         widths = (width,) if exact else (width, None)
         if type != _FLOAT or len(shape) != 2 or shape[0] is not None or shape[1] not in widths:
-            type_name = _TYPES[type].name if type in _TYPES else f"type {type}"
+            type_name = schema.TYPES[type].name if type in schema.TYPES else f"type {type}"
             lengths = ", ".join("any" if length is None else str(length) for length in shape)
             _refuse("onnx_interface", f"{what} {name!r}={type_name} [{lengths}]", allowed, remedy)
 
-    def _read(self, message: memoryview, schema: _Schema, where: str) -> dict[str, Any]:
+    def _read(self, message: memoryview, known: schema.Schema, where: str) -> dict[str, Any]:
         """The fields of a message by name; a list if they may repeat, else absent if missing."""
         read: dict[str, Any] = {
-            field.name: [] for field in schema.values() if isinstance(field, _Field) and field.many
+            field.name: []
+            for field in known.values()
+            if isinstance(field, schema.Field) and field.many
         }
         for number, type, value in fields(message, self._budget):
-            field = schema.get(number)
-            if isinstance(field, _Rejected):
+            field = known.get(number)
+            if isinstance(field, schema.Rejected):
                 _refuse(field.code, f"{where}.{field.name}", "not allowed", field.remedy)
             if field is None or type not in field.types:
                 raise WireError(f"unknown field {number} of wire type {type} in {where}")
@@ -502,7 +379,7 @@ def _refuse_type(field: str, value: int | None, where: str) -> NoReturn:
     _refuse(
         "onnx_tensor",
         f"{field}={value} of {where}",
-        f"must be one of {', '.join(type.name for type in _TYPES.values())}",
+        f"must be one of {', '.join(type.name for type in schema.TYPES.values())}",
         "Export the network in float32",
     )
 

@@ -1,0 +1,218 @@
+"""`make_bundle`: export the policies of training runs and sign a submission of them."""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from leaderboard.artefact.gate import inspect
+from leaderboard.bundle.reading import Bundle, digest_of
+from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
+from leaderboard.documents.board import hex_of
+from leaderboard.documents.checks import check_names, check_runs
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import (
+    ARTEFACTS,
+    FILE,
+    MAX_ARTEFACT_BYTES,
+    Artefact,
+    Knowledge,
+    SignedSubmission,
+    Submission,
+    Training,
+    now,
+)
+from leaderboard.errors import Rejection
+from sme_registry.errors import OptionError
+from sme_registry.io import build_folder, refuse_existing, write_atomically
+from sme_registry.spec import SuiteFile
+
+Progress = Callable[[int, int], None]
+
+_RANGES = {"unit": "[0, 1]", "symmetric": "[-1, 1]"}
+
+
+def make_bundle(
+    folder: str | os.PathLike[str],
+    *,
+    suite: SuiteFile,
+    key: SigningKey,
+    runs: Iterable[str | os.PathLike[str]],
+    method: str,
+    submitter: str,
+    version: str = "1",
+    family: str | None = None,
+    knowledge: Knowledge = "generic",
+    code: str | None = None,
+    statement: str = "",
+    runs_started: dict[str, int] | None = None,
+    training: Training | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Bundle:
+    """Export the policies of runs, and sign a submission of them.
+
+    Args:
+      folder: the bundle to write; written completely or not at all.
+      suite: the suite of the runs.
+      key: the submitter's key.
+      runs: folders that `sme train` wrote, folders that contain such folders, and tables. A
+        Stable-Baselines3 .zip can run code when it is loaded: give only files that you trust.
+      method: its name on the board.
+      submitter: the submitter's name on the board.
+      version: of the method.
+      family: the kind of method; None repeats the method's name.
+      knowledge: what the method knows of the task, as in `Method`.
+      code: a link to the method's code.
+      statement: notes for readers.
+      runs_started: all runs ever started with this method, by class; for other classes, the number
+        of listed runs.
+      training: facts of the training; None takes them from the records of the runs.
+      force: replace an existing bundle.
+      progress: called after each run with the number of finished runs and of all runs.
+
+    Returns:
+      The bundle, as `Bundle.read` reads it.
+
+    Raises:
+      OptionError: the folder exists, or a path in `runs` is none of the above.
+      SpecError, UnknownNameError: a table or record is invalid.
+      PolicyError: a model cannot be exported.
+      Rejection: the board would reject the submission, with the same code.
+      MissingDependencyError: exporting a .zip needs a package that is not installed.
+    """
+    folder = Path(folder)
+    _refuse_existing(folder, force)
+    listed = [run for path in runs for run in runs_of(Path(path), suite)]
+    refuse_other_specs(listed, suite)
+    fields = {
+        "suite": {"name": suite.versioned_name, "digest": suite.digest},
+        "method": {
+            "name": method,
+            "version": version,
+            "family": method if family is None else family,
+            "knowledge": knowledge,
+        },
+        "code": code,
+        "submitter": {"name": submitter, "key": key.public},
+        "runs_started": {**listed_by_class(listed, suite), **(runs_started or {})},
+        "training": _training_facts(listed) if training is None else training,
+        "statement": statement,
+    }
+    # Everything that does not depend on the policies is checked before they are exported.
+    unexported = _submission(fields, suite, listed, _placeholders(listed))
+    SignedSubmission.read(unexported.signed(key).to_bytes())
+    with build_folder(folder, force=force) as building:
+        (building / ARTEFACTS).mkdir()
+        artefacts = []
+        for done, run in enumerate(listed, start=1):
+            artefacts.append(_put_artefact(run, building))
+            if progress is not None:
+                progress(done, len(listed))
+        signed = _submission(fields, suite, listed, artefacts).signed(key)
+        write_atomically(building / FILE, signed.to_bytes())
+        Bundle.read(building)
+        _refuse_existing(folder, force)
+    return Bundle(folder, signed)
+
+
+def _submission(
+    fields: dict[str, Any],
+    suite: SuiteFile,
+    listed: list[SubmittedRun],
+    artefacts: Sequence[Artefact | None],
+) -> Submission:
+    """The submission of runs with these artefacts, checked as the board checks it."""
+    runs = [
+        {"spec": run.spec.digest, "seed": run.seed, "steps": run.steps, "artefact": artefact}
+        for run, artefact in zip(listed, artefacts, strict=True)
+    ]
+    submission = Submission.from_dict({**fields, "created": now(), "runs": runs})
+    check_names(submission)
+    check_runs(suite.suite, submission)
+    return submission
+
+
+def _training_facts(listed: list[SubmittedRun]) -> Training:
+    """Facts of the training from the records of the runs; empty without records."""
+    records = [run.record for run in listed if run.record is not None]
+    if not records:
+        return Training()
+    libraries, settings = set(), set()
+    for record in records:
+        versions = record.versions
+        names = ("stable_baselines3", "torch", "sme_registry", "python")
+        libraries.add(", ".join(f"{name} {versions[name]}" for name in names if name in versions))
+        settings.add(
+            f"{record.algorithm}, {record.hyperparameters}; actions in "
+            f"{_RANGES[record.action_range]}; num_envs={record.num_envs}"
+        )
+    seconds = [record.wall_seconds for record in records]
+    return Training(
+        library=_shortened("; ".join(sorted(libraries)), 200),
+        hyperparameters=_shortened("\n".join(sorted(settings)), 2000),
+        hardware=f"CPU; {statistics.median(seconds):,.0f} s a run (median of {len(records)}), "
+        f"{sum(seconds) / 3600:,.1f} h in total",
+    )
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def _placeholders(listed: list[SubmittedRun]) -> list[Artefact | None]:
+    """A distinct artefact for each policy that is not exported yet."""
+    return [
+        None if run.policy is None else Artefact(sha256=f"sha256:{number:064x}", size=1)
+        for number, run in enumerate(listed)
+    ]
+
+
+def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
+    """Write a run's policy into the bundle, named by its hash."""
+    if run.policy is None:
+        return None
+    try:
+        data = _policy_bytes(run, run.policy, bundle)
+        inspect(data, run.spec.state_dim + 2, run.spec.action_dim)
+    except Rejection as error:
+        raise Rejection(error.code, f"{run.source}: {error.message}") from error
+    artefact = Artefact(sha256=digest_of(data), size=len(data))
+    write_atomically(bundle / ARTEFACTS / f"{hex_of(artefact.sha256)}.onnx", data)
+    return artefact
+
+
+def _policy_bytes(run: SubmittedRun, policy: Path, bundle: Path) -> bytes:
+    if policy.suffix == ".zip":
+        from leaderboard.artefact.export_sb3 import export_sb3
+
+        exported = export_sb3(policy, bundle / "exported.onnx", spec=run.spec)
+        data = exported.read_bytes()
+        exported.unlink()
+        return data
+    try:
+        with policy.open("rb") as stream:
+            return stream.read(MAX_ARTEFACT_BYTES + 1)  # one more than `inspect` allows
+    except OSError as error:
+        raise OptionError(
+            f"{run.source}: policy={str(policy)!r}: cannot be read: {error.strerror}. "
+            "Correct the path."
+        ) from None
+
+
+def _refuse_existing(folder: Path, force: bool) -> None:
+    """Raise if the folder exists, unless `force` is set and it contains nothing but a bundle."""
+    refuse_existing(folder, force=force)
+    if not os.path.lexists(folder):
+        return
+    others = {folder.name}
+    if folder.is_dir() and not folder.is_symlink():
+        others = {path.name for path in folder.iterdir()} - {FILE, ARTEFACTS}
+    if others:
+        raise OptionError(
+            f"{folder}: is not a bundle, or contains other files, such as {min(others)!r}, and is "
+            "not replaced. Give another folder."
+        )
