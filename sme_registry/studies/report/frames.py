@@ -70,7 +70,7 @@ _REGION = """region:str epsilon_low epsilon_high states:int64 similarity similar
 _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str action_range:str
     steps:int64 state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
     hidden_width:int64 policy_init:str spec_seed:str spec_digest:str seed:int64 nu
-    transitions:Int64 dataset_digest:str behaviour_similarity behaviour_similarity_sd
+    transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 _CURVES = _PLACE + "step:int64 episode_return regret similarity length"
 _REFERENCES = {

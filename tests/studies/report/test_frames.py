@@ -87,13 +87,6 @@ def test_the_documentation_names_every_column(loaded: studies.StudyFrames) -> No
     assert not {*loaded.results, *loaded.curves} - documented
 
 
-def test_frames_survive_csv(loaded: studies.StudyFrames, tmp_path: Path) -> None:
-    loaded.results.to_csv(tmp_path / "results.csv", index=False)
-    read = pd.read_csv(tmp_path / "results.csv").astype(loaded.results.dtypes)
-    numbers = loaded.results.select_dtypes("number").columns
-    pd.testing.assert_frame_equal(read[numbers], loaded.results[numbers], rtol=0, atol=0)
-
-
 def test_a_folder_without_a_study_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="holds no study"):
         studies.load(tmp_path)
