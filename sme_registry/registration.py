@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from sme_registry.envs.team import SMETeamEnv
-    from sme_registry.spec import SMESpec
+    from sme_registry.spec import SMESpec, SpecLike
 
 _ENTRY_POINT = "sme_registry.envs:SMEEnv"
 _VECTOR_ENTRY_POINT = "sme_registry.envs:SMEVectorEnv"
@@ -190,9 +190,7 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
     )
 
 
-def make(
-    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
-) -> gymnasium.Env[Any, Any]:
+def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """`gymnasium.make` for an id, a digest, a path or a spec.
 
     Args:
@@ -210,7 +208,7 @@ def make(
 
 
 def make_vec(
-    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str],
+    spec_or_id: SpecLike,
     num_envs: int = 1,
     **kwargs: Any,
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
@@ -237,9 +235,7 @@ def _makeable(spec_or_id: Any) -> str | EnvSpec:
     return env_spec(spec_or_id)
 
 
-def make_parallel(
-    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
-) -> SMETeamEnv:
+def make_parallel(spec_or_id: SpecLike, **kwargs: Any) -> SMETeamEnv:
     """The team of an id, a digest, a path or a spec as a PettingZoo parallel environment.
 
     Args:
@@ -254,9 +250,7 @@ def make_parallel(
     return parallel_env(spec_or_id, **kwargs)
 
 
-def make_aec(
-    spec_or_id: SMESpec | dict[str, Any] | str | os.PathLike[str], **kwargs: Any
-) -> AECEnv[str, Any, Any]:
+def make_aec(spec_or_id: SpecLike, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """The same as a PettingZoo AEC environment: agents act in turn, the step is joint.
 
     Args:

@@ -43,7 +43,7 @@ QUANTITIES = {
     "best_constant_normalised_regret": "normalised regret of the best constant policy",
     "random_normalised_regret": "normalised regret of random actions",
     "constant_similarity": "similarity of the constant policy ½",
-    "final_return": "episode_return of a run's last evaluation",
+    "final_return": "mean return of a run's last evaluations, in % of the optimum's",
     "offline_similarity": "similarity of an offline policy over its last evaluation's episodes",
     "offline_similarity_sd": "its standard deviation over steps",
     "improvement": "offline_similarity − behaviour_similarity",
