@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -29,7 +28,7 @@ from leaderboard.store.objects import Objects
 from leaderboard.store.queue import Queue
 from leaderboard.store.usage import Usage
 from sme_registry.errors import UnknownNameError
-from sme_registry.io import sync_folder, temporary_beside
+from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, Suite
 
 
@@ -76,7 +75,8 @@ class Store:
           The board's store, opened for writing.
 
         Raises:
-          BoardError: the folder is in use or cannot be created, or the suite does not fit a board.
+          BoardError: the folder exists and is not empty, or the suite does not fit a board.
+          OptionError: the folder cannot be created.
           SpecError: a field is invalid.
         """
         key = SigningKey.generate()
@@ -93,19 +93,11 @@ class Store:
         )
         _refuse_unfit(document)
         path = Path(path)
-        # Built under a temporary name and renamed, so that no folder ever holds half a board.
-        building = Folder(temporary_beside(path.absolute()))
-        try:
-            _write_board(building, document, key)
-            os.rename(building.path, path)
-            sync_folder(path.absolute().parent)
-        except OSError as error:
-            raise BoardError(
-                f"{path}: cannot create a board here: {error.strerror}. Choose a new folder."
-            ) from None
-        finally:
-            if building.path.exists():
-                shutil.rmtree(building.path)
+        is_empty = path.is_dir() and not any(path.iterdir())
+        if os.path.lexists(path) and not is_empty:
+            raise BoardError(f"{path}: already exists. Choose a new folder for the board.")
+        with build_folder(path, force=is_empty) as building:
+            _write_board(Folder(building), document, key)
         return cls.open(path)
 
     @classmethod
@@ -321,7 +313,6 @@ def _write_board(folder: Folder, document: BoardDocument, key: SigningKey) -> No
     key.write(folder.key)
     write_document(folder.board, document, new=True)
     Log(folder, key.public).append(key, EMPTY, "opened", document.digest, digest_of(document))
-    sync_folder(folder.path)
 
 
 def _refuse_unknown(id: str) -> NoReturn:
