@@ -38,6 +38,7 @@ from leaderboard.intake import submit_bundle, submit_references
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store
+from sme_registry.errors import SMEError
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, Suite, SuiteFile, catalogue
 
 SETTING = {"state_dim": 2, "action_dim": 2, "policy_init": "unit_variance"}
@@ -143,11 +144,11 @@ def make_board(
     ):
         submit_references(store)
         key = SigningKey.generate()
-        for method in runs or METHODS:
+        for index, method in enumerate(runs or METHODS):
             print(f"{method} …", file=sys.stderr, flush=True)
             source = runs[method] if runs else train_all(Path(temporary, method), suite, method)
             make_bundle(
-                Path(temporary, "bundles", method),
+                Path(temporary, f"bundle-{index}"),
                 suite=suite,
                 key=key,
                 runs=[source],
@@ -155,7 +156,7 @@ def make_board(
                 submitter=submitter,
                 training=None if runs else Training(library=f"numpy {np.__version__}"),
             )
-            submit_bundle(store, Path(temporary, "bundles", method))
+            submit_bundle(store, Path(temporary, f"bundle-{index}"))
     run_scorers(out, 2)
     verify(out)
 
@@ -191,4 +192,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except SMEError as error:
+        sys.exit(str(error))

@@ -1,4 +1,4 @@
-"""Bundles: read with care whatever lies in the folder, and made whole or not at all."""
+"""Bundles: reading untrusted folders, and building completely or not at all."""
 
 from __future__ import annotations
 

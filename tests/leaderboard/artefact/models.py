@@ -37,7 +37,7 @@ def model(
     opsets=(("", 17),),
     ir_version=8,
 ) -> ModelProto:
-    """A model from `o` [batch, 4] to `a` [batch, 2] unless told otherwise."""
+    """A model from `o` [batch, 4] to `a` [batch, 2], by default."""
     graph = helper.make_graph(
         nodes,
         "policy",

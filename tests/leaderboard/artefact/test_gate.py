@@ -69,7 +69,7 @@ def test_every_opset_from_13_to_23_passes(opset):
 
 
 @pytest.mark.parametrize("domain", ["", "ai.onnx"])
-def test_onnx_own_domain_passes_under_both_its_names(domain):
+def test_both_names_of_onnx_own_domain_pass(domain):
     accepted(linear(opsets=[(domain, 17)]))
 
 
@@ -107,7 +107,7 @@ def torch():
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("algorithm", ["PPO", "TD3", "SAC"])
-def test_actors_of_stable_baselines3_exported_by_torch_pass_and_act_alike(torch, algorithm):
+def test_exported_stable_baselines3_actors_pass_and_act_as_before(torch, algorithm):
     sb3 = pytest.importorskip("stable_baselines3")
     spec = SMESpec(state_dim=2, action_dim=2)
     env = sme_registry.make(spec, action_range="symmetric")
@@ -308,7 +308,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_a_bad_file_is_refused_with_its_code(kind):
+def test_a_bad_file_is_rejected_with_its_code(kind):
     found, code = BAD[kind]
     assert rejection(found).code == code
 
@@ -319,7 +319,7 @@ def test_every_truncation_of_a_good_file_is_refused():
         rejection(data[:length])
 
 
-def test_a_file_over_the_size_limit_is_refused_unread():
+def test_a_file_above_the_size_limit_is_rejected_unread():
     assert rejection(bytes(MAX_ARTEFACT_BYTES + 1)).code == "too_large"
 
 
@@ -374,7 +374,7 @@ def test_a_flood_is_refused_within_a_second_and_in_little_memory(kind):
     assert peak < 32 * 2**20
 
 
-def test_deep_nesting_is_no_recursion():
+def test_deep_nesting_is_rejected_without_recursion():
     inner = b""
     for _ in range(2000):
         inner = length_prefixed(0x32, length_prefixed(0x0A, length_prefixed(0x2A, inner)))
@@ -382,7 +382,7 @@ def test_deep_nesting_is_no_recursion():
     assert rejection(data).code == "onnx_malformed"
 
 
-def test_a_strangers_name_moves_no_cursor_in_a_message():
+def test_names_in_messages_are_printable():
     found = rejection(squashed([node("\x1b[2J<script>\n", "y", "a")]))
     assert "\x1b" not in found.message
     assert "\n" not in found.message

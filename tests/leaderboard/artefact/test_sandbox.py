@@ -205,19 +205,19 @@ FAILING = {
 
 
 @pytest.mark.parametrize("kind", FAILING)
-def test_what_goes_wrong_in_a_run_has_its_code(kind, isolation):
+def test_a_failing_run_has_its_code(kind, isolation):
     found, expected = FAILING[kind]
     inspect(found.SerializeToString(), OBSERVATION, ACTION)  # the gate cannot see it
     assert code_of(found) in ((expected,) if isinstance(expected, str) else expected)
 
 
-def test_an_order_of_summation_is_no_dependence_on_the_batch():
+def test_another_order_of_summation_passes_the_check_of_rows():
     wide = models.network(hidden=2000)
     with opened(wide) as policy:
         policy.check_rows(observations(1000))
 
 
-def test_a_single_row_that_peeks_is_found_by_another_order():
+def test_a_row_that_reads_another_is_detected_in_reverse_order():
     # Row 1 has the action of row 0, in any batch that has one; it is not among those asked alone.
     found = squashed(
         [
@@ -238,7 +238,7 @@ def test_a_single_row_that_peeks_is_found_by_another_order():
     assert code_of(found, rows=100) == "run_batch_dependent"
 
 
-def test_random_actions_are_no_function_of_the_state(ungated):
+def test_random_actions_are_rejected(ungated):
     found = squashed([node("RandomUniformLike", "y", "a")])
     assert code_of(found) == "run_batch_dependent"
 
@@ -258,7 +258,7 @@ def test_an_endless_loop_is_stopped_without_the_gate(isolation, ungated):
     assert time.monotonic() - begun < 60.0  # it ends; how soon is the machine's business
 
 
-def test_waiting_for_an_answer_has_an_end(ungated):
+def test_an_answer_that_takes_too_long_is_rejected(ungated):
     limits = SandboxLimits(cpu_seconds=60, call_seconds=0.5)
     assert code_of(models.looping(), limits) == "run_time"
 
@@ -275,11 +275,11 @@ def test_external_data_cannot_be_read_without_the_gate(isolation, ungated, tmp_p
 
 
 @pytest.mark.parametrize("data", [b"", b"no model", b"\x08\x08" * 1000], ids=repr)
-def test_bytes_that_are_no_model_hurt_nobody_without_the_gate(isolation, ungated, data):
+def test_invalid_bytes_are_rejected_without_the_gate(isolation, ungated, data):
     assert code_of(data) in ("onnx_refused", "run_failed")
 
 
-def test_the_gate_is_asked_before_any_process_is_started(monkeypatch):
+def test_the_gate_runs_before_any_process_starts(monkeypatch):
     monkeypatch.setattr(sandbox, "_start", lambda *arguments: pytest.fail("a process was started"))
     with pytest.raises(Rejection, match="onnx_malformed"):
         opened(b"no model")
@@ -305,7 +305,7 @@ def test_no_process_outlives_its_sandbox(isolation, ungated):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_the_child_learns_nothing_and_can_do_nothing(monkeypatch):
+def test_the_child_has_no_environment_no_files_and_no_rights(monkeypatch):
     monkeypatch.setenv("SECRET", "do not tell")
     monkeypatch.setattr(sandbox, "_bwrap", tuple)
     with open(__file__) as kept_open, opened(linear()) as policy:
@@ -366,7 +366,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("kind", LIES)
-def test_a_child_that_was_taken_over_cannot_hurt_its_parent(kind, monkeypatch):
+def test_a_compromised_child_cannot_harm_its_parent(kind, monkeypatch):
     script, expected = LIES[kind]
     monkeypatch.setattr(sandbox, "_bwrap", tuple)
     acting_as(LOADED + script, monkeypatch)
@@ -375,14 +375,14 @@ def test_a_child_that_was_taken_over_cannot_hurt_its_parent(kind, monkeypatch):
     assert code_of(linear(), limits, rows) == expected
 
 
-def test_a_child_that_writes_without_end_is_read_no_further(monkeypatch):
+def test_endless_output_of_a_child_is_not_read(monkeypatch):
     monkeypatch.setattr(sandbox, "_bwrap", tuple)
     acting_as(LOADED + "\nwhile True: os.write(1, bytes(2**16))", monkeypatch)
     with pytest.raises(Rejection, match="invalid"), opened(linear()) as policy:
         policy(observations(8))
 
 
-def test_a_child_that_cannot_start_is_no_fault_of_the_model(monkeypatch):
+def test_a_child_that_cannot_start_does_not_reject_the_model(monkeypatch):
     monkeypatch.setattr(sandbox, "_bwrap", tuple)
     limits = SandboxLimits(start_seconds=0.5)
     for script in ("raise SystemExit(3)", "import time; time.sleep(60)"):
@@ -391,14 +391,14 @@ def test_a_child_that_cannot_start_is_no_fault_of_the_model(monkeypatch):
             opened(linear(), limits)
 
 
-def test_a_child_killed_from_outside_is_no_fault_of_the_model(isolation):
+def test_a_child_killed_from_outside_does_not_reject_the_model(isolation):
     with opened(linear()) as policy:
         os.killpg(policy._process.pid, signal.SIGKILL)
         with pytest.raises(BoardError, match="not caused by the model"):
             policy(observations(3))
 
 
-def test_a_closed_sandbox_says_so_and_closes_twice():
+def test_a_closed_sandbox_raises_and_closes_twice():
     policy = opened(linear())
     policy.close()
     policy.close()
@@ -434,7 +434,7 @@ def alive(pid):
         return False
 
 
-def test_without_onnxruntime_the_remedy_is_said(monkeypatch):
+def test_a_missing_onnxruntime_is_an_error_with_the_install_command(monkeypatch):
     sandbox._library_folders.cache_clear()
     monkeypatch.setattr(sandbox.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(sandbox, "_bwrap", tuple)
@@ -488,7 +488,7 @@ def test_mutated_files_run_or_are_rejected():
     assert found["onnx_malformed"] >= count / 50
 
 
-def test_other_systems_are_told_that_the_sandbox_needs_linux(monkeypatch):
+def test_other_systems_raise_an_error_that_names_linux(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     with pytest.raises(BoardError, match=r"sys.platform='darwin': .* needs Linux"):
         opened(linear())

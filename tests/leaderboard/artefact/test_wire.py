@@ -28,7 +28,7 @@ def read(data, budget=1000):
 
 
 @given(st.integers(-(2**63), 2**63 - 1), st.text(), st.lists(st.floats(width=32), max_size=5))
-def test_it_reads_what_googles_library_writes(i, name, floats):
+def test_it_reads_messages_of_googles_library(i, name, floats):
     message = AttributeProto(name=name, i=i, floats=floats)
     found = read(message.SerializeToString())
     assert [(number, type) for number, type, _ in found] == [
@@ -59,13 +59,13 @@ def test_it_reads_what_googles_library_writes(i, name, floats):
         (b"\x0f", "wire type 7"),
     ],
 )
-def test_bytes_that_are_no_message_are_refused(data, message):
+def test_invalid_messages_are_rejected(data, message):
     with pytest.raises(WireError, match=message):
         read(data)
 
 
 @given(st.binary(max_size=64))
-def test_any_bytes_are_read_or_refused(data):
+def test_any_bytes_are_read_or_rejected(data):
     try:
         read(data)
     except WireError:

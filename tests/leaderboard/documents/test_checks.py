@@ -218,12 +218,12 @@ def test_a_time_that_does_not_exist_is_refused(created):
 
 
 def test_a_run_on_another_spec_is_refused():
-    stranger = "sha256:" + "1" * 64
+    unknown = "sha256:" + "1" * 64
     refused(
         "unknown_spec",
-        f"runs.3.spec={stranger}: must be the digest of one of the suite's 3 instances "
+        f"runs.3.spec={unknown}: must be the digest of one of the suite's 3 instances "
         r"\(`sme show two-v1`\)",
-        runs=[*RUNS, run(stranger)],
+        runs=[*RUNS, run(unknown)],
     )
 
 
@@ -312,7 +312,7 @@ def test_the_most_runs_of_a_submission_fit_and_a_tenth_more_do_not():
     assert len(signed_runs(BOARD, most)) <= MAX_BYTES < len(signed_runs(BOARD, most + most // 10))
 
 
-def test_a_board_that_nobody_could_submit_to_is_refused(tmp_path):
+def test_a_board_whose_suite_exceeds_a_submission_is_refused(tmp_path):
     most = most_runs(BOARD)
     refuse_unsubmittable(board_of(most))
     with pytest.raises(BoardError, match=rf"suite=two-v1: .* {most + 1} runs.*at most {most},"):
@@ -343,7 +343,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize("first", range(len(FAULTS)))
-def test_of_several_faults_the_first_in_order_is_told(first):
+def test_the_first_of_several_faults_is_reported(first):
     changes, runs = {}, list(RUNS)
     for _, fault in FAULTS[first:]:
         if isinstance(fault, dict):

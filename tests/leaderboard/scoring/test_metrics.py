@@ -26,7 +26,7 @@ def runs_of(classes: int, runs: int, metrics: int = 1, seed: int = 0) -> dict[st
 # One run
 
 
-def test_metrics_of_a_run_are_those_written_out_by_hand() -> None:
+def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
     found = run_metrics(
         (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
     )
@@ -87,7 +87,7 @@ def test_iqm_is_scipys_trimmed_mean(runs: int) -> None:
     np.testing.assert_allclose(iqm(values), trim_mean(values, 0.25, axis=0), rtol=1e-13)
 
 
-def test_giving_up_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm(
+def test_failing_one_class_of_six_moves_theta_ten_times_as_far_as_the_pooled_iqm(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     rng = np.random.default_rng(0)
@@ -168,7 +168,7 @@ def test_runs_that_agree_leave_no_interval_and_one_run_adds_none() -> None:
     np.testing.assert_array_equal(high, [0.75, 0.75])
 
 
-def test_an_interval_holds_its_score() -> None:
+def test_an_interval_contains_its_score() -> None:
     for seed in range(50):
         classes = runs_of(2, 3, metrics=4, seed=seed)
         low, high = bootstrap(classes, 100, "a")
@@ -177,7 +177,7 @@ def test_an_interval_holds_its_score() -> None:
 
 
 @pytest.mark.parametrize("name", ["normal", "lognormal(1)", "two humps 80:20", "20 % failed"])
-def test_intervals_hold_the_truth_and_do_not_part_equal_methods(
+def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000)
@@ -204,7 +204,7 @@ def test_the_bootstrap_of_a_board_takes_well_under_a_second(
     assert seconds < 1.0
 
 
-def test_the_bootstrap_of_many_runs_holds_little_memory() -> None:
+def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
     classes = runs_of(1, 1000, metrics=11)
 
     tracemalloc.start()
@@ -218,7 +218,7 @@ def test_the_bootstrap_of_many_runs_holds_little_memory() -> None:
 # Ranks
 
 
-def test_ranks_are_what_counting_every_pair_gives() -> None:
+def test_ranks_match_counting_every_pair() -> None:
     rng = np.random.default_rng(5)
     for _ in range(200):
         ends = np.sort(rng.integers(0, 12, size=(rng.integers(1, 15), 2)), axis=1)

@@ -85,7 +85,7 @@ def reference(sequence: int, name: str, regret: float, **fields: Any) -> EntryRo
 REFERENCES = [reference(1, "optimal", 0.0), reference(2, "constant", 1.0)]
 
 
-def test_entries_stand_in_order_with_the_ranks_that_their_intervals_leave_open() -> None:
+def test_entries_are_ordered_with_the_ranks_that_their_intervals_allow() -> None:
     entries = [
         entry(3, scores(0.50, 0.6)),
         entry(4, scores(0.20, 0.6)),
@@ -115,13 +115,13 @@ def test_each_metric_has_its_own_order() -> None:
     assert orders == {"wd_regret": [3, 4, 5], "ood_regret": [5, 4, 3], "ood_decay": [5, 4, 3]}
 
 
-def test_equal_scores_stand_in_the_order_in_which_they_came() -> None:
+def test_equal_scores_are_in_order_of_submission() -> None:
     entries = [entry(sequence, scores(0.3, 0.4)) for sequence in (9, 4, 7)]
 
     assert [row.entry.sequence for row in ranking(entries, "wd_regret")] == [4, 7, 9]
 
 
-def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> None:
+def test_unranked_entries_have_a_reason_and_take_no_rank() -> None:
     entries = [
         *REFERENCES,
         entry(3, scores(0.1, 0.2), enough_runs=False),
@@ -138,7 +138,7 @@ def test_what_is_not_ranked_is_listed_with_the_reason_and_takes_no_rank() -> Non
     ]
 
 
-def test_what_has_not_certainly_learned_has_no_rank_by_decay() -> None:
+def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay() -> None:
     unsure, sure = entry(3, scores(0.46, 0.46)), entry(4, scores(0.45, 0.6))
 
     rows = ranking([unsure, sure], "ood_decay")
@@ -150,7 +150,7 @@ def test_what_has_not_certainly_learned_has_no_rank_by_decay() -> None:
     assert [row.first for row in ranking([unsure, sure], "wd_regret")] == [1, 1]
 
 
-def test_only_what_is_scored_and_stands_is_there() -> None:
+def test_only_scored_entries_are_listed() -> None:
     entries = [
         entry(3, status="waiting"),
         entry(4, status="rejected", code="schema"),
@@ -181,7 +181,7 @@ def test_a_thousand_entries_are_ranked_in_less_than_50_ms(
 # The reference rows
 
 
-def test_a_board_whose_reference_rows_hold_is_published() -> None:
+def test_a_board_with_right_reference_rows_is_publishable() -> None:
     nearly = [reference(1, "optimal", 9e-7), reference(2, "constant", 1 - 9e-7)]
 
     refuse_unpublishable(REFERENCES)
@@ -202,7 +202,7 @@ def test_without_both_reference_rows_nothing_is_published(left: int) -> None:
         refuse_unpublishable([REFERENCES[left], entry(3, scores(0.1, 0.2))])
 
 
-def test_a_submission_that_calls_itself_optimal_is_no_reference_row() -> None:
+def test_a_submission_named_optimal_is_not_a_reference_row() -> None:
     impostor = replace(REFERENCES[0], reference=False)
 
     with pytest.raises(NotPublishable, match="'optimal': missing"):
@@ -210,7 +210,7 @@ def test_a_submission_that_calls_itself_optimal_is_no_reference_row() -> None:
 
 
 @pytest.mark.parametrize("status", ["waiting", "rejected", "withdrawn"])
-def test_a_reference_row_that_is_not_scored_holds_everything_back(status: Any) -> None:
+def test_a_reference_row_that_is_not_scored_blocks_publication(status: Any) -> None:
     with pytest.raises(NotPublishable, match=f"{status}: must be scored"):
         refuse_unpublishable([REFERENCES[0], replace(REFERENCES[1], status=status)])
 
@@ -218,7 +218,7 @@ def test_a_reference_row_that_is_not_scored_holds_everything_back(status: Any) -
 @pytest.mark.parametrize("name", ["wd_regret", "ood_regret", "ood_decay", "regret_slope", 0, 3, 5])
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("off", [2e-6, -2e-6])
-def test_a_reference_row_off_in_any_region_or_metric_holds_everything_back(
+def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(
     which: int, name: str | int, off: float
 ) -> None:
     rows = list(REFERENCES)
@@ -275,7 +275,7 @@ def test_no_cell_of_the_csv_is_a_formula() -> None:
     assert '"a;=1+1 =2"' in text  # whole in its quotes, where semicolons split cells, too
 
 
-def test_text_that_is_a_negative_number_is_no_number_in_the_csv() -> None:
+def test_text_that_looks_like_a_negative_number_stays_text_in_the_csv() -> None:
     lines = list(
         csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)))
     )
@@ -287,7 +287,7 @@ def test_text_that_is_a_negative_number_is_no_number_in_the_csv() -> None:
 @pytest.mark.parametrize(
     "start", ["=", "+", "-", "@", "\t=", " =", "\r=", "＝", "|", "%", "\x00=", "\u202e="]
 )
-def test_no_text_that_a_spreadsheet_may_run_begins_a_cell(start: str) -> None:
+def test_no_cell_begins_with_a_formula(start: str) -> None:
     rows = ranking([entry(3, scores(0.1, 0.2), submitter=f"{start}cmd")], "wd_regret")
 
     (line,) = csv.DictReader(io.StringIO(to_csv(rows, "wd_regret", BOARD, HEAD, DATE)))
@@ -309,7 +309,7 @@ def test_the_csv_has_every_score_with_its_interval() -> None:
     assert float(found["normalised_regret_5_high"]) == pytest.approx(0.25)
 
 
-def test_latex_shows_what_was_written_and_runs_none_of_it() -> None:
+def test_latex_commands_in_names_are_escaped() -> None:
     text = to_latex(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)
 
     line = next(line for line in text.splitlines() if "passwd" in line)
@@ -339,7 +339,7 @@ def test_the_json_has_the_whole_scores() -> None:
 
 
 @pytest.mark.parametrize("write", [to_csv, to_latex, to_json])
-def test_every_file_says_what_it_is_of(write: Any) -> None:
+def test_every_export_names_its_suite_protocol_and_log(write: Any) -> None:
     text = write(hostile_rows(), "wd_regret", BOARD, HEAD, DATE).replace(r"\_", "_")
 
     for said in (

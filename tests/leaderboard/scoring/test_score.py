@@ -202,7 +202,7 @@ def test_failed_and_unlisted_runs_score_one() -> None:
     assert shallow.wd_regret == 1.0
 
 
-def test_to_withhold_the_runs_that_decay_most_improves_no_metric() -> None:
+def test_omitting_the_runs_with_the_largest_decay_improves_no_metric() -> None:
     levels = [high for _, high in BOARD.protocol.edges]
 
     def run(class_name: str, slope: float) -> RunScore:
@@ -245,7 +245,7 @@ def test_ranking_needs_enough_runs_in_each_class() -> None:
     assert score(None, None, None, runs_started={"deep": 2}).enough_runs
 
 
-def test_a_policy_that_stands_twice_is_scored_once() -> None:
+def test_a_policy_that_is_listed_twice_is_scored_once() -> None:
     opened: list[str] = []
     calls: list[tuple[int, int]] = []
 
@@ -266,9 +266,7 @@ def test_a_policy_that_stands_twice_is_scored_once() -> None:
         (as_bytes(models.model([models.node("Abs", "o", "a")])), "run_output"),
     ],
 )
-def test_an_artefact_that_is_refused_rejects_the_submission_and_is_named(
-    policy: bytes, code: str
-) -> None:
+def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy: bytes, code: str) -> None:
     result = score(LINEAR, policy, LINEAR)
 
     assert (result.status, result.code) == ("rejected", code)
@@ -279,7 +277,7 @@ def test_an_artefact_that_is_refused_rejects_the_submission_and_is_named(
     assert result.runs == ()
 
 
-def test_an_action_that_depends_on_its_batch_in_an_outer_region_alone_is_found() -> None:
+def test_dependence_on_the_batch_in_an_outer_region_is_detected() -> None:
     far = models.tensor("far", np.float32(1.3))
     policy = as_bytes(
         models.squashed(
@@ -314,7 +312,7 @@ def test_a_class_without_runs_is_refused() -> None:
     assert "'deep'" in result.message
 
 
-def test_a_number_of_runs_that_nobody_started_is_refused_before_anything_is_made_of_it() -> None:
+def test_too_many_started_runs_are_rejected_before_scoring() -> None:
     opened: list[str] = []
 
     result = score(LINEAR, LINEAR, LINEAR, opened=opened, runs_started={"deep": 10**12})
@@ -325,7 +323,7 @@ def test_a_number_of_runs_that_nobody_started_is_refused_before_anything_is_made
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
-def test_what_stops_the_scorer_is_no_fault_of_the_submission(error: type[BaseException]) -> None:
+def test_errors_of_the_scorer_do_not_reject_the_submission(error: type[BaseException]) -> None:
     def stop(done: int, total: int) -> None:
         raise error
 
@@ -342,7 +340,7 @@ def children() -> list[int]:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds its children in /proc")
-def test_a_sandbox_ended_from_outside_judges_nothing() -> None:
+def test_a_sandbox_ended_from_outside_does_not_reject_the_submission() -> None:
     before = set(children())
 
     def end_it(done: int, total: int) -> None:
@@ -383,7 +381,7 @@ def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
     )
 
 
-def test_versions_are_those_that_the_numbers_come_from_not_what_else_is_loaded(
+def test_versions_are_of_packages_that_the_numbers_depend_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     alone = score(LINEAR, None, None)

@@ -13,7 +13,7 @@ REGRET = {"optimal": 0.0, "constant": 1.0}
 
 
 @given(st.lists(finite, max_size=5))
-def test_a_scale_holds_every_value_between_round_ends(values):
+def test_a_scale_covers_every_value_with_round_ends(values):
     scale = charts.Scale.covering(*values)
     assert scale.low < scale.high
     assert 2 <= len(scale.ticks) <= 8
@@ -34,7 +34,7 @@ def test_a_number_has_a_true_minus_and_no_negative_zero(value, text):
     assert charts.number(value) == text
 
 
-def test_a_bar_spans_its_interval_and_bears_its_value():
+def test_a_bar_spans_its_interval_and_marks_its_value():
     scale = charts.Scale.covering(0.0, 1.0)
     lines = charts.reference_lines(scale, REGRET)
     bar = ElementTree.fromstring(
@@ -47,13 +47,13 @@ def test_a_bar_spans_its_interval_and_bears_its_value():
     assert bar.find("line[@class='constant']").get("x1") == "97.00%"
 
 
-def test_a_sparkline_says_its_numbers():
+def test_a_sparkline_has_its_numbers_as_text():
     spark = charts.sparkline([0.1, 0.25, 0.4], charts.Scale.covering(0.0, 1.0))
     assert "0.10, 0.25, 0.40" in ElementTree.fromstring(spark).get("aria-label")
     assert len(re.search(r'points="([^"]*)"', spark)[1].split()) == 3
 
 
-def test_a_profile_of_many_regions_labels_only_some_of_them():
+def test_a_chart_of_many_regions_labels_only_some():
     edges = [(0.0, 0.0), *((m / 100, (m + 1) / 100) for m in range(100))]
     profile = [Estimate(value=0.1, low=0.0, high=0.2)] * len(edges)
     chart = ElementTree.fromstring(charts.regret_chart(profile, edges, "x"))
@@ -62,7 +62,7 @@ def test_a_profile_of_many_regions_labels_only_some_of_them():
     assert len(list(chart.iter("circle"))) == len(edges)
 
 
-def test_a_profile_has_a_title_and_a_description_and_escapes_the_name():
+def test_a_chart_has_a_title_and_a_description_and_escapes_the_name():
     profile = [Estimate(value=0.1, low=0.0, high=0.2)] * 2
     chart = charts.regret_chart(profile, [(0, 0), (0, 1)], "<b>&\"'")
     drawn = ElementTree.fromstring(chart)

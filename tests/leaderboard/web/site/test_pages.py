@@ -95,7 +95,7 @@ def pages(site):
     return found
 
 
-def test_no_page_has_inline_script_style_or_an_element_that_we_do_not_use(pages):
+def test_no_page_has_inline_script_or_style_or_unexpected_elements(pages):
     for name, page in pages.items():
         for tag, attributes in page.elements:
             assert tag in ALLOWED, (name, tag)
@@ -122,7 +122,7 @@ def test_every_page_has_landmarks_a_title_one_heading_and_no_id_twice(pages):
         assert set(named) <= set(ids), name
 
 
-def test_tables_have_captions_scopes_and_boxes_that_the_keyboard_reaches(pages):
+def test_tables_have_captions_scopes_and_focusable_boxes(pages):
     for name, page in pages.items():
         assert all("scope" in attributes for attributes in page.all("th")), name
         drawn = [a for a in page.all("table") if "data-table" not in a]
@@ -136,7 +136,7 @@ def test_tables_have_captions_scopes_and_boxes_that_the_keyboard_reaches(pages):
             ), name
 
 
-def test_every_link_leads_to_a_file_of_the_site_or_to_https(pages, site):
+def test_every_link_targets_a_file_of_the_site_or_https(pages, site):
     followed = Counter()
     for name, page in pages.items():
         for tag, attributes in page.elements:
@@ -159,7 +159,7 @@ def test_every_link_leads_to_a_file_of_the_site_or_to_https(pages, site):
     assert followed["outside"] == 2 * 3 + 2  # two entries have a link: on each board, on their page
 
 
-def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
+def test_the_board_states_its_digests_and_what_it_proves(pages, board):
     store, _ = board
     for name in ("index.html", "ood_regret.html", "ood_decay.html"):
         words = pages[name].words
@@ -173,7 +173,7 @@ def test_the_board_says_what_it_proves_and_of_what_it_is(pages, board):
     assert "Ranked only where" not in pages["index.html"].words
 
 
-def test_the_method_page_says_how_failures_and_intervals_count(pages):
+def test_the_method_page_defines_failures_and_intervals(pages):
     words = pages["method.html"].words
     assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
     assert "gains nothing" not in words
@@ -181,7 +181,7 @@ def test_the_method_page_says_how_failures_and_intervals_count(pages):
     assert "best value there is" not in pages["ood_decay.html"].words  # D may be negative
 
 
-def test_the_log_page_says_what_a_kept_digest_is_good_for(pages, board):
+def test_the_log_page_explains_the_use_of_a_kept_digest(pages, board):
     words = pages["log.html"].words
     assert "verify BOARD --contains DIGEST" in words
     assert "Removing entries at the end leaves none" in words
@@ -216,7 +216,7 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
     assert all('class="bar"' in row and 'class="spark"' in row for _, _, row in rows)
 
 
-def test_what_has_not_learned_is_listed_by_decay_and_not_ranked(site):
+def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
     rows = {name: (rank, row) for rank, name, row in rows_of((site / "ood_decay.html").read_text())}
     rank, row = rows["A method with quite a long name (ensemble of 16 critics)"]
     assert rank == "–"
@@ -224,7 +224,7 @@ def test_what_has_not_learned_is_listed_by_decay_and_not_ranked(site):
     assert rows["SAC"][0] == "2–4"
 
 
-def test_entries_without_a_place_stand_below_with_their_status(pages):
+def test_submissions_that_are_not_scored_are_listed_below_with_their_status(pages):
     words = pages["index.html"].words
     below = words[words.index("Waiting, rejected and withdrawn") :]
     assert re.search(r"Broken 0\.1.*rejected onnx_op", below)
@@ -233,7 +233,7 @@ def test_entries_without_a_place_stand_below_with_their_status(pages):
 
 
 @pytest.mark.parametrize("kind", ["sac", "rejected", "waiting", "gone"])
-def test_the_page_of_a_submission_says_what_became_of_it(kind, board, pages, site):
+def test_the_page_of_a_submission_shows_its_status(kind, board, pages, site):
     store, ids = board
     digits = hex_of(ids[kind])
     words = pages[f"submissions/{digits}.html"].words
@@ -282,7 +282,7 @@ def test_runs_that_were_started_and_not_listed_are_shown(board, pages):
     assert words.count("not listed") == words.count("none: scores 1") == 3
 
 
-def test_the_json_files_are_what_was_signed_and_found(board, site):
+def test_the_json_files_are_the_signed_submission_and_its_result(board, site):
     store, ids = board
     digits = hex_of(ids["sac"])
     signed = (site / f"submissions/{digits}.json").read_bytes()
@@ -315,7 +315,7 @@ def test_only_https_becomes_a_link():
         assert rows.https_only(link) is None
 
 
-def test_the_comparison_has_every_entry_that_stands_and_no_other(board, site):
+def test_the_comparison_has_exactly_the_scored_entries(board, site):
     store, ids = board
     text = (site / "board-data.js").read_text()
     data = json.loads(text.removeprefix("window.boardData = ").removesuffix(";\n"))
@@ -388,16 +388,16 @@ def test_a_server_reads_the_same_bytes_as_the_folder_holds(board, site):
         "board.xml",
     ],
 )
-def test_what_is_not_of_the_site_is_not_found(board, path):
+def test_other_paths_are_not_found(board, path):
     assert Pages(board[0]).read(path) is None
 
 
-def test_a_result_that_is_not_there_is_not_found(board):
+def test_a_missing_result_is_not_found(board):
     store, ids = board
     assert Pages(store).read(f"results/{hex_of(ids['waiting'])}.json") is None
 
 
-def test_nothing_is_written_of_a_board_whose_references_are_off(tmp_path):
+def test_a_board_with_wrong_references_writes_no_pages(tmp_path):
     with Store.create(
         tmp_path / "board",
         title="No references",
@@ -416,7 +416,7 @@ def test_nothing_is_written_of_a_board_whose_references_are_off(tmp_path):
         assert Pages(store).read("static/board.css")
 
 
-def test_a_folder_that_cannot_be_written_to_is_an_error_that_says_so(board, tmp_path):
+def test_a_folder_that_is_not_writable_is_an_error(board, tmp_path):
     (tmp_path / "site").write_text("a file")
     with pytest.raises(BoardError, match="cannot be written"):
         write_site(board[0], tmp_path / "site")
@@ -452,7 +452,7 @@ def test_pages_never_replace_a_boards_own_files(tmp_path, out):
         assert not list(tmp_path.rglob("*.html"))
 
 
-def test_pages_may_lie_in_a_board_and_beside_it(tmp_path):
+def test_pages_may_be_in_a_board_or_next_to_it(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         for out in (tmp_path / "board" / "site", tmp_path):
             for _ in range(2):  # the site's own board.json makes no board of its folder
@@ -478,7 +478,7 @@ def test_a_long_log_has_pages_and_full_ones_never_change(board, monkeypatch):
     assert Page(pages.log()).all("nav")[1]["aria-label"] == "Pages of the log"
 
 
-def test_an_empty_board_is_a_page_that_says_so(tmp_path):
+def test_an_empty_board_has_a_page(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         page = Page(Pages(store).board("wd_regret"))
     assert "No entry is ranked yet." in page.words
