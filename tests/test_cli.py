@@ -672,6 +672,14 @@ def test_the_installed_command_answers_in_pure_json_on_standard_output() -> None
     assert len(json.loads(process.stdout)) > 30
 
 
+@pytest.mark.parametrize("arguments", [("list",), ("show", "TeamBlind4"), ("show", "Défaut")])
+def test_output_is_utf8_where_the_system_has_another_encoding(arguments: tuple[str, ...]) -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252"}  # a pipe on Windows
+    process = subprocess.run([*SME, *arguments], capture_output=True, check=False, env=environment)
+    assert "Traceback" not in process.stderr.decode()
+    assert (process.stdout + process.stderr).decode().isascii() is False
+
+
 def test_the_exit_code_and_the_one_line_reach_the_shell() -> None:
     process = subprocess.run([*SME, "show", "Defalt"], capture_output=True, check=False, text=True)
     assert process.returncode == 2

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sme_registry.cli.arguments import Json
-from sme_registry.cli.list import study_table
+from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import PlannedCell, StudyFile, catalogue
 from sme_registry.spec.resolve import is_path
@@ -135,20 +135,10 @@ def plan(
 
 def _list_plans(json: bool) -> None:
     files = catalogue.entries(StudyFile)
-    if not json:
+    if json:
+        print_json([{**summary(file), "cells": len(file.plan.cells)} for file in files])
+    else:
         out().print(study_table(files))
-        return
-    print_json(
-        [
-            {
-                "name": file.versioned_name,
-                "digest": file.digest,
-                "cells": len(file.plan.cells),
-                "description": file.description,
-            }
-            for file in files
-        ]
-    )
 
 
 def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 from importlib import metadata
@@ -29,6 +30,7 @@ class CommandGroup(TyperGroup):
     def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line, and exit with its exit code."""
         options |= {"standalone_mode": False, "prog_name": self.program}
+        _use_utf8()
         try:
             code = super().main(*args, **options)
             sys.stdout.flush()
@@ -83,6 +85,13 @@ def version_option(program: str) -> Any:
             raise typer.Exit
 
     return typer.Option("--version", callback=show, is_eager=True, help="Show the version.")
+
+
+def _use_utf8() -> None:
+    """Print UTF-8 also where the system's default is another encoding, as in pipes on Windows."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() != "utf-8":
+            stream.reconfigure(encoding="utf-8")
 
 
 def _discard_output() -> int:
