@@ -313,6 +313,7 @@ def test_every_verdict_has_words_on_the_page(analysis: Analysis):
         text = text_of(page(analysis, everything, [], ["No maps."], []))
         assert "None" not in text
         assert not re.search(r"\(\s|\s[,.;:)]|\.\.|,,", text)
+        assert not re.search(r"\d[a-z]{3}|[a-z½)](?=[0-9A-Z½])", text[: text.index("Tables")])
         algorithms = algorithms[:1]  # the others were rendered once
     assert "No algorithm" in text_of(
         page(analysis, found.model_copy(update={"algorithms": ()}), [], [], [])
