@@ -6,7 +6,6 @@ from sme_registry.evaluation.policies import (
     Policy,
     TeamPolicy,
     as_policy,
-    load_onnx,
     load_sb3,
 )
 from sme_registry.evaluation.references import reference_policy
@@ -27,7 +26,6 @@ __all__ = [
     "TeamPolicy",
     "as_policy",
     "evaluate",
-    "load_onnx",
     "load_sb3",
     "reference_policy",
     "resolve_protocol",

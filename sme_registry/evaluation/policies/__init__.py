@@ -6,7 +6,6 @@ callable · Stable-Baselines3 model or .zip · .onnx file · .npz file of an off
 
 from sme_registry.evaluation.policies.forms import as_policy
 from sme_registry.evaluation.policies.npz import OfflinePolicy
-from sme_registry.evaluation.policies.onnx import load_onnx
 from sme_registry.evaluation.policies.policy import Policy
 from sme_registry.evaluation.policies.sb3 import load_sb3
 from sme_registry.evaluation.policies.team import Member, TeamPolicy
@@ -17,6 +16,5 @@ __all__ = [
     "Policy",
     "TeamPolicy",
     "as_policy",
-    "load_onnx",
     "load_sb3",
 ]

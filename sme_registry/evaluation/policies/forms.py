@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.policies.policy import Interface, Policy, prepare
+from sme_registry.evaluation.policies.interface import Interface
+from sme_registry.evaluation.policies.policy import Policy, prepare
 from sme_registry.evaluation.policies.team import TeamPolicy, separate_policies, shared_policy
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object

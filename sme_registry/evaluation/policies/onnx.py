@@ -12,18 +12,16 @@ from typing import Any
 
 from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import MissingDependencyError, PolicyError
+from sme_registry.evaluation.policies.interface import Interface
 
 
-def load_onnx(
-    path: str | os.PathLike[str], dims: tuple[int, int], of: str = "this task"
-) -> Callable[[Observations], Any]:
+def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[Observations], Any]:
     """Load an ONNX file's network, on one thread of the CPU.
 
     Args:
-      path: an .onnx file with one float32 input `[B, dims[0]]` and one output `[B, dims[1]]`.
-        It runs in this process without limits.
-      dims: entries of an observation, and of an action.
-      of: what these widths belong to, for the error message.
+      path: an .onnx file with one float32 input `[B, O]` and one output `[B, A]`. It runs in this
+        process without limits.
+      interface: O, A, and what they belong to.
 
     Returns:
       Its actions, as a function of observations.
@@ -57,7 +55,10 @@ def load_onnx(
             "with an opset from 13 to 23, or pass a callable."
         ) from error
     for what, ends, width in zip(
-        ("input", "output"), (session.get_inputs(), session.get_outputs()), dims, strict=True
+        ("input", "output"),
+        (session.get_inputs(), session.get_outputs()),
+        interface[:2],
+        strict=True,
     ):
         actual = ", ".join(f"{end.name} {end.type} {end.shape}" for end in ends)
         # A length that is not a number is dynamic, and known only when the network runs.
@@ -68,8 +69,8 @@ def load_onnx(
         ):
             raise PolicyError(
                 f"{path}: its {what}s are {actual or 'none'}: must be one tensor(float) "
-                f"[batch, {width}] for {of}, the batch of any size. Evaluate it on the task it was "
-                "trained for, and export it with a dynamic batch axis."
+                f"[batch, {width}] for {interface.description}, the batch of any size. Evaluate it "
+                "on the task it was trained for, and export it with a dynamic batch axis."
             )
     observation = session.get_inputs()[0].name
     return lambda observations: session.run(None, {observation: observations})[0]

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import ActionError, PolicyError
 from sme_registry.evaluation.policies import sb3
+from sme_registry.evaluation.policies.interface import Interface
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.policies.onnx import load_onnx
 from sme_registry.spec import ActionRange
@@ -66,24 +67,6 @@ class Policy:
             ) from error
 
 
-class Interface(NamedTuple):
-    """What a policy must map from and to.
-
-    Attributes:
-      observation_dim: entries of an observation.
-      action_dim: entries of an action.
-      description: what these widths belong to, such as "state_dim=3, action_dim=2".
-      alternatives: other forms that are allowed, for the error message.
-      hint: see `Policy`.
-    """
-
-    observation_dim: int
-    action_dim: int
-    description: str
-    alternatives: str = ""
-    hint: str = ""
-
-
 def prepare(
     policy: Any, interface: Interface, *, action_range: str | None = None, name: str | None = None
 ) -> Policy:
@@ -114,8 +97,7 @@ def prepare(
         name = Path(policy).stem if name is None else name
         policy = _load(Path(policy), interface)
     if hasattr(policy, "predict"):
-        dims = interface.observation_dim, interface.action_dim
-        sb3.check_spaces(policy, dims, interface.description)
+        sb3.check_spaces(policy, interface)
         act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
     elif callable(policy):
         act, action_range = policy, action_range or "unit"
@@ -136,16 +118,16 @@ def prepare(
 
 
 def _load(path: Path, interface: Interface) -> Any:
-    dims, description = (interface.observation_dim, interface.action_dim), interface.description
     if path.suffix == ".onnx":
-        return load_onnx(path, dims, description)
+        return load_onnx(path, interface)
     if path.suffix == ".npz":
         policy = OfflinePolicy.load(path)
-        if (policy.observation_dim, policy.action_dim) != dims:
+        if (policy.observation_dim, policy.action_dim) != interface[:2]:
             raise PolicyError(
                 f"{path}: maps observations [B, {policy.observation_dim}] to actions "
-                f"[B, {policy.action_dim}]: must be [B, {dims[0]}] and [B, {dims[1]}] for "
-                f"{description}. Evaluate it on the task it was trained for."
+                f"[B, {policy.action_dim}]: must be [B, {interface.observation_dim}] and "
+                f"[B, {interface.action_dim}] for {interface.description}. "
+                "Evaluate it on the task it was trained for."
             )
         return policy
     return sb3.load_sb3(path)

@@ -18,6 +18,7 @@ import numpy as np
 
 from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import MissingDependencyError, PolicyError
+from sme_registry.evaluation.policies.interface import Interface
 
 _LOW = {"unit": 0.0, "symmetric": -1.0}
 
@@ -98,18 +99,18 @@ def predictor(model: Any) -> Callable[[Observations], Any]:
     return act
 
 
-def check_spaces(model: Any, dims: tuple[int, int], of: str) -> None:
+def check_spaces(model: Any, interface: Interface) -> None:
     """Check that a model has these widths of observations and actions and no normaliser.
 
     Raises:
       PolicyError: it does not.
     """
-    for what, width in zip(("observation", "action"), dims, strict=True):
+    for what, width in zip(("observation", "action"), interface[:2], strict=True):
         shape = getattr(getattr(model, f"{what}_space", None), "shape", (width,))
         if shape != (width,):
             raise PolicyError(
-                f"policy: its {what}s have shape {shape}: must be {(width,)} for {of}. "
-                "Evaluate it on the task it was trained for."
+                f"policy: its {what}s have shape {shape}: must be {(width,)} for "
+                f"{interface.description}. Evaluate it on the task it was trained for."
             )
     normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
     if getattr(normaliser, "norm_obs", False):

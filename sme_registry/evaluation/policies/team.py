@@ -19,7 +19,8 @@ import numpy as np
 from sme_registry.envs.shared import shared_observation_of
 from sme_registry.envs.types import Observation as Observations
 from sme_registry.errors import PolicyError, did_you_mean
-from sme_registry.evaluation.policies.policy import Interface, Policy, prepare
+from sme_registry.evaluation.policies.interface import Interface
+from sme_registry.evaluation.policies.policy import Policy, prepare
 from sme_registry.spec import ActionRange, SMESpec
 from sme_registry.task import draw
 from sme_registry.task.draw import Array
