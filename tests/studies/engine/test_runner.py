@@ -68,10 +68,10 @@ def study(tmp_path: Path) -> Path:
 
 
 def quick(file: Any, folder: Path, **options: Any) -> tuple[Any, str]:
-    """Run in this process; the status, and what was said."""
-    said = io.StringIO()
-    options = {"executor": "in-process", "console": Console(file=said, width=200)} | options
-    return run_study(file, folder, **options), said.getvalue()
+    """Run in this process; the status, and the output."""
+    output = io.StringIO()
+    options = {"executor": "in-process", "console": Console(file=output, width=200)} | options
+    return run_study(file, folder, **options), output.getvalue()
 
 
 def driver(study: Path, notes: Path, seeds: int, open_for: int = 0) -> subprocess.Popen[str]:
@@ -87,13 +87,13 @@ def keys(file: Any) -> set[str]:
 
 def test_every_cell_is_run_once_and_running_again_runs_nothing(study: Path, notes: Path) -> None:
     file, work = small_file(seeds=3), partial(cells.noted, notes)
-    status, said = quick(file, study, run=work)
+    status, output = quick(file, study, run=work)
     assert (status.count("done"), len(status.cells)) == (3, 3)
     assert set(Ledger(study).results()) == keys(file)
-    assert "3 cells · 3 to run · 1 at once" in said
-    again, said = quick(file, study, run=work)
+    assert "3 cells · 3 to run · 1 at once" in output
+    again, output = quick(file, study, run=work)
     assert again == status
-    assert "3 finished before and reused · 0 to run" in said
+    assert "3 finished before and reused · 0 to run" in output
     assert set(cells.starts(notes).values()) == {1}
 
 
@@ -118,17 +118,17 @@ def test_a_process_of_each_cell_gives_the_same_results_with_one_thread(
 
 def test_a_cell_that_raises_is_listed_with_its_error_and_retried_on_request(study: Path) -> None:
     file = small_file(seeds=3)
-    status, said = quick(file, study, run=cells.raising)
+    status, output = quick(file, study, run=cells.raising)
     assert [status.count(state) for state in ("done", "failed", "waiting")] == [2, 1, 0]
     (broken,) = status.failed
     assert broken.planned.run == 1
     assert broken.failure is not None
     assert broken.failure.error == "ValueError: this one is broken"
     assert "in raising" in broken.failure.traceback
-    assert "failed: constant on small, run 1: ValueError: this one is broken" in said
+    assert "failed: constant on small, run 1: ValueError: this one is broken" in output
 
-    status, said = quick(file, study, run=cells.raising)
-    assert "1 failed before (--retry runs them again) · 0 to run" in said
+    status, output = quick(file, study, run=cells.raising)
+    assert "1 failed before (--retry runs them again) · 0 to run" in output
     status, _ = quick(file, study, run=cells.raising, retry_failed=True)
     assert status.failed[0].failure.attempts == 2
     status, _ = quick(file, study, retry_failed=True)
@@ -207,11 +207,11 @@ def test_two_runs_on_one_folder_share_the_cells_and_each_is_run_once(
             cells.wait_for(lambda: sum(cells.starts(notes).values()) == 4)
             assert study_status(study).count("running") == 4
             (notes / cells.GATE).touch()
-            said = [process.communicate(timeout=120)[1] for process in (one, two)]
+            output = [process.communicate(timeout=120)[1] for process in (one, two)]
         finally:
             one.kill()
             two.kill()
-    assert [one.returncode, two.returncode] == [0, 0], said
+    assert [one.returncode, two.returncode] == [0, 0], output
     assert cells.starts(notes) == dict.fromkeys(keys(small_file(seeds=6)), 1)
     assert study_status(study).count("done") == 6
 
@@ -227,13 +227,13 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(study: Path, tmp_path: P
         cells.wait_for((study / "plan.json").exists)
         cells.wait_for(lambda: study_status(study).count("running") == 2)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the children, too
-        said = process.stderr.read()
+        output = process.stderr.read()
     assert process.returncode == 130
-    assert said.splitlines()[-1] == (
+    assert output.splitlines()[-1] == (
         f"error: interrupted: 0 of 2 cells have finished and are in {study}. Run the same command "
         "to continue."
     )
-    assert "Traceback" not in said
+    assert "Traceback" not in output
     assert study_status(study).count("waiting") == 2
 
 
@@ -243,9 +243,9 @@ def test_a_corrupt_result_is_set_aside_and_its_cell_run_again(study: Path, notes
     path = min((study / "cells").iterdir())
     path.write_text(path.read_text()[:-100])
     assert study_status(study).count("waiting") == 1
-    status, said = quick(file, study, run=work)
+    status, output = quick(file, study, run=work)
     assert status.count("done") == 2
-    assert "Renamed to" in said
+    assert "Renamed to" in output
     assert sorted(cells.starts(notes).values()) == [1, 2]
     assert path.with_name(f"{path.name}.corrupt").exists()
 
@@ -254,10 +254,10 @@ def test_of_an_edited_plan_only_the_new_cells_are_run(study: Path, notes: Path) 
     work = partial(cells.noted, notes)
     quick(small_file(seeds=2), study, run=work)
     edited = small_file(seeds=3, algorithms=("optimal", "constant"))
-    status, said = quick(edited, study, run=work)
+    status, output = quick(edited, study, run=work)
     assert status.count("done") == 6
-    assert "The folder's plan was small-v1" in said
-    assert "2 finished before and reused · 4 to run" in said
+    assert "The folder's plan was small-v1" in output
+    assert "2 finished before and reused · 4 to run" in output
     assert set(cells.starts(notes).values()) == {1}
     assert Ledger(study).plan_file() == edited
     status, _ = quick(small_file(seeds=1), study, run=work)
@@ -294,8 +294,8 @@ def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(
     assert status.count("done") == 2
 
 
-class _Heard(io.StringIO):
-    """What was said, and what is to happen when certain words are."""
+class _WatchedOutput(io.StringIO):
+    """Output that calls a function when certain words are written."""
 
     def __init__(self, words: str, then: Any) -> None:
         super().__init__()
@@ -318,7 +318,9 @@ def test_what_cannot_be_written_now_is_kept_until_there_is_room(study: Path, not
         (notes / cells.GATE).touch()
 
     # Run 0 ends and cannot be written; run 1 runs until there is room again.
-    console = Console(file=_Heard("No new cell starts until there is space", make_room), width=400)
+    console = Console(
+        file=_WatchedOutput("No new cell starts until there is space", make_room), width=400
+    )
     work = partial(cells.gated, notes, open_for=1)
     status, _ = quick(file, study, executor="processes", jobs=2, run=work, console=console)
     assert status.count("done") == 4
@@ -367,18 +369,18 @@ def test_asking_for_models_too_late_says_how_many_there_are_not(study: Path) -> 
     pytest.importorskip("stable_baselines3")
     learner = {"name": "PPO", "uses": "PPO", "hyperparameters": {"n_steps": 8, "batch_size": 8}}
     file = small_file(seeds=2, algorithms=[learner, "constant"], steps=8)
-    _, said = quick(file, study, only=["algorithm=PPO"])
-    assert "no model" not in said
-    status, said = quick(file, study, keep_models=True)
+    _, output = quick(file, study, only=["algorithm=PPO"])
+    assert "no model" not in output
+    status, output = quick(file, study, keep_models=True)
     assert status.count("done") == 4
-    assert "2 of the finished cells have no model and are not run again" in said
-    assert "a new folder" in said
+    assert "2 of the finished cells have no model and are not run again" in output
+    assert "a new folder" in output
     assert not (study / "models").exists()
     kept = study.with_name("kept")
     quick(file, kept, keep_models=True)
-    _, said = quick(file, kept, keep_models=True)  # a reference never has a model
-    assert "4 finished before" in said
-    assert "no model" not in said
+    _, output = quick(file, kept, keep_models=True)  # a reference never has a model
+    assert "4 finished before" in output
+    assert "no model" not in output
 
 
 def test_results_of_other_versions_are_reused_and_said_to_be(study: Path) -> None:
@@ -390,13 +392,13 @@ def test_results_of_other_versions_are_reused_and_said_to_be(study: Path) -> Non
         assert result is not None
         versions = {**result.versions, "numpy": numpy, "of a package that is not installed": "1"}
         ledger.write(result.model_copy(update={"versions": versions}))
-    status, said = quick(file, study)
+    status, output = quick(file, study)
     assert status.count("done") == 3
     here = f"(installed: {np.__version__})"
     assert (
         "2 of the reused results come from other package versions: "
         f"numpy 1.0.0 {here}, numpy 1.0.1 {here}."
-    ) in " ".join(said.split())
+    ) in " ".join(output.split())
     fresh = study.with_name("fresh")
     quick(file, fresh)
     assert "other versions" not in quick(file, fresh)[1]
@@ -441,8 +443,8 @@ def test_a_terminal_has_bars_and_anything_else_lines(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sme_registry.terminal.progress.SECONDS_BETWEEN_LINES", 0.0)
-    _, said = quick(small_file(seeds=2), study)
-    assert "study small-v1: 1 of 2 cells · about" in said
+    _, output = quick(small_file(seeds=2), study)
+    assert "study small-v1: 1 of 2 cells · about" in output
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=120)
     status, _ = quick(small_file(seeds=4), study, console=console, run=cells.modelled)
