@@ -1,12 +1,12 @@
-"""Everything that `sme_registry` raises on bad input.
+"""The errors that `sme_registry` raises on invalid input.
 
     SMEError
-    ├── SpecError                 a document's field wrong, missing or unknown (also a ValueError)
-    │   ├── MalformedDocumentError    not JSON at all, or not the JSON of this kind of document
-    │   ├── DigestMismatchError       a file's digest is not that of its spec
-    │   └── FingerprintMismatchError  a drawn task's numbers are not the published ones
-    ├── UnknownNameError          no environment, suite, … of this name (also a LookupError)
-    ├── NameTakenError            a released name would change its meaning
+    ├── SpecError                 an invalid or missing field of a document (also a ValueError)
+    │   ├── MalformedDocumentError    not JSON, or not the JSON of this kind of document
+    │   ├── DigestMismatchError       a file's digest is not the digest of its spec
+    │   └── FingerprintMismatchError  the drawn numbers differ from the published ones
+    ├── UnknownNameError          no environment, suite, … has this name (also a LookupError)
+    ├── NameTakenError            a name already stands for another spec (also a ValueError)
     ├── ResourceLimitError        the task would not fit in memory (also a MemoryError)
     ├── ActionError               an action of the wrong shape or not finite (also a ValueError)
     ├── StateError                a state of the wrong shape or out of bounds (also a ValueError)
@@ -14,9 +14,9 @@
     ├── WrapperError              an outer wrapper that would change the task
     ├── PolicyError               a policy that cannot be loaded, or whose actions cannot be used
     ├── OptionError               an argument or option outside its range (also a ValueError)
-    └── MissingDependencyError    an optional package is needed and absent (also an ImportError)
+    └── MissingDependencyError    an optional package is not installed (also an ImportError)
 
-A message says what was wrong, what was expected and what to do:
+A message gives the field, its value, the allowed range and the fix:
 `hidden_width=0: must be in [1, 4096]. Leave it out for the default, 64.`
 """
 
@@ -27,11 +27,11 @@ from collections.abc import Iterable
 
 
 class SMEError(Exception):
-    """Base of every error that this package raises on bad input."""
+    """Base of every error that this package raises on invalid input."""
 
 
 class SpecError(SMEError, ValueError):
-    """A document's field is wrong, missing, unknown, or impossible beside another."""
+    """A field of a document is invalid, missing, unknown, or conflicts with another."""
 
 
 class MalformedDocumentError(SpecError):
@@ -39,15 +39,15 @@ class MalformedDocumentError(SpecError):
 
 
 class DigestMismatchError(SpecError):
-    """A file carries a digest that is not the digest of its spec."""
+    """The digest in a file is not the digest of its spec."""
 
 
 class FingerprintMismatchError(SpecError):
-    """A task drawn here has other numbers than the ones its file publishes."""
+    """The numbers drawn on this machine differ from those that the file publishes."""
 
 
 class UnknownNameError(SMEError, LookupError):
-    """No environment, suite, protocol or algorithm of this name is known."""
+    """No environment, suite, protocol or algorithm has this name."""
 
 
 class NameTakenError(SMEError, ValueError):
@@ -83,19 +83,19 @@ class OptionError(SMEError, ValueError):
 
 
 class MissingDependencyError(SMEError, ImportError):
-    """An optional package is needed for this and is not installed."""
+    """An optional package is required and not installed."""
 
 
 def near_misses(name: str, known: Iterable[str], count: int = 3) -> list[str]:
-    """The known names nearest to a mistyped one, best first; case is ignored.
+    """The known names most similar to a mistyped one, best first; case is ignored.
 
     Args:
-      name: what was asked for.
+      name: the mistyped name.
       known: the names that exist.
-      count: how many to return at most.
+      count: the largest number of names to return.
 
     Returns:
-      Up to `count` names; empty if none is near.
+      Up to `count` names; empty if none is similar.
     """
     by_fold = {candidate.casefold(): candidate for candidate in known}
     close = difflib.get_close_matches(name.casefold(), by_fold, n=count, cutoff=0.6)
@@ -103,7 +103,7 @@ def near_misses(name: str, known: Iterable[str], count: int = 3) -> list[str]:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`" Did you mean 'k'?"`, or an empty string where nothing is near."""
+    """`" Did you mean 'k'?"`, or an empty string if no name is similar."""
     close = near_misses(name, known)
     if not close:
         return ""

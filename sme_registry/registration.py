@@ -28,7 +28,7 @@ _TEAM_ENTRY_POINTS = {
 
 
 def _register(env_id: str, spec: dict[str, Any] | str, team: bool) -> None:
-    """Put an id into the registry where it belongs: Gymnasium's, or for teams PettingZoo's."""
+    """Register an id with Gymnasium or, for a team, with PettingZoo."""
     if team:
         for kind, entry_point in _TEAM_ENTRY_POINTS.items():
             pettingzoo.register(kind, env_id, entry_point, kwargs={"spec": spec})
@@ -46,7 +46,7 @@ def _is_registered(env_id: str) -> bool:
 
 
 def register_catalogue() -> None:
-    """Register every file of `specs/envs` by its name and by its content; reads no more than that.
+    """Register every file of `specs/envs` by its name and by its content, without validation.
 
     Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
     """
@@ -60,7 +60,7 @@ def register_catalogue() -> None:
 
 
 def register(spec: SMESpec, name: str) -> str:
-    """Register a spec of your own in this process.
+    """Register a spec under a name, in this process.
 
     Args:
       spec: the spec, or its fields as a mapping.
@@ -70,7 +70,7 @@ def register(spec: SMESpec, name: str) -> str:
       The id, such as `SME/MyTask-v1`.
 
     Raises:
-      OptionError: the name has other characters.
+      OptionError: the name has invalid characters.
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
     """
     from sme_registry.spec import as_spec
@@ -127,18 +127,19 @@ def save(
 
     Args:
       spec: the spec.
-      path: where to; the folder is made. An existing file is replaced, whole or not at all.
+      path: the file to write; its folder is created. An existing file is replaced, completely
+        or not at all.
       name: letters, digits, '_' and '-'; by default the file's name without its ending.
       description: one or two sentences.
-      tags: words to find it by.
+      tags: keywords, for `sme list --tag`.
 
     Returns:
       The path written.
 
     Raises:
-      SpecError: the name or a tag has other characters.
+      SpecError: the name or a tag has invalid characters.
       ResourceLimitError: the task would not fit in memory.
-      OptionError: the file cannot be written; what stood there is untouched.
+      OptionError: the file cannot be written; an existing file is unchanged.
     """
     from sme_registry.spec import as_spec
     from sme_registry.spec.envelope import EnvFile
@@ -165,7 +166,7 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
     """Gymnasium's `EnvSpec` of any spec, unregistered; its kwargs are plain JSON.
 
     Args:
-      spec: the spec, or whatever `load` takes.
+      spec: the spec, or a name, digest or path as for `load`.
       **kwargs: spec fields to override, which give the derived spec its own id; and arguments of
         the environment, such as `action_range`.
 
@@ -196,7 +197,7 @@ def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     Args:
       spec_or_id: the task.
       **kwargs: spec fields to override (`complexity=10`), `action_range`, `render_mode`, and
-        what else `gymnasium.make` takes.
+        other arguments of `gymnasium.make`.
 
     Returns:
       The environment with Gymnasium's default wrappers.
@@ -217,8 +218,8 @@ def make_vec(
     Args:
       spec_or_id: the task.
       num_envs: the lanes.
-      **kwargs: spec fields to override, `action_range`, `autoreset_mode`, and what else
-        `gymnasium.make_vec` takes.
+      **kwargs: spec fields to override, `action_range`, `autoreset_mode`, and other
+        arguments of `gymnasium.make_vec`.
 
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEVectorEnv`.

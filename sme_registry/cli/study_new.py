@@ -100,13 +100,13 @@ def new(
         plan = StudyPlan.from_dict(fields, str(path))
         draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
         data = scaled_plan(draft, steps, None, None).plan.to_dict()
-        file = StudyFile.sealed(data, str(path), **{"name": path.stem, **about})
+        file = StudyFile.with_digest(data, str(path), **{"name": path.stem, **about})
     else:
         _refuse_other_options(context)
         data = read_json(source) if is_path(source) else find_plan(source).to_dict()
         named = isinstance(data, dict) and "name" in data
         default_name = {} if named else {"name": path.stem}
-        file = StudyFile.sealed(data, source, **{**default_name, **about})
+        file = StudyFile.with_digest(data, source, **{**default_name, **about})
     # A package that is not installed here may be installed where the plan runs.
     uses = (algorithm.uses for algorithm in file.plan.algorithms)
     warn_of_unavailable(uses, MissingDependencyError)

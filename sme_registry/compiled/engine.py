@@ -69,7 +69,7 @@ class StepMany(Protocol):
         ends: Mask,
         /,
     ) -> bool:
-        """Advance `t` and `accumulated`, write what follows `action`; False: action refused."""
+        """Advance `t` and `accumulated`, write the arguments after `action`; False: refused."""
         ...
 
 
@@ -78,7 +78,7 @@ class Engine:
     """A task's step and oracle, ready to call.
 
     Attributes:
-      backend: what runs it, "numba" or "numpy".
+      backend: "numba" or "numpy".
       new_lane: makes a buffer for a single lane at t = 0, to pass to its steps, and the view of
         that buffer that holds t, r_cum and s, `[2 + S]`.
       step_float32: one step of one lane, for float32 actions.
@@ -96,7 +96,7 @@ class Engine:
 
 
 def chosen_backend() -> Backend:
-    """What the environment variable SME_BACKEND says; by default Numba where it is installed.
+    """The back-end of the environment variable SME_BACKEND; by default Numba where it is installed.
 
     Raises:
       OptionError: the variable names no back-end.
@@ -118,7 +118,7 @@ _packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()
 
 
 def engine(task: Task, backend: Backend | None = None) -> Engine:
-    """The engine of a task. Cheap: what is large is shared by all engines of one task.
+    """The engine of a task. Cheap: engines of one task share its packed numbers.
 
     Args:
       task: the task.
@@ -151,7 +151,7 @@ def _numba_engine(task: Task) -> Engine:
         return out
 
     # The entry points skip Numba's dispatch on argument types, a tenth of a step's time. They
-    # must be given arrays of exactly these types and dimensions.
+    # require arrays of exactly these types and dimensions.
     packed = _packed[task]
     steps: list[StepLane]
     if packed.size <= _SMALL:

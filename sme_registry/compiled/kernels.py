@@ -1,4 +1,4 @@
-"""The step as machine code, for one lane and for a batch. Never different from the definition.
+"""The step as machine code, for one lane and for a batch; always equal to the definition.
 
 Both kernels do the same floating-point operations in the same order for each lane (each sum runs
 over its inputs in ascending order, no fused or re-associated arithmetic), so a batch equals its
@@ -58,7 +58,7 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
 
 
 def lane_size(packed: npt.NDArray[np.float64]) -> int:
-    """How many numbers one lane's own part holds."""
+    """The size of one lane's own part."""
     return 2 + int(packed[0]) + 2 * int(packed[7])
 
 
@@ -361,7 +361,7 @@ def _block_rewards(p, first, count, distance, owned, team_distance, values, ends
 
 @njit(inline="always", error_model="numpy")
 def _block_payout(p, first, count, t, accumulated, column, values, ends, observation):  # type: ignore[no-untyped-def]
-    """What is paid and what stays in r_cum; whether a lane is truncated; t/T and r_cum/k observed.
+    """Payout, r_cum and truncation, and the observed t/T and r_cum/k.
 
     Short loops rather than one long one: those that divide write to `column`, which is contiguous
     and so fills vector registers; a column of `observation` is not.
@@ -414,7 +414,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
     """One step of `B` lanes of a team of n agents; a single agent is a team of one.
 
     The lanes are stepped in blocks that fit in cache: π*, its distance from the action, the
-    transition, the rewards, then what is paid.
+    transition, the rewards, then the payouts.
 
     Args:
       p: the packed task.
@@ -460,7 +460,7 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
 
 @njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)
 def add_and_normal_cdf(x, b):  # type: ignore[no-untyped-def]
-    """x ← Φ(x + b) in place, `[B, out]` and `[out]`: what follows a matrix product."""
+    """x ← Φ(x + b) in place, `[B, out]` and `[out]`: the step after a matrix product."""
     for i in range(x.shape[0]):
         row = x[i]
         for o in range(row.size):

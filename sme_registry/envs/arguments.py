@@ -39,8 +39,8 @@ def to_unit(
     Whether they are finite is checked by the step, which reads each of them anyway.
 
     Args:
-      action: what the user passed.
-      shape: what it must have.
+      action: the user's argument.
+      shape: the required shape.
       rescaled: whether the environment's range is [−1, 1].
       ignored: `[B]` rows to set to zero.
 
@@ -124,7 +124,7 @@ def single_agent(task: Task) -> Task:
     """The task, which must have a single agent.
 
     Raises:
-      SpecError: it is for a team; says how to make that.
+      SpecError: it is for a team; the message says how to make that.
     """
     if len(task.policies) > 1:
         raise SpecError(

@@ -1,8 +1,8 @@
-"""The initial states of a batch: each lane's own generator, drawn from in advance.
+"""The initial states of a batch, drawn in advance from a generator per lane.
 
-Lane i draws what a single environment with its seed would draw, in the same order. Asking 1,024
-generators for one state each costs as much as six steps of the whole batch; asking each for sixteen
-at once costs little more, and only who asks is different, not the numbers.
+Lane i draws what a single environment with its seed would draw, in the same order. Drawing one
+state from each of 1,024 generators costs as much as six steps of the whole batch. Drawing sixteen
+states at once costs little more and gives the same numbers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class InitialStates:
         self._used = np.full(lanes, self._ahead)
 
     def seed(self, lane: int, seed: int) -> None:
-        """Begin a lane's stream anew."""
+        """Restart a lane's stream."""
         self._generators[lane] = seeding.np_random(seed)[0]
         self._used[lane] = self._ahead
 

@@ -1,4 +1,4 @@
-"""How environments go by the content of their spec."""
+"""Ids of environments by the content of their spec."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def content_id(spec: SMESpec) -> str:
 
 
 def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | None:
-    """Gymnasium's spec of an environment, all JSON; a derived task takes its content's id.
+    """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
-    Whoever makes `SME/Default-v1` with `complexity=10` has another task, and it must not be
-    recorded under the name it was derived from.
+    `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
+    from which it was derived.
 
     Args:
-      env_spec: what Gymnasium says the environment was made from.
+      env_spec: from which Gymnasium made the environment.
       spec: the spec that is run.
     """
     if env_spec is None:
@@ -46,7 +46,7 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
         plain.kwargs["spec"] = spec.to_dict()
     if not named:
         plain.id = content_id(spec)
-        # EnvSpec splits the id into these once, when it is made.
+        # EnvSpec derives these from the id only in its constructor.
         plain.name = plain.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
         plain.version = DYNAMICS_VERSION
     return plain

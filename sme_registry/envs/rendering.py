@@ -1,8 +1,8 @@
-"""`Renderer`: what an SME looks like, one frame per step.
+"""`Renderer`: frames of an episode.
 
-The state and the action beside the optimal one, channel by channel; below them the episode so far:
-similarity of each step and the regret that has added up. Of a team all channels, each agent's own
-underlined, and the mean of the agents' numbers.
+A frame shows the state, the action and the optimal action, channel by channel, and below them the
+similarity of each step and the accumulated regret. For a team it shows all channels, each agent's
+underlined, and the means over the agents.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _OPTIMAL, _ACTION, _REGRET, _STATE = (0, 158, 115), (0, 114, 178), (213, 94, 0),
 
 def _import_pygame() -> Any:
     try:
-        # With some versions of setuptools its import warns of what is no fault of the user's.
+        # With some versions of setuptools, importing pygame warns; the user cannot avoid that.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import pygame
@@ -50,7 +50,7 @@ def _import_pygame() -> Any:
 
 
 class Renderer:
-    """Draws the episode under way. Recording is cheap; a frame is drawn when it is asked for.
+    """Draws the present episode. Recording is cheap; a frame is drawn on request.
 
     Args:
       spec: the task.
@@ -69,7 +69,7 @@ class Renderer:
         self._window: pygame.Surface | None = None
         self._begun = False
 
-    # A copy in the middle of an episode keeps what is recorded, and opens a window of its own.
+    # A copy keeps the recorded steps, and opens a new window.
     def __getstate__(self) -> dict[str, Any]:
         dropped = ("_pygame", "_window", "_clock", "_small", "_normal")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
@@ -78,14 +78,14 @@ class Renderer:
         self.__dict__.update(state, _pygame=_import_pygame(), _window=None)
 
     def record(self, env: SMEEnv, last: tuple[Any, dict[str, Any]] | None) -> None:
-        """Take in a reset or a step.
+        """Record a reset or a step.
 
         Args:
           env: the environment, after it.
           last: None at a reset; else the action, in the environment's range, and the step's info.
 
         Raises:
-          OptionError: in mode "human", where no window can be opened.
+          OptionError: no window can be opened in mode "human".
         """
         self._state = env.state
         if last is None:
@@ -113,7 +113,7 @@ class Renderer:
         """The present frame: `[H, W, 3]` uint8 for "rgb_array"; None for "human".
 
         Raises:
-          EpisodeError: nothing is recorded yet.
+          EpisodeError: before the first reset.
         """
         if not self._begun:
             raise EpisodeError("render: the episode has not begun. Call reset() first.")
@@ -189,7 +189,7 @@ class Renderer:
     def _actions(
         self, surface: pygame.Surface, left: int, top: int, right: int, bottom: int
     ) -> None:
-        """Each action as a dot, the optimal one as a bar across; what lies between is the error."""
+        """Each action as a dot, the optimal one as a bar; the line between them is the error."""
         A, rect = self._spec.action_dim, self._pygame.draw.rect
         self._heading(surface, "last action", A, left, top)
         height = bottom - top - 22
@@ -197,10 +197,10 @@ class Renderer:
         columns = _columns(tracks, left, right)
         for x, width, _ in columns:
             rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
-        for own in self._owned:
-            if mine := columns[own]:
-                end = mine[-1][0] + mine[-1][1]
-                rect(surface, _FAINT, (mine[0][0], bottom + 4, end - mine[0][0], 3))
+        for channels in self._owned:
+            if owned := columns[channels]:
+                end = owned[-1][0] + owned[-1][1]
+                rect(surface, _FAINT, (owned[0][0], bottom + 4, end - owned[0][0], 3))
         if self._action is None or self._optimal is None:
             return
         x = right
@@ -220,12 +220,12 @@ class Renderer:
             rect(surface, _OPTIMAL, (x, y_best - 2, width, 4))
             self._pygame.draw.circle(surface, _ACTION, (middle, y), max(2, min(6, width // 2)))
 
-    def _heading(self, surface: pygame.Surface, what: str, count: int, left: int, top: int) -> None:
-        shown = f"{count} channels" if count > 1 else "1 channel"
+    def _heading(self, surface: pygame.Surface, name: str, count: int, left: int, top: int) -> None:
+        number = f"{count} channels" if count > 1 else "1 channel"
         if count > _CHANNELS_SHOWN:
-            shown = f"the first {_CHANNELS_SHOWN} of {count} channels"
-        width = self._text(surface, what, (left, top), _INK, self._normal)
-        self._text(surface, shown, (left + width + 8, top + 2), _FAINT, self._small)
+            number = f"the first {_CHANNELS_SHOWN} of {count} channels"
+        width = self._text(surface, name, (left, top), _INK, self._normal)
+        self._text(surface, number, (left + width + 8, top + 2), _FAINT, self._small)
 
     def _numbers(self, surface: pygame.Surface, y: int) -> None:
         last = self._similarities[-1] if self._similarities else None
@@ -242,8 +242,8 @@ class Renderer:
         for i, (name, value, colour) in enumerate(columns):
             x = round(_MARGIN + i * step)
             self._text(surface, name, (x, y), _FAINT, self._small)
-            shown = "–" if value is None else f"{value:.3f}"
-            self._text(surface, shown, (x, y + 18), colour, self._normal)
+            text = "–" if value is None else f"{value:.3f}"
+            self._text(surface, text, (x, y + 18), colour, self._normal)
 
     def _curve(
         self,
@@ -292,13 +292,13 @@ class Renderer:
 
 
 def _title(spec: SMESpec) -> str:
-    """The axes by their symbols; those at their default go without saying, but for the first."""
-    shown = [f"SME   S = {spec.state_dim}", f"A = {spec.action_dim}", f"L = {spec.complexity}"]
+    """The axes by their symbols, and the name of the spec by content."""
+    parts = [f"SME   S = {spec.state_dim}", f"A = {spec.action_dim}", f"L = {spec.complexity}"]
     rest = {"k": spec.k, "r_min": spec.r_min, "D": spec.D}
-    shown += [f"{name} = {value:g}" for name, value in rest.items()]
+    parts += [f"{name} = {value:g}" for name, value in rest.items()]
     if spec.team is not None:
-        shown.append(f"mean of {len(spec.team.agents)} agents")
-    return "   ".join([*shown, spec.content_name])
+        parts.append(f"mean of {len(spec.team.agents)} agents")
+    return "   ".join([*parts, spec.content_name])
 
 
 def _owned(spec: SMESpec) -> list[slice]:

@@ -1,12 +1,12 @@
-"""What one policy that acts for every agent of a team is shown, and what it answers.
+"""Observations and actions of one policy that acts for every agent of a team.
 
 Agents of a team may observe and own different numbers of channels; a shared policy needs one width
-for all. It is asked for each agent in turn, with that agent's *shared observation*
+for all. It is called for each agent in turn, with that agent's *shared observation*
 
     (s with the channels that the agent does not observe set to 0, t/T, its r_cum/k, one-hot of i)
 
-`[B, S + 2 + n]`, so it sees no more of the state than the agent does and knows whom it acts for.
-It answers `[B, max a_i]`, of which the agent's first a_i are used. `B` batch, `S` state_dim, `n`
+`[B, S + 2 + n]`, so it observes no more of the state than the agent does, and which agent it is.
+It returns `[B, max a_i]`, of which the agent's first a_i are used. `B` batch, `S` state_dim, `n`
 agents, a_i the channels that agent i owns.
 """
 
@@ -15,11 +15,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from sme_registry.envs.types import Observation
 from sme_registry.task import Task
-
-Observation = npt.NDArray[np.float32]
 
 
 def shared_observation_dim(task: Task) -> int:
@@ -28,12 +26,12 @@ def shared_observation_dim(task: Task) -> int:
 
 
 def shared_action_dim(task: Task) -> int:
-    """Entries of a shared policy's action: of the agent that owns most."""
-    return int(max(own.stop - own.start for own in task.owned))
+    """Entries of a shared policy's action: as many as the agent with most channels owns."""
+    return int(max(channels.stop - channels.start for channels in task.owned))
 
 
 def shared_observation(task: Task, joint: Observation) -> Observation:
-    """What a shared policy is shown for each agent.
+    """The shared observation of each agent.
 
     Args:
       task: the task; one without a team is a team of one.
@@ -43,21 +41,21 @@ def shared_observation(task: Task, joint: Observation) -> Observation:
       `[B, n, S + 2 + n]` float32, a fresh array.
     """
     S, n = task.spec.state_dim, len(task.observed)
-    shown = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
+    shared = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
     single = joint[:, : S + 2].copy()
     for agent, observed in enumerate(task.observed):
         single[:, S + 1] = joint[:, S + 1 + agent]
-        shown[:, agent] = shared_observation_of(agent, n, observed, single)
-    return shown
+        shared[:, agent] = shared_observation_of(agent, n, observed, single)
+    return shared
 
 
 def shared_observation_of(
     agent: int, agents: int, observed: Sequence[int], single: Observation
 ) -> Observation:
-    """What a shared policy is shown for one agent.
+    """The shared observation of one agent.
 
     Args:
-      agent: which, in [0, n).
+      agent: its index, in [0, n).
       agents: n.
       observed: the state channels that it observes.
       single: `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
@@ -66,8 +64,8 @@ def shared_observation_of(
       `[B, S + 2 + n]` float32, a fresh array.
     """
     width = single.shape[1]
-    seen = [*observed, width - 2, width - 1]
-    shown = np.zeros((len(single), width + agents), np.float32)
-    shown[:, seen] = single[:, seen]
-    shown[:, width + agent] = 1.0
-    return shown
+    visible = [*observed, width - 2, width - 1]
+    shared = np.zeros((len(single), width + agents), np.float32)
+    shared[:, visible] = single[:, visible]
+    shared[:, width + agent] = 1.0
+    return shared

@@ -43,7 +43,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     Observation of agent i: `[|O_i| + 2]` float32 in [0, 1]. Action: `[a_i]`, in [0, 1]
     (`action_range="unit"`) or [−1, 1] (`"symmetric"`), clipped. `infos[agent]` of each step has the
     keys of `SMEEnv`, that agent's own; `similarity` is always over its own channels, while
-    `step_reward`, `regret` and `accumulated_reward` are of what it is paid for.
+    `step_reward`, `regret` and `accumulated_reward` are those that it is paid for.
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
@@ -80,8 +80,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         parts = [slice(*part) for part in pairwise([0, *ends])]
         self._observed_parts = list(zip(self.possible_agents, parts, strict=True))
         self._parts = [
-            (agent, name, own)
-            for agent, (name, own) in enumerate(
+            (agent, name, channels)
+            for agent, (name, channels) in enumerate(
                 zip(self.possible_agents, self._task.owned, strict=True)
             )
         ]
@@ -89,8 +89,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self._begun = False
 
         self._action_spaces, self._observation_spaces = {}, {}
-        for agent, name, own in self._parts:
-            width = own.stop - own.start
+        for agent, name, channels in self._parts:
+            width = channels.stop - channels.start
             self._action_spaces[name], self._rescaled = arguments.action_space(action_range, width)
             self._observation_spaces[name] = gymnasium.spaces.Box(
                 0.0, 1.0, (len(columns[agent]),), np.float32
@@ -103,7 +103,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         """The joint action `[1, A]`, and each agent's part of it: a view to write into."""
         self._joint_action = np.zeros((1, self.sme_spec.action_dim))
         row = self._joint_action[0]
-        self._slots = [(name, row[own].shape, row[own]) for _, name, own in self._parts]
+        views = [(name, row[channels]) for _, name, channels in self._parts]
+        self._slots = [(name, view.shape, view) for name, view in views]
 
     # The copy of a view is no view: the copy allocates both again.
     def __getstate__(self) -> dict[str, Any]:
@@ -123,7 +124,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         return self._action_spaces[self._checked_agent(agent)]
 
     def state(self) -> Array:
-        """The state s, `[S]` float64 in [0, 1] (a copy), whatever each agent observes of it."""
+        """The state s, `[S]` float64 in [0, 1] (a copy), unobserved channels included."""
         state: Array = self._batch.state[0]
         return state
 
@@ -212,13 +213,13 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         n = len(self.possible_agents)
         return {
             name: {
-                "optimal_action": optimal[own],
+                "optimal_action": optimal[channels],
                 "similarity": values[agent],
                 "step_reward": values[n + agent],
                 "regret": values[2 * n + agent],
                 "accumulated_reward": values[4 * n + agent],
             }
-            for agent, name, own in self._parts
+            for agent, name, channels in self._parts
         }
 
     def _by_agent(self, observation: Observation) -> dict[str, Observation]:
@@ -283,8 +284,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         )
 
     def _not_finite(self, joint: Array) -> ActionError:
-        for _, name, own in self._parts:
-            if not np.isfinite(joint[0, own]).all():
+        for _, name, channels in self._parts:
+            if not np.isfinite(joint[0, channels]).all():
                 return ActionError(f"{name}: {arguments.not_finite_error()}")
         return arguments.not_finite_error()
 

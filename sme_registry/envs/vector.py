@@ -200,7 +200,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         return observation, reward, terminated, truncated, infos
 
     def _begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
-        """Put lanes at the start of an episode, and write what they observe."""
+        """Put lanes at the start of an episode, and write their observations."""
         self._batch.begin(lanes, observation, states)
         self._ended[lanes] = False
 

@@ -33,14 +33,14 @@ class _SingleLane(Lane):
 class SMEVecEnv(LanesVecEnv):
     """`num_envs` lanes of one task for SB3's algorithms and `VecEnv` wrappers.
 
-    As in SB3's own, a finished lane begins its next episode at once, its last observation is
+    As in SB3's `VecEnv`s, a finished lane begins its next episode at once, its last observation is
     `terminal_observation` in its info, `TimeLimit.truncated` is True where it was truncated and
     not terminated, and `seed(n)` seeds lane i with n + i at the next reset.
 
     Args:
       spec_or_id: the task: a spec, its fields, an id, a digest or a path.
       num_envs: the lanes, at least 1.
-      action_range: "symmetric", [−1, 1], what SB3's Gaussian policies are made for; or "unit".
+      action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
       **overrides: spec fields to change.
 
     Raises:
@@ -115,7 +115,7 @@ class SMEVecEnv(LanesVecEnv):
 def _columns(batched: dict[str, Any], dones: Mask) -> dict[str, list[Any]]:
     """Each key of Gymnasium's batched info in mode SAME_STEP, a value for each lane."""
     any_done = bool(dones.any())
-    # Where lanes have ended, what belongs to their last step stands apart.
+    # Where lanes have ended, the values of their last step are in `final_info`.
     last = batched["final_info"] if any_done else batched
     columns = {}
     for key, values in last.items():

@@ -65,7 +65,7 @@ class SMETeamVecEnv(LanesVecEnv):
         self._task, self._batch, self._begun = task, Batch(task, num_envs), False
         # For each channel of the joint action: the agent that owns it, and the entry of its action.
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
-        self._entry = np.concatenate([np.arange(own.stop - own.start) for own in task.owned])
+        self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])
         super().__init__(
             [
                 Lane(self._batch, team, agent=name, **shared)
@@ -148,7 +148,7 @@ class SMETeamVecEnv(LanesVecEnv):
         )
         optimal = arguments.from_unit(done.optimal, self._rescaled)
         columns: dict[str, list[Any]] = {
-            "optimal_action": [row[own] for row in optimal for own in self._task.owned],
+            "optimal_action": [row[part] for row in optimal for part in self._task.owned],
             "similarity": similarity.tolist(),
             "step_reward": step_reward.tolist(),
             "regret": regret.tolist(),

@@ -1,4 +1,4 @@
-"""Documents: what is frozen, hashed and shared."""
+"""Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
 from sme_registry.spec.arguments import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.spec.document import (

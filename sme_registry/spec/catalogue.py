@@ -1,6 +1,6 @@
-"""The catalogue: the files under `specs/`, found by name, by content, or by path.
+"""The catalogue: the files under `specs/`, by name.
 
-Nothing is listed twice: what is in the folders is in the catalogue.
+The folders are the only list: a file in them is in the catalogue.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _VERSION = re.compile(r"-v(\d+)$")
 
 
 def spec_folder() -> Path:
-    """The folder of the catalogue: inside the installed package, or beside it in a checkout."""
+    """The folder of the catalogue: inside the installed package, or next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     installed = package / "specs"
     return installed if installed.is_dir() else package.parent / "specs"
@@ -60,15 +60,15 @@ def entries(kind: type[_E]) -> list[_E]:
 
 
 def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
-    """The file of a name, with or without its version (the newest then).
+    """The file of a name, with or without its version (then the newest).
 
     Args:
-      kind: of what.
-      name: what was asked for.
-      others: names known elsewhere, which may be meant where there is no such file.
+      kind: the kind of file.
+      name: its name.
+      others: names known elsewhere, to suggest where there is no such file.
 
     Raises:
-      UnknownNameError: there is none; the message names the nearest.
+      UnknownNameError: there is none; the message suggests the nearest.
     """
     known = names(kind)
     if name in known:
@@ -83,14 +83,14 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     known += others
     short = [_VERSION.sub("", full) for full in known]
     raise UnknownNameError(
-        f"{name!r}: no {kind.content} of this name is known."
+        f"{name!r}: no {kind.content} has this name."
         + (did_you_mean(name, known) or did_you_mean(name, short))
-        + " `sme list` shows what there is."
+        + " `sme list` shows the names."
     )
 
 
 def title(spec: SMESpec) -> str:
-    """What a reader calls a task: `SME/Default-v1` where the catalogue has it, else its content."""
+    """A task's name in the catalogue (`SME/Default-v1`), else its name by content."""
     named = {file.digest: file.versioned_name for file in entries(EnvFile)}
     return f"{NAMESPACE}/{named.get(spec.digest, spec.content_name)}"
 
@@ -98,8 +98,8 @@ def title(spec: SMESpec) -> str:
 def released() -> Iterator[tuple[str, str, bool]]:
     """`(versioned name, name by content, is a team)` of every environment, without validation.
 
-    For registering the catalogue at import, which must stay cheap; what is made of a name is
-    validated in full.
+    For registering the catalogue at import, which must stay cheap; making an environment validates
+    its file.
     """
     for path in paths(EnvFile):
         file = read_json(path)

@@ -83,8 +83,8 @@ class StrictModel(BaseModel):
         except ValidationError as error:
             raise _spec_error(type(self), error, "") from None
 
-    # As Pydantic marks its own: nested models are validated without it, so that the outermost
-    # model alone writes the message, with whole paths.
+    # The mark of Pydantic's own constructors: without it, each nested model would be validated by
+    # this one, and raise an error without the path that leads to it.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @model_validator(mode="before")
@@ -159,12 +159,12 @@ def refuse_repeated_names(field: str, members: Sequence[_Named]) -> None:
     """Raise where two members of a field have the same name.
 
     Raises:
-      ValueError: for Pydantic, which makes an error of the document of it.
+      ValueError: for Pydantic, which reports it as an error of the document.
     """
     names = [member.name for member in members]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"{field}: the name {name!r} is given twice. Rename one of them.")
+            raise ValueError(f"{field}: the name {name!r} appears twice. Rename one of them.")
 
 
 def _spec_error(model: type[StrictModel], error: ValidationError, source: str) -> SpecError:

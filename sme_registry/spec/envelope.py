@@ -1,7 +1,7 @@
 """Files: a document in an envelope of name, version, description, tags and digest.
 
 The digest is of the document alone, so renaming a file or describing it better changes nothing.
-A file whose digest is not its document's is refused.
+A file with another digest is refused.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Fingerprint(StrictModel):
 
 
 class Envelope(StrictModel):
-    """What every file carries beside its document.
+    """The fields of every file next to its document.
 
     Attributes:
       content: the field that holds the document.
-      remedy: what turns a changed document, or one alone, into a file; `{source}` is where it is.
+      remedy: how to write a changed document, or a bare one, as a file; `{source}` is its path.
     """
 
     content: ClassVar[str]
@@ -49,7 +49,7 @@ class Envelope(StrictModel):
 
     @property
     def versioned_name(self) -> str:
-        """`Default-v1`: how files and ids are called."""
+        """`Default-v1`: the name in files and ids."""
         return f"{self.name}-v{self.version}"
 
     @classmethod
@@ -61,8 +61,8 @@ class Envelope(StrictModel):
           source: what to call it in an error, such as its path.
 
         Raises:
-          SpecError: a field is wrong or missing.
-          DigestMismatchError: the digest is of another document.
+          SpecError: a field is invalid or missing.
+          DigestMismatchError: the digest is not the document's.
         """
         name = source or cls.__name__
         remedy = cls.remedy.format(source=name)
@@ -90,16 +90,16 @@ class Envelope(StrictModel):
 
         Raises:
           MalformedDocumentError: not readable, or not strict JSON.
-          SpecError: a field is wrong.
-          DigestMismatchError: the digest is of another document.
+          SpecError: a field is invalid.
+          DigestMismatchError: the digest is not the document's.
         """
         return cls.from_dict(read_json(path), str(path))
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the file, whole or not at all.
+        """Write the file completely or not at all.
 
         Raises:
-          OptionError: it cannot be written; what stood there is untouched.
+          OptionError: it cannot be written; an existing file is unchanged.
         """
         write_atomically(path, to_json(self.to_dict()))
 
@@ -135,21 +135,21 @@ class StudyFile(Envelope):
     plan: StudyPlan
 
     @classmethod
-    def sealed(cls, data: Any, source: str, **given: Any) -> Self:
-        """A plan that was edited, or stands alone, as a file with the digest that it has now.
+    def with_digest(cls, data: Any, source: str, **fields: Any) -> Self:
+        """The file of an edited or bare plan, with the plan's present digest.
 
         Args:
-          data: plain data of a file, whose digest does not matter, or of a plan.
+          data: plain data of a file, whose digest is ignored, or of a plan.
           source: what to call it in an error, such as its path.
-          **given: fields of the file, such as `name`, in place of those in `data`.
+          **fields: fields of the file, such as `name`, which replace those of `data`.
 
         Raises:
-          SpecError: a field is wrong or missing.
+          SpecError: a field is invalid or missing.
         """
         is_file = isinstance(data, dict) and cls.content in data
         plan = StudyPlan.from_dict(data[cls.content] if is_file else data, source)
-        own = {**(data if is_file else {}), **given}
-        return cls.from_dict({**own, "digest": plan.digest, "plan": plan.to_dict()}, source)
+        fields = {**(data if is_file else {}), **fields}
+        return cls.from_dict({**fields, "digest": plan.digest, "plan": plan.to_dict()}, source)
 
 
 class ProtocolFile(Envelope):

@@ -1,4 +1,4 @@
-"""`EvaluationProtocol`: which states a policy is judged in, as a hashed document.
+"""`EvaluationProtocol`: the states in which a policy is evaluated, as a hashed document.
 
 METHOD, section 3: nested cubes X_ε = {s : ‖s − ½‖_∞ ≤ (1+ε)/2}; region 0 is the cube X_0 (WD),
 region m the half-open shell X_{ε_m} \\ X_{ε_{m−1}} (OOD m); states uniform by volume in each.

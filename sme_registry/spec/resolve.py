@@ -17,7 +17,7 @@ from sme_registry.spec.sme_spec import SMESpec, as_spec
 
 _HEX_DIGITS = 12  # fewest digits that name a spec
 
-# Specs that this process registered under ids of its own; `registration.register` fills it.
+# Specs registered in this process, by id; see `registration.register`.
 registered: dict[str, SMESpec] = {}
 
 

@@ -1,6 +1,6 @@
-"""`SMESpec`: the handful of numbers that a Synthetic Monitoring Environment is generated from.
+"""`SMESpec`: the numbers from which a Synthetic Monitoring Environment is generated.
 
-Symbols of METHOD beside the fields: N_s `state_dim` (S), N_a `action_dim` (A), k, r_min, D,
+Fields and their symbols in METHOD: N_s `state_dim` (S), N_a `action_dim` (A), k, r_min, D,
 C_π* `complexity` (L), T `horizon`, H `hidden_width`.
 """
 
@@ -110,7 +110,7 @@ class AgentSpec(Document):
 
 
 class TeamSpec(Document):
-    """How the action channels are shared out; agents own consecutive channels, in order."""
+    """Which agent owns which action channels: consecutive ones, in the order of the agents."""
 
     agents: Annotated[tuple[AgentSpec, ...], Field(min_length=1, max_length=1024, strict=False)]
     reward: Literal["individual", "team"] = "individual"
@@ -118,7 +118,7 @@ class TeamSpec(Document):
     @model_validator(mode="before")
     @classmethod
     def _default_names(cls, data: Any) -> Any:
-        """Agents without a name are `agent_0`, `agent_1`, …, as PettingZoo's own are."""
+        """Agents without a name are `agent_0`, `agent_1`, …, as in PettingZoo."""
         if not isinstance(data, dict) or not isinstance(data.get("agents"), list | tuple):
             return data
         agents = [
@@ -134,9 +134,9 @@ class TeamSpec(Document):
 
 
 class Setting(Document):
-    """Everything that a task is generated from but its seed: one setting of the axes.
+    """One setting of the axes: everything that a task is generated from, except its seed.
 
-    Defaults are the paper's (METHOD, section 1), and ours where it gives none.
+    Defaults are the paper's (METHOD, section 1), or ours where it has none.
     """
 
     schema_version: SchemaVersion = 1
@@ -192,7 +192,7 @@ class Setting(Document):
 
 
 class SMESpec(Setting):
-    """A task, whole: a setting of the axes and the seed of its draw.
+    """A complete task: a setting of the axes and the seed of its draw.
 
     Equal specs have equal digests, and equal digests are equal specs.
     """
@@ -217,7 +217,7 @@ class SMESpec(Setting):
 
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
-    """A spec given as itself or as plain data.
+    """A spec from itself or from plain data.
 
     Raises:
       SpecError: a field is wrong, missing or unknown, or `value` is neither.

@@ -1,8 +1,8 @@
-"""`StudyPlan`: algorithms × kinds of tasks × seeds, what each run may take and how it is judged.
+"""`StudyPlan`: algorithms × classes of tasks × seeds, the budget of each run and its evaluation.
 
-A plan holds everything that its numbers depend on, so a study is one file that a colleague can run.
-Its cells are its runs: the cell of an algorithm, a class and a number i trains with seed i on the
-class's instance i (beginning again where there are fewer instances), as the paper's seeds do both.
+A plan holds everything that its results depend on, so a colleague can run a study from one file.
+Its cells are its runs: cell i of an algorithm and a class trains with seed i on instance i of the
+class (modulo the number of instances); in the paper, too, a seed determines both.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 def _refuse_team(setting: Setting, field: str) -> None:
     if setting.team is not None:
         raise ValueError(
-            f"{field}.team: must be null: a study's cells are one agent's tasks, and this one is "
+            f"{field}.team: must be null: a study's tasks have a single agent, and this one is "
             f"for {len(setting.team.agents)}. Remove it, and train teams with `sme train`."
         )
 
 
 class StudyAlgorithm(StrictModel):
-    """What is run in a study's cells.
+    """An algorithm of a study.
 
     Attributes:
-      name: how reports call it; each name once.
+      name: its name in reports, unique in the plan.
       uses: an algorithm of Stable-Baselines3 ("PPO"), an installed entry point of the group
         `sme_registry.algorithms`, `module:function`, or `reference:constant`, `reference:linear`,
         `reference:random`, `reference:optimal`, which learn nothing.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
-      steps: its own budget; null takes the plan's.
+      steps: its budget; null takes the plan's.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
@@ -57,8 +57,8 @@ class StudyAlgorithm(StrictModel):
 class Cell(Document):
     """One run of a study, by content: its digest is the key of its result.
 
-    Neither the plan nor the names in it are part of a cell, so a plan may be renamed, cut or
-    extended, and what was run stays valid.
+    Neither the plan nor its names are part of a cell, so a plan may be renamed, cut or extended,
+    and its results stay valid.
     """
 
     schema_version: SchemaVersion = 1
@@ -91,8 +91,8 @@ class StudyPlan(Document):
     """A study.
 
     Attributes:
-      classes: kinds of tasks; the first is the one that others are contrasted with.
-      algorithms: what is run on each of them.
+      classes: kinds of tasks; the others are compared with the first.
+      algorithms: those run on each class.
       seeds: runs of each algorithm on each class.
       steps: environment steps of a run.
       evaluations: evenly spaced over training, the last at its end; 0 for none.

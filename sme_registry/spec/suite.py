@@ -1,6 +1,6 @@
 """`Suite`: a list of classes; a class is one setting with its instances (seeds).
 
-A method is judged on a kind of task and not on one draw of it.
+So a method is evaluated on a kind of task, not on one draw of it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""`certify`: is this draw of a task a sane one? Measured before training, not discovered after it.
+"""`certify`: checks of a drawn task, to reject a bad draw before training.
 
 Source: METHOD, sections 1 and 2. Axis letters: `S` state_dim, `A` action_dim, `N` lanes or states.
 
-A check passes inside one range, warns inside a wider one, and refuses outside both. A warning is
-for a task that is right but easy: the constant action ½ is near its optimum, as METHOD says of
-`semi_orthogonal` policies of 2 to 5 layers. Refused is what is broken, or teaches nothing.
+A check passes inside one range, warns inside a wider one, and refuses outside both. A warning means
+that a task is correct but easy: the constant action ½ is near its optimum, as METHOD says of
+`semi_orthogonal` policies of 2 to 5 layers. A broken or trivial task is refused.
 
 The ranges of difficulty come from 4,560 draws (40 seeds of 114 settings; S 1..64, A 1..16,
 L 1..20). Mean r̃ of the constant policy: smallest, median, largest. Spread: smallest, median.
@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -57,14 +57,14 @@ _CONSTANT_PASSES, _CONSTANT_WARNS = (0.65, 0.80), (0.60, 0.90)  # mean r̃ of th
 
 @dataclass(frozen=True)
 class Check:
-    """One measured number of a task beside what it should be.
+    """One measured number of a task, and its range.
 
     Attributes:
-      name: what is measured.
-      value: the number; None where it was not measured (`meaning` says why).
+      name: of the number.
+      value: the number; None where it was not measured; `meaning` gives the reason.
       low, high: the range in which it passes; None where there is no bound on that side.
-      outcome: "passed"; "warning" for a task that works and teaches little; "refused" for a
-        broken or trivial one; "reported" for what is shown and not judged.
+      outcome: "passed"; "warning" for an easy task; "refused" for a broken or
+        trivial one; "reported" for numbers without a range.
       meaning: one sentence for the reader.
     """
 
@@ -78,7 +78,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What `certify` found.
+    """The result of `certify`.
 
     Attributes:
       digest: of the spec.
@@ -93,8 +93,11 @@ class Certificate:
     @property
     def outcome(self) -> Outcome:
         """The worst of the checks: "passed", "warning" or "refused"."""
-        found = {check.outcome for check in self.checks}
-        return "refused" if "refused" in found else "warning" if "warning" in found else "passed"
+        outcomes = {check.outcome for check in self.checks}
+        for worst in ("refused", "warning"):
+            if worst in outcomes:
+                return cast(Outcome, worst)
+        return "passed"
 
     @property
     def passed(self) -> bool:
@@ -121,7 +124,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     """Measure a drawn task. The same task and seed give the same certificate.
 
     Args:
-      task: the task, or what `load_task` draws it from.
+      task: the task, or a spec, name, digest or path, as for `load_task`.
       seed: of the states and actions measured with, in [0, 2⁵³).
 
     Returns:
@@ -153,7 +156,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     return Certificate(task.spec.digest, seed, checks)
 
 
-def _judged(
+def _check(
     name: str,
     value: float,
     meaning: str,
@@ -186,19 +189,19 @@ def _parameters(task: Task) -> tuple[Check, ...]:
     orthogonal = max(_orthogonality_error(layer, unit_rows) for layer in every)
     centred = max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every)
     return (
-        _judged(
+        _check(
             "transition_row_sums",
             rows,
             "How far a row of W is from the sum 1, which keeps an action's mass.",
             passes=(None, 0.0),
         ),
-        _judged(
+        _check(
             "layers_orthogonal",
             orthogonal,
             "How far W/√12 of a layer of π* is from semi-orthogonal (rescaled: from unit rows).",
             passes=(None, _ROUNDING),
         ),
-        _judged(
+        _check(
             "layers_centred",
             centred,
             "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
@@ -220,7 +223,7 @@ def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
     """Where random actions lead an ensemble that starts uniformly, and one that starts at a point.
 
     The first must stay uniform. The second need not become so within an episode: a channel into
-    which the actions put little may stay in a nearly invariant set. That is shown, not judged.
+    which the actions put little may stay in a nearly invariant set. So it has no range.
     """
     S, A = task.spec.state_dim, task.spec.action_dim
     s = _draw(task, seed, "states", lanes, S)
@@ -231,14 +234,14 @@ def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
     # Kolmogorov's bound on √N·D, shared out over the channels (Bonferroni).
     bound = math.sqrt(0.5 * math.log(2.0 * S / _FALSE_ALARM))
     return (
-        _judged(
+        _check(
             "uniform_states",
             _distance_from_uniform(s),
             f"Largest √N·KS distance of a state channel from uniform, {MIXING_STEPS} random "
             "actions after uniform starts.",
             passes=(None, bound),
         ),
-        _judged(
+        _check(
             "coverage",
             _coverage(s, pairs=S > 1),
             f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state channels "
@@ -293,7 +296,7 @@ def _no_collapse(task: Task, seed: int) -> Check:
         _distinct(history),
         _distinct(s.reshape(len(constants), lanes, S).swapaxes(0, 1)),
     )
-    return _judged(
+    return _check(
         "distinct_states",
         min(shares),
         f"Smallest share of distinct values of a state channel, over {CONSTANT_STEPS:,} steps of "
@@ -315,7 +318,7 @@ def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
     optimal = _in_blocks(task, s)
     similarity = task.similarity_of(np.full_like(optimal, 0.5), optimal)
     return (
-        _judged(
+        _check(
             "constant_policy_similarity",
             float(similarity.mean()),
             "Mean r̃ of the constant action ½ over uniform states; near 0.75 where π* spreads over "
@@ -323,14 +326,14 @@ def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
             passes=_CONSTANT_PASSES,
             warns=_CONSTANT_WARNS,
         ),
-        _judged(
+        _check(
             "constant_policy_reward",
             float(task.reward_of(similarity).mean()),
-            "Mean step reward of the constant action ½: what an agent earns without learning.",
+            "Mean step reward of the constant action ½, which an agent earns without learning.",
             passes=(None, 0.30),
             warns=(None, 0.60),
         ),
-        _judged(
+        _check(
             "channel_spread",
             float(optimal.std(axis=0).min()),
             "Smallest standard deviation of a channel of π* over uniform states; 0.289 where it "
@@ -353,7 +356,7 @@ def _least_typical_agent(task: Task, optimal: Array) -> tuple[Check, ...]:
     means = task.similarities_of(np.full_like(optimal, 0.5), optimal).mean(axis=0)
     agent = int(np.abs(means - 0.75).argmax())
     return (
-        _judged(
+        _check(
             "agent_constant_policy_similarity",
             float(means[agent]),
             f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
@@ -380,8 +383,8 @@ def _linear_policy(task: Task, seed: int, s: Array, optimal: Array) -> Check:
     actions = np.clip(_affine(s[half:]) @ fitted, 0.0, 1.0)
     value = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
     meaning = (
-        "Mean step reward of the least-squares linear policy: what needs no deep learning. Not "
-        "judged: high at complexity 1 by construction."
+        "Mean step reward of the least-squares linear policy, which needs no deep learning. It "
+        "has no range: it is high at complexity 1 by construction."
     )
     return Check(name, float(value), None, None, "reported", meaning)
 

@@ -29,8 +29,8 @@ class Layer(NamedTuple):
 def transition_matrix(spec: SMESpec) -> Array:
     """W `[A, S]`: U(0,1) entries, each row divided by its sum, on the grid 2⁻²⁹.
 
-    In exact integer arithmetic: each entry is rounded down to the grid, and what a row then
-    lacks of exactly 1 goes, a grid step each, to the entries that lost most.
+    In exact integer arithmetic: each entry is rounded down to the grid, and a row's
+    difference from exactly 1 is added, one grid step each, to the entries that lost most.
     """
     shape = (spec.action_dim, spec.state_dim)
     bits = raw_bits(spec.seed, "transition/W", math.prod(shape)).reshape(shape)

@@ -1,4 +1,4 @@
-"""How much memory a task would take, so that what cannot fit is refused before it is drawn."""
+"""The memory that a task needs, so that one too large is refused before it is drawn."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def peak_bytes(spec: SMESpec) -> int:
 
 
 def limit_bytes() -> int:
-    """The limit: 4 GiB, or what the environment variable SME_MEMORY_LIMIT_GIB says.
+    """The limit: 4 GiB, or the value of the environment variable SME_MEMORY_LIMIT_GIB.
 
     Raises:
       OptionError: the variable is not a positive number.
@@ -44,16 +44,16 @@ def limit_bytes() -> int:
 
 
 def refuse_above_limit(needed: int, what: str, remedy: str) -> None:
-    """Raise where something would need more memory than the limit.
+    """Raise if something needs more memory than the limit.
 
     Raises:
-      ResourceLimitError: `needed` bytes are above the limit; says both.
+      ResourceLimitError: `needed` bytes exceed the limit; the message has both.
     """
     limit = limit_bytes()
     if needed > limit:
         raise ResourceLimitError(
             f"{what} would need {_gib(needed)} GiB of memory; the limit is {_gib(limit)} GiB. "
-            f"{remedy} Where there is memory for it, set {LIMIT_VARIABLE} above {_gib(needed)}."
+            f"{remedy} If the machine has the memory, set {LIMIT_VARIABLE} above {_gib(needed)}."
         )
 
 

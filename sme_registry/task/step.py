@@ -2,14 +2,14 @@
 
 Source: METHOD, sections 1 and 5. `B` batch, `n` agents (a single agent is a team of one), `S`
 state_dim, `A` action_dim, T horizon, t completed steps. Each agent i has its own r_i and r_cum:
-r_i is of the similarity over its own channels, or of all channels where the team is paid.
+r_i follows from the similarity over its own channels, or over all where the team is paid.
 
     r_cum ← r_cum + r(s, a);  s ← T(s, a);  t ← t + 1
     terminated = any r_i < D   truncated = t ≥ T
     R = r_cum where k divides t or truncated, else 0;  r_cum ← 0 after a payout
     observation = (s, t/T, r_cum/k of each agent), after the step
 
-On termination alone nothing extra is paid; what is lost stays visible as r_cum.
+On termination alone nothing extra is paid; the lost reward stays visible as r_cum.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from sme_registry.task.task import Task
 
 
 class Step(NamedTuple):
-    """What one step gives, for each lane.
+    """The result of one step, for each lane.
 
     Attributes:
       state: `[B, S]` next states.
       optimal_action: `[B, A]` π* of the states acted in.
       similarity: `[B, n]` r̃ over the agent's own channels.
       step_reward: `[B, n]` r.
-      reward: `[B, n]` R, what is paid.
+      reward: `[B, n]` R, the payout.
       accumulated_reward: `[B, n]` r_cum, after a payout's reset.
       terminated: `[B]`.
       truncated: `[B]`.
@@ -91,9 +91,9 @@ def step(
 def observe(
     spec: SMESpec, s: Array, t: npt.NDArray[np.int64], accumulated_reward: Array
 ) -> npt.NDArray[np.float32]:
-    """What there is to observe, (s, t/T, r_cum/k of each agent), `[B, S + 1 + n]` float32.
+    """The joint observation, (s, t/T, r_cum/k of each agent), `[B, S + 1 + n]` float32.
 
-    A single agent observes all of it; an agent of a team its own part, see `envs.team`.
+    A single agent observes all of it, an agent of a team only its part; see `envs.team`.
     """
     columns = [s, (t / spec.horizon)[:, None], accumulated_reward / spec.k]
     return np.concatenate(columns, axis=-1).astype(np.float32)

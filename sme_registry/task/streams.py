@@ -1,8 +1,8 @@
-"""Named, independent random streams of one seed, from raw bits with our own conversion.
+"""Named, independent random streams of one seed, converted from raw bits.
 
 stream(seed, name) = Philox4x64-10 keyed by the first 128 bits of SHA-256("sme-v1/" seed "/" name).
-A stream depends on its seed and its own name alone, so adding a layer or an agent moves no other.
-NumPy promises the raw bits of a bit generator, not what `Generator` makes of them.
+A stream depends on its seed and its name alone, so a new layer or agent changes no other stream.
+NumPy guarantees the raw bits of a bit generator, but not the numbers of its `Generator`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DYNAMICS_VERSION = 1
 
 
 def bit_generator(seed: int | str, name: str) -> np.random.Philox:
-    """A stream at its beginning, to be read on as far as it is needed."""
+    """The bit generator of a stream, at its beginning."""
     label = f"sme-v{DYNAMICS_VERSION}/{seed}/{name}"
     key = int.from_bytes(hashlib.sha256(label.encode()).digest()[:16], "little")
     return np.random.Philox(key=key)

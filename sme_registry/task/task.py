@@ -8,8 +8,8 @@ Source: METHOD, section 1. Axis letters: `B` batch, `S` state_dim, `A` action_di
     r̂(s, a)  = max(0, 4 (r̃ − ¾))
     r(s, a)  = r̂ if r̂ > r_min, else 0                   step reward; regret = 1 − r
 
-Every method takes one state `[S]` or a batch `[B, S]`, and answers in kind. States may lie outside
-the unit cube. Actions are clipped to [0, 1], as the environment clips them.
+Every method takes one state `[S]` or a batch `[B, S]`, and returns one value or a batch. States may
+lie outside the unit cube. Actions are clipped to [0, 1], as the environment clips them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Task:
     """A drawn task: pure, read-only, safe to share between environments and threads.
 
     Attributes:
-      spec: what it was drawn from.
+      spec: the spec from which it was drawn.
       W: `[A, S]` transition matrix; entries in [0, 1] on the grid 2⁻²⁹, each row sums to 1.
       b: `[S]` transition offset in (0, 1).
       policies: the layers of each agent's optimal policy; one entry where there is no team.
@@ -126,7 +126,7 @@ class Task:
         return self.reward_of(self.similarity(s, a))
 
     def regret(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """1 − r, `[B]` or a scalar, in [0, 1]: what the optimum would have earned beyond this.
+        """1 − r, `[B]` or a scalar, in [0, 1]: by how much the optimal step reward exceeds r.
 
         Raises:
           StateError, ActionError: wrong shape or not finite.
@@ -139,36 +139,41 @@ class Task:
         return cast(Array, np.where(graded > self.spec.r_min, graded, 0.0)[()])
 
     def similarity_of(self, a: Array, optimal: Array) -> Array:
-        """r̃ of actions in [0, 1] beside the optimal ones, `[..., A]` each."""
+        """r̃ of actions in [0, 1] and the optimal ones, `[..., A]` each."""
         return cast(Array, 1.0 - np.abs(a - optimal).sum(axis=-1) / self.spec.action_dim)
 
     def similarities_of(self, a: Array, optimal: Array) -> Array:
         """Each agent's r̃ over its own channels, `[..., n]` of actions `[..., A]`."""
-        missed = np.abs(a - optimal)
-        means = [missed[..., own].sum(axis=-1) / (own.stop - own.start) for own in self.owned]
+        distance = np.abs(a - optimal)
+        means = [
+            distance[..., channels].sum(axis=-1) / (channels.stop - channels.start)
+            for channels in self.owned
+        ]
         return 1.0 - np.stack(means, axis=-1)
 
     def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """Each agent's share of the team's regret, `[B, n]` or `[n]`; they add up to it.
 
         regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one.
-        The team's 1 − r̃ is the sum of all d_i / A, so each is charged in proportion to what it
-        contributed. All are 0 at the optimum.
+        The team's 1 − r̃ is the sum of all d_i / A, so each is charged in proportion to its
+        contribution. All are 0 at the optimum.
 
         Raises:
           StateError, ActionError: wrong shape or not finite.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
-        missed = np.abs(a - optimal)
-        distances = np.stack([missed[..., own].sum(axis=-1) for own in self.owned], axis=-1)
+        distance = np.abs(a - optimal)
+        distances = np.stack(
+            [distance[..., channels].sum(axis=-1) for channels in self.owned], axis=-1
+        )
         total = distances.sum(axis=-1, keepdims=True)
         shares = np.divide(distances, total, out=np.zeros_like(distances), where=total > 0)
         regret = 1.0 - self.reward_of(self.similarity_of(a, optimal))
         return cast(Array, shares * np.asarray(regret)[..., None])
 
     def difference_rewards(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """What the team would gain were one agent at its optimum, `[B, n]` or `[n]`, in [0, 1].
+        """The team's gain if one agent acted optimally, `[B, n]` or `[n]`, in [0, 1].
 
         The team's step reward with agent i's action replaced by its optimal one and all others as
         they are, minus the team's step reward as it is.
@@ -180,10 +185,10 @@ class Task:
         optimal = self.policy(s)
         as_is = self.reward_of(self.similarity_of(a, optimal))
         gains = []
-        for own in self.owned:
-            mended = a.copy()
-            mended[..., own] = optimal[..., own]
-            gains.append(self.reward_of(self.similarity_of(mended, optimal)) - as_is)
+        for channels in self.owned:
+            corrected = a.copy()
+            corrected[..., channels] = optimal[..., channels]
+            gains.append(self.reward_of(self.similarity_of(corrected, optimal)) - as_is)
         return np.stack(gains, axis=-1)
 
     def policy(self, s: Array) -> Array:
@@ -197,7 +202,7 @@ class Task:
         return np.concatenate(actions, axis=-1) if len(actions) > 1 else actions[0]
 
     def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
-        """States and actions that belong together; one of them may be single beside a batch."""
+        """Checked states and actions; one of them may be single while the other is a batch."""
         s, a = self._states(s), self._actions(a)
         if s.ndim == a.ndim == 2 and len(s) != len(a):
             raise ActionError(
@@ -213,7 +218,7 @@ class Task:
         return np.clip(_checked(a, self.spec.action_dim, "action", ActionError), 0.0, 1.0)
 
 
-def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception]) -> Array:
+def _checked(values: npt.ArrayLike, width: int, name: str, error: type[Exception]) -> Array:
     """`values` as float64 of shape `[..., width]`, finite."""
     try:
         array = np.asarray(values)
@@ -221,15 +226,15 @@ def _checked(values: npt.ArrayLike, width: int, what: str, error: type[Exception
             raise TypeError
         array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError):
-        raise error(f"{what}={values!r:.80}: must be an array of {width} numbers.") from None
+        raise error(f"{name}={values!r:.80}: must be an array of {width} numbers.") from None
     if array.ndim not in (1, 2) or array.shape[-1] != width:
         raise error(
-            f"{what} of shape {array.shape}: must be [{width}] or [B, {width}] "
-            f"(this task's {what}_dim is {width})."
+            f"{name} of shape {array.shape}: must be [{width}] or [B, {width}] "
+            f"(this task's {name}_dim is {width})."
         )
     if not (np.abs(array) < _LARGEST).all():
         raise error(
-            f"{what}: has NaN or infinite entries. Every entry must be a finite number, and below "
+            f"{name}: has NaN or infinite entries. Every entry must be a finite number, and below "
             f"{_LARGEST:g} in size."
         )
     return array

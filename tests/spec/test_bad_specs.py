@@ -91,7 +91,7 @@ BAD = [
     ),
     (
         {"team": {"agents": [{"action_dim": 2, "name": "agent_1"}, {"action_dim": 2}]}},
-        ["team.agents: the name 'agent_1' is given twice. Rename one of them."],
+        ["team.agents: the name 'agent_1' appears twice. Rename one of them."],
     ),
     (
         {"team": {"agents": [{"action_dim": 4}], "reward": "shared"}},
@@ -173,7 +173,7 @@ def test_a_spec_error_is_also_a_value_error():
         (
             Suite,
             {"classes": [{"name": "a", "setting": {}, "seeds": [i]} for i in (1, 2)]},
-            "classes: the name 'a' is given twice.",
+            "classes: the name 'a' appears twice.",
         ),
         (
             Suite,
