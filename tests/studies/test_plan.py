@@ -296,7 +296,7 @@ class TestCommands:
             (("new", "x", "-t", "Default", "-a", "PPO"), "must end in .json"),
             (("new", "x.json", "-a", "PPO"), "--suite"),
             (("new", "x.json", "-t", "Default"), "--algorithm"),
-            (("new", "x.json", "-t", "Default", "-a", "PPO", "-a", "PPO"), "given twice"),
+            (("new", "x.json", "-t", "Default", "-a", "PPO", "-a", "PPO"), "appears twice"),
             (("new", "x.json", "-t", "Default", "-a", "PPO", "--seeds", "0"), "seeds=0"),
             (("new", "x.json", "-t", "Team2", "-a", "PPO"), "classes.0.setting.team: must be null"),
             (("new", "x.json", "--suite", "teams", "-a", "PPO"), "train teams with `sme train`"),
