@@ -106,9 +106,9 @@ def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
     names = {}
     for algorithm in algorithms:
         alike = [settings[other.name] for other in algorithms if other.uses == algorithm.uses]
-        own = settings[algorithm.name]
+        options = settings[algorithm.name]
         differing = [
-            f"{key} = {own[key]}" if key in own else f"default {key}"
+            f"{key} = {options[key]}" if key in options else f"default {key}"
             for key in sorted({key for each in alike for key in each})
             if any(each.get(key) != alike[0].get(key) for each in alike)
         ]

@@ -1,6 +1,6 @@
-"""The figures of a study's report, drawn from its frames; each as bytes in every requested format.
+"""The figures of a study's report, drawn from its frames, each as bytes in every requested format.
 
-They are drawn at the width of a printed page. An algorithm has one colour, marker and dash in all
+They have the width of a printed page. An algorithm has one colour, marker and dash in all
 of them; a hollow marker stands for fewer than `ENOUGH_RUNS` runs, bars for 95 % intervals.
 """
 
@@ -29,7 +29,7 @@ __all__ = ["Picture", "draw_figures"]
 def draw_figures(
     analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
 ) -> tuple[list[Picture], list[str]]:
-    """Every figure that the finished runs allow.
+    """Draw every figure that the finished runs allow.
 
     Args:
       analysis: the tables.
@@ -42,7 +42,7 @@ def draw_figures(
     Raises:
       MissingDependencyError: Matplotlib is not installed.
     """
-    drawn = (
+    results = (
         draw_contrasts(analysis, formats, METRICS[:3], "contrasts-regret"),
         draw_contrasts(analysis, formats, METRICS[3:], "contrasts-training"),
         *(draw_regret(analysis, formats, metric) for metric in REGRET_METRICS),
@@ -55,5 +55,5 @@ def draw_figures(
         draw_maps(analysis, formats, models),
         *draw_offline(analysis, formats),
     )
-    pictures = [picture for picture in drawn if isinstance(picture, Picture)]
-    return pictures, [reason for reason in drawn if isinstance(reason, str)]
+    pictures = [picture for picture in results if isinstance(picture, Picture)]
+    return pictures, [reason for reason in results if isinstance(reason, str)]

@@ -17,20 +17,22 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Picture | str
     if rows.empty:
         return "No aggregates over classes: no class has runs of every algorithm."
     place = {group: float(i) for i, group in enumerate(dict.fromkeys(rows.group))}
-    drawn = panels.looks(analysis)
-    height = 1.1 + (0.09 * len(drawn) + 0.1) * max(2, len(place))
+    looks = panels.looks(analysis)
+    height = 1.1 + (0.09 * len(looks) + 0.1) * max(2, len(place))
     with panels.panel_grid(2, formats, (0.0, height)) as (grid, files):
         for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
-            own = rows[rows.metric == metric.key]
-            enough = own.fewest_runs >= ENOUGH_RUNS
-            panels.marks_by_algorithm(axes, own, "value", own.group.map(place), enough, drawn)
+            selected = rows[rows.metric == metric.key]
+            enough = selected.fewest_runs >= ENOUGH_RUNS
+            panels.marks_by_algorithm(
+                axes, selected, "value", selected.group.map(place), enough, looks
+            )
             axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
             axes.set_xlabel("IQM of 1 − normalised regret")
             panels.shade_rows(axes, place.values())
         labels = [literal(group) for group in place]
         grid.panels[0].set_yticks([*place.values()], labels, fontsize=8)
         grid.panels[0].set_ylim(len(place) - 0.4, -0.6)
-        panels.legend(grid.figure, drawn)
+        panels.legend(grid.figure, looks)
     return Picture(
         "aggregates",
         "Aggregates over kinds of tasks",

@@ -19,15 +19,15 @@ def draw_contrasts(
         return (
             "No contrasts: they need finished runs of one number on the first class and on another."
         )
-    drawn = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
+    looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
     axes_of = {c: analysis.classes[c].axis for c in analysis.classes if c in set(rows.class_name)}
     place = _places(axes_of)
-    height = 1.15 + (0.07 * len(drawn) + 0.09) * max(5.0, max(place.values()) + 1)
+    height = 1.15 + (0.07 * len(looks) + 0.09) * max(5.0, max(place.values()) + 1)
     with panels.panel_grid(len(metrics), formats, (0.0, height)) as (grid, files):
         for axes, metric in zip(grid.panels, metrics, strict=True):
-            own = rows[rows.metric == metric.key]
-            at = own.class_name.map(place)
-            panels.marks_by_algorithm(axes, own, "change", at, own.enough_pairs, drawn)
+            selected = rows[rows.metric == metric.key]
+            at = selected.class_name.map(place)
+            panels.marks_by_algorithm(axes, selected, "change", at, selected.enough_pairs, looks)
             axes.axvline(0.0, color="black", linewidth=0.9, zorder=1.5)
             side = "right" if metric.worse > 0 else "left"
             axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
@@ -35,7 +35,7 @@ def draw_contrasts(
             panels.shade_rows(axes, place.values())
         grid.panels[0].set_yticks([*place.values()], [*place], fontsize=8)
         grid.panels[0].set_ylim(max(place.values()) + 0.6, -0.6)
-        panels.legend(grid.figure, drawn)
+        panels.legend(grid.figure, looks)
     names = [metric.label.partition(",")[0] for metric in metrics]
     return Picture(
         name,

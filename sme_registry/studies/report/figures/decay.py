@@ -21,11 +21,11 @@ def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture | str:
     with drawing((4.8, 3.5), tuple(formats)) as (figure, files):
         axes = figure.add_subplot()
         for name, look in looks(analysis).items():
-            own = (inside.algorithm == name).to_numpy()
+            selected = (inside.algorithm == name).to_numpy()
             edge = 0.8 if look.marker in "x+12" else 0.0
             axes.plot(
-                inside.similarity[own], loss[own], **look.points, markersize=4, alpha=0.55,
-                markeredgewidth=edge, label=literal(name),
+                inside.similarity[selected], loss[selected], **look.points, markersize=4,
+                markeredgewidth=edge, alpha=0.55, label=literal(name),
             )  # fmt: skip
         axes.axhline(0.0, color=GREY, linewidth=1.0)
         axes.set_xlabel("similarity r̃ within distribution")

@@ -24,9 +24,9 @@ def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Picture | s
     place = {pair: float(i) for i, pair in enumerate(dict.fromkeys(pairs))}
     with panels.panel_grid(2, formats, (1.0, 0.26 * max(3, len(place)))) as (grid, files):
         for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
-            own = rows[rows.metric == metric.key]
-            at, enough = pairs[own.index].map(place), own.fewest_runs >= ENOUGH_RUNS
-            panels.marks(axes, own, "probability", at, enough, Look("black", "o", "-"))
+            selected = rows[rows.metric == metric.key]
+            at, enough = pairs[selected.index].map(place), selected.fewest_runs >= ENOUGH_RUNS
+            panels.marks(axes, selected, "probability", at, enough, Look("black", "o", "-"))
             axes.axvline(0.5, color=GREY, linewidth=1.0, zorder=1.5)
             axes.set_xlim(-0.02, 1.02)
             axes.set_title(panels.HEADINGS[metric.key], fontsize=9)

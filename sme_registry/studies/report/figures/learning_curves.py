@@ -36,16 +36,16 @@ def _draw_group(
     analysis: Analysis, formats: Sequence[str], group: Group, rows: pd.DataFrame, names: list[str]
 ) -> Picture:
     data = training_data(analysis.runs)
-    drawn = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
+    looks = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
     figure = panels.panel_grid(
         len(names), formats, (0.6, 4.4), width=min(panels.WIDTH, 1.2 + 2.6 * len(names)),
         most_across=_MOST_ACROSS, stack=len(CURVES),
     )  # fmt: skip
     with figure as (grid, files):
         for stack, name in zip(grid.stacks, names, strict=True):
-            own = rows[rows.algorithm == name]
+            selected = rows[rows.algorithm == name]
             for axes, measure in zip(stack, CURVES, strict=True):
-                _draw_curves(axes, own[own.measure == measure], drawn)
+                _draw_curves(axes, selected[selected.measure == measure], looks)
             stack[0].set_title(literal(name))
             stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
             stack[-1].set_xlim(left=0)
@@ -53,7 +53,7 @@ def _draw_group(
             stack[-1].xaxis.set_major_formatter(_steps)
         for index, label in enumerate(CURVES.values()):
             grid.label_rows(label, index)
-        labels = {_label(analysis, name, group): look for name, look in drawn.items()}
+        labels = {_label(analysis, name, group): look for name, look in looks.items()}
         panels.legend(grid.figure, labels, across=4)
     window = rows.window.max()
     return Picture(
@@ -67,10 +67,10 @@ def _draw_group(
     )
 
 
-def _draw_curves(axes: Any, rows: pd.DataFrame, drawn: Mapping[str, Look]) -> None:
+def _draw_curves(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> None:
     """The curves of one algorithm and measure, one a class; markers do not coincide."""
     curves = dict(iter(rows.groupby("class_name")))
-    for index, (name, look) in enumerate(drawn.items()):
+    for index, (name, look) in enumerate(looks.items()):
         if name not in curves:
             continue
         curve = curves[name]
@@ -80,7 +80,7 @@ def _draw_curves(axes: Any, rows: pd.DataFrame, drawn: Mapping[str, Look]) -> No
         every = max(1, len(curve) // 6)
         axes.plot(
             curve.step, curve["median"], **look.line, linewidth=1.6, markersize=4,
-            markevery=(index * every // len(drawn), every),
+            markevery=(index * every // len(looks), every),
         )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ def draw_offline(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
     if not analysis.has_offline_runs:
         return []
     classes = list(dict.fromkeys(analysis.offline.class_name))
-    drawn = panels.numbered_looks(dict.fromkeys(analysis.offline.learner), dashes=_DASHES)
+    looks = panels.numbered_looks(dict.fromkeys(analysis.offline.learner), dashes=_DASHES)
     across = min(3, len(classes))
     width = max(3.6, min(panels.WIDTH, 1.0 + 2.4 * across))
     with panels.panel_grid(len(classes), formats, (0.9, 2.4), width=width, share_x=True) as (
@@ -30,7 +30,7 @@ def draw_offline(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
         files,
     ):
         for axes, class_name in zip(grid.panels, classes, strict=True):
-            _draw_class(axes, analysis, class_name, drawn)
+            _draw_class(axes, analysis, class_name, looks)
         grid.label_rows("r̃ − r̃ of the behaviour")
         grid.label_columns("ν of the behaviour policy")
         lines = {
@@ -38,12 +38,12 @@ def draw_offline(analysis: Analysis, formats: Sequence[str]) -> list[Picture]:
             "optimum": (GREY, _OPTIMUM_DASH),
             "constant ½": (GREY, panels.CONSTANT_DASH),
         }
-        panels.legend(grid.figure, drawn, lines, across=2 * across)
+        panels.legend(grid.figure, looks, lines, across=2 * across)
     title = "Improvement over the behaviour policy"
     return [Picture("offline-improvement", title, _caption(analysis), files)]
 
 
-def _draw_class(axes: Any, analysis: Analysis, class_name: str, drawn: dict[str, Look]) -> None:
+def _draw_class(axes: Any, analysis: Analysis, class_name: str, looks: dict[str, Look]) -> None:
     rows = analysis.offline[analysis.offline.class_name == class_name]
     runs = analysis.offline_runs[analysis.offline_runs.class_name == class_name]
     data = rows.drop_duplicates("nu")
@@ -56,11 +56,11 @@ def _draw_class(axes: Any, analysis: Analysis, class_name: str, drawn: dict[str,
         axes.plot(data.nu, height, color=GREY, linewidth=1.1, linestyle=dash, zorder=1.6)
     nus = sorted(set(analysis.offline.nu))
     apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
-    for index, (name, look) in enumerate(drawn.items()):
-        shift = (index - (len(drawn) - 1) / 2) * 0.25 * apart / len(drawn)
-        own, each = rows[rows.learner == name], runs[runs.learner == name]
-        at, enough = own.nu + shift, own.runs >= ENOUGH_RUNS
-        panels.marks(axes, own, "improvement", at, enough, look, upright=True, joined=True)
+    for index, (name, look) in enumerate(looks.items()):
+        shift = (index - (len(looks) - 1) / 2) * 0.25 * apart / len(looks)
+        selected, each = rows[rows.learner == name], runs[runs.learner == name]
+        at, enough = selected.nu + shift, selected.runs >= ENOUGH_RUNS
+        panels.marks(axes, selected, "improvement", at, enough, look, upright=True, joined=True)
         axes.plot(
             each.nu + shift, each.improvement, **look.points, markersize=2.5, markeredgewidth=0.0,
             alpha=0.5, zorder=3.5,

@@ -210,9 +210,9 @@ def marks_by_algorithm(
 ) -> None:
     """`marks` of each algorithm, next to one another around each place."""
     for index, (name, look) in enumerate(looks.items()):
-        own = rows.algorithm == name
+        selected = rows.algorithm == name
         shift = (index - (len(looks) - 1) / 2) * spread / len(looks)
-        marks(axes, rows[own], value, at[own] + shift, filled[own], look, **options)
+        marks(axes, rows[selected], value, at[selected] + shift, filled[selected], look, **options)
 
 
 def shade_rows(axes: Axes, places: Iterable[float]) -> None:

@@ -17,11 +17,11 @@ def draw_profiles(analysis: Analysis, formats: Sequence[str], metric: Metric) ->
     if rows.empty:
         return "No performance profiles: no class has runs of every algorithm."
     groups = list(dict.fromkeys(rows.group))
-    drawn = panels.looks(analysis)
+    looks = panels.looks(analysis)
     with panels.panel_grid(len(groups), formats, (0.7, 2.1), share_x=True) as (grid, files):
         for axes, group in zip(grid.panels, groups, strict=True):
             for name, profile in rows[rows.group == group].groupby("algorithm", sort=False):
-                look, tau = drawn[name], profile.threshold
+                look, tau = looks[name], profile.threshold
                 axes.fill_between(
                     tau, profile.low, profile.high, color=look.colour, alpha=0.15, linewidth=0
                 )
@@ -35,7 +35,7 @@ def draw_profiles(analysis: Analysis, formats: Sequence[str], metric: Metric) ->
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         grid.label_rows("share of runs above τ")
         grid.label_columns("τ (1 − normalised regret)")
-        panels.legend(grid.figure, {name: drawn[name] for name in analysis.algorithms})
+        panels.legend(grid.figure, {name: looks[name] for name in analysis.algorithms})
     return Picture(
         f"profiles-{metric.key.removesuffix('_regret')}",
         f"Performance profiles {panels.HEADINGS[metric.key]}",

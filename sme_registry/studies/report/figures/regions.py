@@ -26,8 +26,8 @@ def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture | str:
     heights = 0.75, 0.62 + 0.2 * len(classes)
     with panels.panel_grid(len(analysis.algorithms), formats, heights) as (grid, files):
         for axes, name in zip(grid.panels, analysis.algorithms, strict=True):
-            own = rows[rows.algorithm == name]
-            values = own.pivot(index="class_name", columns="region", values="similarity")
+            selected = rows[rows.algorithm == name]
+            values = selected.pivot(index="class_name", columns="region", values="similarity")
             image = _heat_map(axes, values.reindex(index=classes, columns=regions).to_numpy())
             axes.set_title(literal(name))
             axes.set_xticks(range(len(regions)), [region.replace("OOD ", "") for region in regions])

@@ -20,17 +20,17 @@ def draw_regret(analysis: Analysis, formats: Sequence[str], metric: Metric) -> P
     if not groups:
         return "No normalised regret: no run has finished."
     names = analysis.learners or analysis.algorithms
-    drawn = {name: look for name, look in panels.looks(analysis).items() if name in names}
+    looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
     with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as (grid, files):
         for axes, group in zip(grid.panels, groups, strict=True):
-            _draw_axis(axes, analysis, group, metric, drawn)
-        grid.panels[0].set_ylim(bottom=0.0)  # of all, once all is drawn: it ends autoscaling
+            _draw_axis(axes, analysis, group, metric, looks)
+        grid.panels[0].set_ylim(bottom=0.0)  # last: it ends autoscaling, for all panels
         grid.label_rows("normalised regret")
         references = {
             "linear (LSQ)": (GREY, panels.LINEAR_DASH),
             "constant ½": (GREY, panels.CONSTANT_DASH),
         }
-        panels.legend(grid.figure, drawn, references)
+        panels.legend(grid.figure, looks, references)
     return Picture(
         metric.key.replace("_", "-"),
         f"Normalised regret {panels.HEADINGS[metric.key]}, along each axis",
@@ -43,7 +43,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str], metric: Metric) -> P
 
 
 def _draw_axis(
-    axes: Any, analysis: Analysis, group: Group, metric: Metric, drawn: Mapping[str, Look]
+    axes: Any, analysis: Analysis, group: Group, metric: Metric, looks: Mapping[str, Look]
 ) -> None:
     """The classes of one axis, in the order of its values."""
     x = {name: i for i, name in enumerate(group.classes)}
@@ -60,7 +60,7 @@ def _draw_axis(
     )  # fmt: skip
     axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=panels.CONSTANT_DASH, zorder=1.6)
     panels.marks_by_algorithm(
-        axes, levels, "iqm", at, levels.runs >= ENOUGH_RUNS, drawn, spread=0.5, upright=True,
+        axes, levels, "iqm", at, levels.runs >= ENOUGH_RUNS, looks, spread=0.5, upright=True,
         joined=ordered,
     )  # fmt: skip
     axes.set_xticks(
