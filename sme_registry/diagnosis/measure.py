@@ -191,7 +191,7 @@ def shells(
     seed: int,
     wd_scores: dict[str, Score],
 ) -> tuple[Shell, ...]:
-    """WD, whose scores are given, and the five shells around it."""
+    """WD, with its scores from the caller, and the five shells around it."""
     protocol = EvaluationProtocol(states_per_region=affordable(task, _SHELL_STATES), seed=seed)
     around = [
         Shell(

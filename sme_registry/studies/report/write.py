@@ -1,32 +1,34 @@
 """`write_report`: a study's folder to its report.
 
-    REPORT/index.html           the page: findings, figures and tables, nothing outside it
+    REPORT/index.html           the page: findings, figures and tables in one file
     REPORT/findings.json        the findings as data
     REPORT/figures/*.png .pdf   the figures, at the width of a printed page
     REPORT/tables/*.csv         every number
-    REPORT/tables/*.tex         what a paper prints
+    REPORT/tables/*.tex         the tables of a paper
 
-The same results give the same files. Files of an earlier report that this one does not write stay.
+The same results give the same files. Other files of an earlier report are kept.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sme_registry.errors import OptionError
 from sme_registry.io import to_json, write_atomically
 from sme_registry.studies.engine.ledger import REPORT, Ledger
-from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import csv_tables, text_tables
 from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.frames import plan_file
 from sme_registry.studies.report.page import page
 
+__all__ = ["FORMATS", "write_report"]
+
 FORMATS = ("html", "png", "pdf", "csv", "latex")
-_DRAWN = {"html": "svg", "png": "png", "pdf": "pdf"}
+_FIGURE_FORMATS = {"html": "svg", "png": "png", "pdf": "pdf"}
 
 
 def write_report(
@@ -34,10 +36,10 @@ def write_report(
     out: str | os.PathLike[str] | None = None,
     formats: Sequence[str] = FORMATS,
 ) -> list[Path]:
-    """Write the report of a study from whatever of its runs has finished.
+    """Write the report of a study's finished runs.
 
-    Models that the study kept are loaded for the maps of the plane, and loading one can run code of
-    whoever made it. Nothing else of the folder is more than data.
+    The maps of the plane need the models that the study kept, and loading a model can run code of
+    its author. All other files of the folder are read as data.
 
     Args:
       folder: of the study.
@@ -48,9 +50,9 @@ def write_report(
       The files written, the page first.
 
     Raises:
-      OptionError: an unknown format, no study in the folder, none of its runs has finished, or the
+      OptionError: a format is unknown, the folder holds no study, no run has finished, or the
         report cannot be written.
-      SpecError: the folder's plan is no plan.
+      SpecError: the folder's plan is invalid.
       MissingDependencyError: Matplotlib is not installed.
     """
     unknown = [name for name in formats if name not in FORMATS]
@@ -63,21 +65,27 @@ def write_report(
     if not results:
         raise OptionError(
             f"folder={str(folder)!r}: none of its {len(keys)} runs has finished. Run them with "
-            "`sme study run`, and look at them with `sme study status`."
+            "`sme study run`, and check them with `sme study status`."
         )
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
-    analysis = analyse(file, results, failures)
-    tables = text_tables(analysis)
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
-    drawn = [ending for name, ending in _DRAWN.items() if name in formats]
-    figures, absent = draw_figures(analysis, drawn, models) if drawn else ([], [])
-
+    contents = _contents(analyse(file, results, failures), models, formats)
     target = Path(folder) / REPORT if out is None else Path(out)
+    return [write_atomically(target / name, content) for name, content in contents.items()]
+
+
+def _contents(
+    analysis: Analysis, models: Mapping[str, Path], formats: Sequence[str]
+) -> dict[str, str | bytes]:
+    """The contents of each file, by its name in the report."""
+    tables = text_tables(analysis)
+    figure_formats = [_FIGURE_FORMATS[name] for name in formats if name in _FIGURE_FORMATS]
+    figures, absent = draw_figures(analysis, figure_formats, models) if figure_formats else ([], [])
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
-        found = findings(analysis)
-        contents["index.html"] = page(analysis, found, figures, absent, tables)
-        contents["findings.json"] = to_json(found.to_dict())
+        document = findings(analysis)
+        contents["index.html"] = page(analysis, document, figures, absent, tables)
+        contents["findings.json"] = to_json(document.to_dict())
     for ending in ("png", "pdf"):
         if ending in formats:
             contents |= {f"figures/{x.name}.{ending}": x.files[ending] for x in figures}
@@ -85,4 +93,4 @@ def write_report(
         contents |= {f"tables/{name}.csv": text for name, text in csv_tables(analysis).items()}
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
-    return [write_atomically(target / name, content) for name, content in contents.items()]
+    return contents
