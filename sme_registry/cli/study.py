@@ -211,13 +211,13 @@ def _print_status(status: StudyStatus) -> None:
     result = table(
         f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}",
         {"class": "name", **{escape(name): "number" for name in algorithms}},
-        caption="done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]",
     )
     counts = status.counts
     for class_name in unique(cell.planned.class_name for cell in status.cells):
         row = [counts.get((class_name, name)) for name in algorithms]
         result.add_row(class_name, *("" if each is None else _counts(each) for each in row))
     out().print(result)
+    out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
     if status.seconds_left.high > 0:
