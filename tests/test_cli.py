@@ -256,6 +256,12 @@ class TestNew:
         good("new", "plain.json")
         assert load(tmp_path / "plain.json") == SMESpec()
 
+    def test_every_field_of_a_spec_has_an_option_with_a_description(self) -> None:
+        text = good("new", "--help").stdout
+        for field in SMESpec.model_fields.keys() - {"schema_version"}:
+            assert f"--{field.replace('_', '-')} " in text
+        assert "None" not in text
+
     def test_from_derives_and_its_file_is_loaded_by_its_path(self, tmp_path: Path) -> None:
         printed = good("new", "a.json", "--from", "HardDeep", "--k", "5").stdout
         spec = load(tmp_path / "a.json")
