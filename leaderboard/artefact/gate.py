@@ -301,9 +301,7 @@ class _Inspection:
             if "dim_value" in dim and "dim_param" in dim:
                 raise WireError("a dimension with a length and a symbol")
             length = signed(dim["dim_value"]) if "dim_value" in dim else None
-            lengths.append(
-                None if length == -1 else length
-            )  # -1 is how some exporters write an open length
+            lengths.append(None if length == -1 else length)  # some exporters write -1 for "any"
         return _text(value.get("name", b"")), tensor.get("elem_type", 0), lengths
 
     def _interface(self, what: str, values: list[memoryview], width: int, exact: bool) -> None:
