@@ -84,7 +84,7 @@ def test_every_number_is_that_of_teams_stepped_in_a_loop(spec: Any, action_range
         assert rewards.dtype == np.float32
         for team, env in enumerate(theirs):
             acted = {name: joint[team, own[i]] for i, name in enumerate(task.names)}
-            observed[team], paid, dead, late, told = env.step(acted)
+            observed[team], paid, dead, late, infos_by_agent = env.step(acted)
             for agent, name in enumerate(task.names):
                 lane = team * n + agent
                 info = infos[lane]
@@ -97,8 +97,8 @@ def test_every_number_is_that_of_teams_stepped_in_a_loop(spec: Any, action_range
                     last = info.pop("terminal_observation")
                     expected = shown(env, agent, observed[team][name])
                     np.testing.assert_array_equal(last, expected, strict=True)
-                assert info.keys() == told[name].keys()
-                for key, value in told[name].items():
+                assert info.keys() == infos_by_agent[name].keys()
+                for key, value in infos_by_agent[name].items():
                     assert type(info[key]) is type(value)
                     np.testing.assert_array_equal(info[key], value, strict=True)
             if not env.agents:

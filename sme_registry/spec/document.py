@@ -237,15 +237,10 @@ def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
         return " or ".join(repr(value) for value in schema.get("enum", [schema.get("const")]))
     schema = _resolved(root, schema)
     match schema.get("type"):
-        case "integer" | "number" as kind:
-            noun = "an integer" if kind == "integer" else "a finite number"
-            low = f"[{schema['minimum']}" if "minimum" in schema else "(−∞"
-            high = f"{schema['maximum']}]" if "maximum" in schema else "∞)"
-            if "exclusiveMinimum" in schema:
-                low = f"({schema['exclusiveMinimum']}"
-            if "exclusiveMaximum" in schema:
-                high = f"{schema['exclusiveMaximum']})"
-            return noun if (low, high) == ("(−∞", "∞)") else f"{noun} in {low}, {high}"
+        case "integer":
+            return "an integer" + _interval(schema)
+        case "number":
+            return "a finite number" + _interval(schema)
         case "string" if "pattern" in schema and "description" in schema:
             return str(schema["description"])
         case "string":
@@ -257,6 +252,21 @@ def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
         case "boolean":
             return "true or false"
     return str(schema.get("type", schema.get("description", "of another form")))
+
+
+def _interval(schema: dict[str, Any]) -> str:
+    low, high = "(−∞", "∞)"
+    for bound, value in schema.items():
+        match bound:
+            case "minimum":
+                low = f"[{value}"
+            case "exclusiveMinimum":
+                low = f"({value}"
+            case "maximum":
+                high = f"{value}]"
+            case "exclusiveMaximum":
+                high = f"{value})"
+    return "" if (low, high) == ("(−∞", "∞)") else f" in {low}, {high}"
 
 
 def _length(schema: dict[str, Any], of: str, unit: str) -> str:

@@ -44,7 +44,7 @@ def test_module_and_id_make_the_task_in_a_fresh_process() -> None:
     assert digest == sme_registry.load("Complexity2").digest
 
 
-def test_a_json_env_spec_makes_the_task_in_a_process_that_never_heard_of_it() -> None:
+def test_a_json_env_spec_makes_the_task_in_a_process_that_did_not_register_it() -> None:
     sent = sme_registry.env_spec(SMESpec(complexity=3, seed=11), action_range="symmetric").to_json()
     answer = fresh_python(
         "import gymnasium, json\n"

@@ -138,7 +138,7 @@ def test_state_is_a_copy_of_all_of_s_whatever_is_observed() -> None:
     assert env.state_space.contains(env.state())
 
 
-def test_the_end_of_one_is_the_end_of_all_and_both_flags_are_told_to_everyone() -> None:
+def test_the_end_of_one_agent_ends_the_episode_of_all_with_the_same_flags() -> None:
     env = begun("Team4", D=0.5, horizon=1)
     actions = dict(zip(env.agents, np.split(env.task.optimal_action(START), 4), strict=True))
     actions["agent_2"] = np.abs(actions["agent_2"] - 0.3)
@@ -284,7 +284,7 @@ def test_a_bad_reset_is_refused_and_the_episode_goes_on(
     assert env.step(middle(env))[0]["agent_0"][-2] == np.float32(2 / 100)
 
 
-def test_reset_begins_where_it_is_told_and_ignores_options_that_are_not_for_it() -> None:
+def test_reset_begins_at_the_given_state_and_ignores_unknown_options() -> None:
     env = sme_registry.make_parallel("TeamBlind4")
     observations, _ = env.reset(seed=1, options={"state": START, "render": 5})
     for name, channels in zip(env.possible_agents, env.task.observed, strict=True):

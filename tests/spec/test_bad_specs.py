@@ -101,7 +101,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("fields", "fragments"), BAD, ids=[str(b)[:50] for b, _ in BAD])
-def test_a_bad_field_is_refused_in_words_that_say_what_to_do(fields, fragments):
+def test_the_error_of_a_bad_field_names_value_range_and_fix(fields, fragments):
     with pytest.raises(SpecError) as caught:
         SMESpec.from_dict(fields)
     message = str(caught.value)
@@ -117,13 +117,13 @@ def test_what_is_no_mapping_is_no_spec(document):
         SMESpec.from_dict(document)
 
 
-def test_all_errors_are_told_at_once():
+def test_all_errors_are_listed_at_once():
     with pytest.raises(SpecError) as caught:
         SMESpec.from_dict({"k": 0, "r_min": 2, "seeed": 1, "team": {"agents": [{"action_dim": 0}]}})
     lines = str(caught.value).splitlines()
     assert lines[0] == "SMESpec: "
-    told = [line.strip().split(":")[0] for line in lines[1:]]
-    assert told == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
+    fields = [line.strip().split(":")[0] for line in lines[1:]]
+    assert fields == ["k=0", "r_min=2", "team.agents.0.action_dim=0", "seeed=1"]
 
 
 def test_the_source_of_a_document_begins_its_error():

@@ -1,4 +1,4 @@
-"""Whatever names a task leads to its spec, and what names nothing is told what is near."""
+"""Every name of a task resolves to its spec; the error of an unknown name suggests the nearest."""
 
 import shutil
 
@@ -75,7 +75,7 @@ def test_a_path_needs_no_ending_where_it_cannot_be_a_name(tmp_path):
         (f"SME/{DEFAULT.spec.content_name}-v9", "no task has version 9 of the dynamics"),
     ],
 )
-def test_an_unknown_name_is_told_what_is_near(name, fragment):
+def test_the_error_of_an_unknown_name_suggests_the_nearest(name, fragment):
     with pytest.raises(UnknownNameError) as caught:
         resolve(name)
     assert fragment in str(caught.value)
@@ -94,7 +94,7 @@ def test_a_missing_file_says_so(path):
         resolve(path)
 
 
-def test_a_bare_spec_is_told_from_a_file(tmp_path):
+def test_a_bare_spec_is_distinguished_from_a_file(tmp_path):
     path = tmp_path / "bare.json"
     path.write_text(SMESpec(k=5).model_dump_json())
     with pytest.raises(MalformedDocumentError, match=r"bare spec.*sme_registry\.save"):
