@@ -1,4 +1,4 @@
-"""Figures: whole files of the asked format, and what is drawn in them."""
+"""Figures: complete files in the requested format, and their content."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_unknown_formats_are_rejected_before_anything_is_drawn(tmp_path, report,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_figure_that_fails_leaves_the_old_file(tmp_path):
+def test_a_figure_that_fails_keeps_the_old_file(tmp_path):
     path = tmp_path / "map.png"
     path.write_bytes(b"old")
     with pytest.raises(PolicyError):
@@ -82,7 +82,7 @@ def test_without_matplotlib_the_message_names_the_extra(tmp_path, report, monkey
         plots.decay_curve(report, tmp_path / "figure.png")
 
 
-def test_drawing_leaves_matplotlibs_settings_alone(tmp_path, report):
+def test_drawing_does_not_change_matplotlibs_settings(tmp_path, report):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
@@ -112,7 +112,7 @@ def test_figures_name_their_task(tmp_path, report, figures):
     assert figures[2].get_suptitle() == ""
 
 
-def test_a_policys_name_is_not_read_as_a_formula(tmp_path, report, figures):
+def test_policy_names_are_not_parsed_as_formulas(tmp_path, report, figures):
     plots.decay_curve(report, tmp_path / "figure.png")  # "$\\frac$" would be an error
     assert figures[0].legends[0].get_texts()[0].get_text() == r"a \$\frac\$ name"
 
@@ -152,7 +152,7 @@ def test_decay_curve_of_a_team_has_a_line_for_each_agent(tmp_path, figures, n):
     assert len(figures[1].axes[0].lines) == 2
 
 
-def test_similarity_map_of_a_team_is_of_its_joint_action(tmp_path, figures):
+def test_similarity_map_of_a_team_shows_its_joint_action(tmp_path, figures):
     team = PLANE.derive(team={"agents": [{"action_dim": 1, "observes": [1]}, {"action_dim": 1}]})
     own = {"agent_0": lambda o: o[:, :1], "agent_1": lambda o: o[:, :1]}
     plots.similarity_map(own, team, tmp_path / "map.png", resolution=8, epsilon=1.0)
@@ -193,7 +193,7 @@ def test_similarity_map_shows_r_over_the_plane_beyond_the_unit_square(tmp_path, 
     assert set(zip(*outline.get_data(), strict=True)) == {(0, 0), (1, 0), (1, 1), (0, 1)}
 
 
-def test_similarity_map_gives_the_policy_the_asked_time(tmp_path):
+def test_similarity_map_passes_the_time_to_the_policy(tmp_path):
     seen = set()
 
     def watching(observations):

@@ -7,7 +7,7 @@ columns of the CSV files.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,7 +122,8 @@ def number(value: float, digits: int = 2, sign: str = "") -> str:
 def _contrasts(analysis: Analysis, metric: str, label: str) -> TextTable:
     rows = analysis.contrasts[analysis.contrasts.metric == metric]
     digits = 1 if metric == "final_return" else 2
-    frame = _wide(rows, {"class_name": "class"}, "algorithm", lambda row: _change(row, digits))
+    at, order = {"class_name": "class"}, analysis.algorithms
+    frame = _wide(rows, at, "algorithm", lambda row: _change(row, digits), order)
     settings = [analysis.classes[name].label for name in frame["class"]]
     frame.insert(1, "setting", settings)
     return TextTable(
@@ -188,24 +189,29 @@ def _counts(analysis: Analysis) -> TextTable:
 
 
 def _wide(
-    rows: pd.DataFrame, index: dict[str, str], across: str, entry: Callable[[Any], str]
+    rows: pd.DataFrame,
+    index: dict[str, str],
+    across: str,
+    entry: Callable[[Any], str],
+    order: Sequence[str] = (),
 ) -> pd.DataFrame:
-    """A long table as text, `across` as columns; orders are those of the rows.
+    """A long table as text, `across` as columns, in the order of the rows.
 
     Args:
       rows: the long table.
       index: its columns that name the rows, and their headings.
       across: the column whose values become columns.
       entry: the text of a row.
+      order: of the columns; by default that of the rows, too.
     """
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows.itertuples():
         place = tuple(getattr(row, name) for name in index)
         lines.setdefault(place, {})[getattr(row, across)] = entry(row)
-    columns = [*index.values(), *dict.fromkeys(rows[across])]
+    names = [name for name in order or dict.fromkeys(rows[across]) if name in set(rows[across])]
     wide = pd.DataFrame(
         [dict(zip(index.values(), place, strict=True)) | line for place, line in lines.items()],
-        columns=columns,
+        columns=[*index.values(), *names],
     )
     if "nu" in index:
         wide[index["nu"]] = wide[index["nu"]].map("{:g}".format)

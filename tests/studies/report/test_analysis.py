@@ -1,4 +1,4 @@
-"""A study's tables: they hold what the runs left, and missing runs are part of no number."""
+"""The tables of a study: the numbers of its finished runs; missing runs are part of none."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def contrast(analysis: Analysis, class_name: str, algorithm: str, metric: str) -
     return row_of(analysis.contrasts, class_name, algorithm, metric)
 
 
-def test_what_is_missing_is_counted_and_named(study):
+def test_missing_runs_are_counted_and_named(study):
     analysis = study[2]
     assert list(analysis.missing.itertuples(index=False, name=None)) == [
         ("k-25", "Beta", 3, "ValueError: <b>bad</b>"),
@@ -67,7 +67,7 @@ def test_what_is_missing_is_counted_and_named(study):
     assert len(analysis.runs) == analysis.counts.done.sum() == 73
 
 
-def test_a_class_is_known_by_the_axis_in_which_it_differs_from_the_first(study):
+def test_a_class_has_the_axis_in_which_it_differs_from_the_first(study):
     classes = study[2].classes
     assert [(info.axis, info.label) for info in classes.values()] == [
         ("", ""),
@@ -78,7 +78,7 @@ def test_a_class_is_known_by_the_axis_in_which_it_differs_from_the_first(study):
     ]
 
 
-def test_a_contrast_pairs_runs_of_one_number(study):
+def test_a_contrast_pairs_runs_of_equal_number(study):
     before, after = regrets(study, "default", "Beta"), regrets(study, "k-25", "Beta")
     row = contrast(study[2], "k-25", "Beta", "wd_regret")
     assert sorted(after) == [0, 1, 2]
@@ -89,7 +89,7 @@ def test_a_contrast_pairs_runs_of_one_number(study):
     assert row.verdict == "worse"
 
 
-def test_contrasts_find_what_each_learner_was_made_to_suffer_from(study):
+def test_contrasts_find_the_axis_that_each_learner_is_sensitive_to(study):
     analysis = study[2]
     for algorithm, class_name in (("Alpha", "r_min-0_5"), ("Beta", "k-25")):
         rows = [
@@ -104,7 +104,7 @@ def test_contrasts_find_what_each_learner_was_made_to_suffer_from(study):
     assert contrast(analysis, "r_min-0_5", "constant", "wd_regret").verdict == "open"
 
 
-def test_what_learns_nothing_has_no_regret_of_training(study):
+def test_a_reference_has_no_online_regret(study):
     analysis = study[2]
     assert analysis.learners == ("Alpha", "Beta")
     assert row_of(analysis.levels, "default", "constant", "online_regret") is None
@@ -121,7 +121,7 @@ def test_one_run_has_no_interval(study):
     assert set(alone.contrasts.verdict) == {"open"}
 
 
-def test_only_classes_where_all_have_runs_are_compared(study):
+def test_only_classes_with_runs_of_every_algorithm_are_compared(study):
     file, results, _ = study
     gone = {
         cell.cell.digest for cell in file.plan.cells
@@ -151,7 +151,7 @@ def test_curves_are_the_median_over_runs_then_smoothed(study):
 
 
 @pytest.mark.parametrize(("evaluations", "width"), [(1, 1), (10, 1), (40, 4), (100, 10), (400, 10)])
-def test_the_window_is_ten_evaluations_where_there_are_enough(evaluations: int, width: int):
+def test_the_window_is_at_most_ten_evaluations(evaluations: int, width: int):
     assert window(evaluations) == width
 
 
@@ -170,7 +170,7 @@ def test_without_the_first_class_there_are_no_contrasts(study):
     assert len(cut.runs) == len(results) - len(first)
 
 
-def test_of_no_result_there_are_no_numbers(study):
+def test_without_results_the_tables_are_empty(study):
     empty = analyse(study[0], {}, draws=50)
     assert len(empty.missing) == 75
     assert empty.results.empty
