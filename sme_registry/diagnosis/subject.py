@@ -23,8 +23,8 @@ from sme_registry.spec.study import Cell
 from sme_registry.task.draw import Array
 from sme_registry.training import RunRecord, checkpoint
 from sme_registry.training import episodes as episode_files
-from sme_registry.training.learn import MODEL
 from sme_registry.training.numpy_policy import numpy_policy
+from sme_registry.training.record import MODEL
 
 __all__ = ["Log", "Subject", "load_cell", "load_policy", "load_run"]
 

@@ -1,12 +1,19 @@
 """Files and arguments: strict JSON, atomic writes, folders, locks, versions, argument checks."""
 
 from sme_registry.io.checks import choice, integer_in
-from sme_registry.io.files import TEMPORARY, atomic_file, temporary_beside, write_atomically
-from sme_registry.io.folders import build_folder, claim_folder, refuse_existing, sync_folder
-from sme_registry.io.imports import import_object
-from sme_registry.io.installed import is_installed, require_packages, versions
+from sme_registry.io.files import (
+    TEMPORARY,
+    atomic_file,
+    build_folder,
+    claim_folder,
+    refuse_existing,
+    sync_folder,
+    temporary_beside,
+    write_atomically,
+)
 from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
 from sme_registry.io.locks import Lock, file_lock, is_locked
+from sme_registry.io.packages import import_object, is_installed, require_packages, versions
 
 __all__ = [
     "MAX_DOCUMENT_BYTES",

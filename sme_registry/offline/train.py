@@ -39,8 +39,8 @@ from sme_registry.offline.source import check_task, data_source
 from sme_registry.spec import ProtocolLike, SpecLike
 from sme_registry.task import Task, materialize
 from sme_registry.training import known_algorithm
-from sme_registry.training.evaluation import DECAY_CURVE, EVALUATION, write_evaluation
 from sme_registry.training.record import PACKAGES
+from sme_registry.training.run import DECAY_CURVE, EVALUATION, write_evaluation
 
 RECORD = "offline.json"
 POLICY = "policy.npz"

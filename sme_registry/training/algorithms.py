@@ -36,7 +36,7 @@ def default_algorithm(spec: SMESpec) -> str:
 
 
 def default_num_envs(spec: SMESpec, algorithm: str) -> int:
-    """The number of parallel environments by default: 1, and 8 for a team and an on-policy one.
+    """The default number of parallel environments: 8 for a team and an on-policy algorithm, or 1.
 
     With an off-policy algorithm, more environments would mean fewer updates.
     """
@@ -78,23 +78,16 @@ def require_sb3() -> None:
     Raises:
       MissingDependencyError: names the extra to install.
     """
-    packages = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
-    require_packages("training", packages, "train")
+    require_packages(
+        "training", {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}, "train"
+    )
 
 
 def load_algorithm(name: str) -> Any:
-    """The algorithm's class.
-
-    Raises:
-      UnknownNameError: no such algorithm.
-      MissingDependencyError: Stable-Baselines3 is not installed.
-    """
-    name = known_algorithm(name)
-    require_sb3()
+    """The class of an algorithm of `ALGORITHMS`; see `require_sb3`."""
     # It imports the deprecated `gym` if that is installed, which prints a long notice.
-    with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return getattr(importlib.import_module("stable_baselines3"), name)
+    with contextlib.redirect_stderr(io.StringIO()), quiet():
+        return getattr(importlib.import_module("stable_baselines3"), known_algorithm(name))
 
 
 def is_sb3(algorithm: Any) -> bool:
@@ -123,12 +116,9 @@ def silence(model: Any) -> None:
     model.set_logger(Logger(None, []))
 
 
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def quiet() -> contextlib.AbstractContextManager[Any]:
     """Hide warnings of libraries, which address their developers and not our users."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    return warnings.catch_warnings(action="ignore")
 
 
 @contextlib.contextmanager

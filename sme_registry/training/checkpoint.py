@@ -22,11 +22,7 @@ _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def save(model: Any, path: Path) -> None:
-    """Write a checkpoint completely or not at all.
-
-    Raises:
-      OptionError: it cannot be written; the previous one is unchanged.
-    """
+    """Write a checkpoint; raises OptionError if that fails, and the previous one is unchanged."""
     archive = io.BytesIO()
     model.save(archive)
     buffer = getattr(model, "replay_buffer", None)
@@ -55,20 +51,19 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
     """
     try:
         with zipfile.ZipFile(path) as members:
-            has_replay = _MEMBER in members.namelist()
-            stored = io.BytesIO(members.read(_MEMBER)) if has_replay else None
-        replay = None if stored is None else dict(np.load(stored, allow_pickle=False))
-        if replay is not None and "buffer_size" in kwargs:
+            if _MEMBER not in members.namelist():
+                return algorithm.load(path, env=env, device="cpu", **kwargs)
+            replay = dict(np.load(io.BytesIO(members.read(_MEMBER)), allow_pickle=False))
+        if "buffer_size" in kwargs:
             kwargs["buffer_size"] = max(kwargs["buffer_size"], replay["rewards"].size)
         model = algorithm.load(path, env=env, device="cpu", **kwargs)
-        if replay is not None:
-            _refill(model.replay_buffer, replay)
+        _refill(model.replay_buffer, replay)
+        return model
     except Exception as error:
         raise PolicyError(
             f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
             "(in Python, force=True), or in another folder."
         ) from error
-    return model
 
 
 def _refill(buffer: Any, replay: dict[str, Any]) -> None:

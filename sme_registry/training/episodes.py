@@ -70,13 +70,12 @@ def read_episodes(path: Path) -> list[Episode]:
     episodes = []
     for row in rows[1:]:
         try:
-            if len(row) != len(head):
-                break
-            values = [kind(text) for kind, text in zip(_TYPES, row, strict=False)]
-            regrets = tuple(map(float, row[len(COLUMNS) :]))
-        except ValueError:
+            kinds = zip(_TYPES + (float,) * len(agents), row, strict=True)
+            values = [kind(text) for kind, text in kinds]
+        except ValueError:  # a number or a column is missing
             break
-        episodes.append(Episode._make((*values, regrets)))
+        regrets = tuple(values[len(COLUMNS) :])
+        episodes.append(Episode._make((*values[: len(COLUMNS)], regrets)))
     return episodes
 
 

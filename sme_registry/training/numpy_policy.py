@@ -84,9 +84,8 @@ def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) 
     perceptron = _perceptron(getattr(model, "policy", model))
     if perceptron is None:
         return policy
-    width = spec.state_dim + 2
-    probes = streams.uniform(0, "actor/probes", _PROBES * width).reshape(_PROBES, width)
-    observations = probes.astype(np.float32)
+    probes = streams.uniform(0, "actor/probes", _PROBES * (spec.state_dim + 2))
+    observations = probes.reshape(_PROBES, -1).astype(np.float32)
     expected, actions = policy.act(observations), perceptron(observations)
     # A subclass may do more than its layers say. NaN counts as a difference.
     same = expected.shape == actions.shape and np.allclose(

@@ -12,7 +12,9 @@ from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel
 
-FILE = "run.json"
+RECORD = "run.json"
+MODEL = "model.zip"
+TENSORBOARD = "tensorboard"
 DEFAULTS = "stable-baselines3 defaults"
 PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
 
@@ -66,16 +68,12 @@ class RunRecord(StrictModel):
         Raises:
           MalformedDocumentError, SpecError: the file exists but is not a valid record.
         """
-        path = folder / FILE
+        path = folder / RECORD
         return cls.from_dict(read_json(path), str(path)) if path.exists() else None
 
     def write(self, folder: Path) -> None:
-        """Write the record into the run's folder, completely or not at all.
-
-        Raises:
-          OptionError: the file cannot be written.
-        """
-        write_atomically(folder / FILE, to_json(self.to_dict()))
+        """Write the record into the run's folder; raises OptionError if that fails."""
+        write_atomically(folder / RECORD, to_json(self.to_dict()))
 
     def updated(self, **changes: Any) -> RunRecord:
         """This record with some fields changed."""

@@ -38,11 +38,17 @@ from sme_registry.training.algorithms import (
     rollout_steps,
 )
 from sme_registry.training.episodes import Episode
-from sme_registry.training.evaluation import DECAY_CURVE, EVALUATION, write_evaluation
-from sme_registry.training.learn import MODEL, TENSORBOARD, learn
-from sme_registry.training.record import DEFAULTS, PACKAGES, RunRecord
-from sme_registry.training.record import FILE as RECORD
+from sme_registry.training.record import (
+    DEFAULTS,
+    MODEL,
+    PACKAGES,
+    RECORD,
+    TENSORBOARD,
+    RunRecord,
+)
 
+EVALUATION = "evaluation.json"
+DECAY_CURVE = "decay_curve.png"
 TRAINING_CURVE = "training_curve.png"
 SIMILARITY_MAP = "similarity_map.png"
 REPORT = "report.md"  # written by `sme demo`
@@ -144,6 +150,8 @@ def train(
     record = _claim(folder, plan, resume=resume, force=force)
     record.write(folder)
     with quiet(), one_thread():
+        from sme_registry.training.learn import learn
+
         record, episodes, model = learn(record, folder, progress, console)
         report, figures = _evaluate(model, record, folder, progress, console)
     record = record.updated(status="finished")
@@ -194,11 +202,7 @@ def _plan(
 
 
 def _claim(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
-    """Prepare the folder; returns the plan, with the progress of a run that is resumed.
-
-    Raises:
-      OptionError: the folder contains something that must not be replaced.
-    """
+    """Prepare the folder; returns the plan, with the progress of a run that is resumed."""
     previous = None if force else RunRecord.read(folder)
     if previous is None:
         claim_folder(folder, _FILES if force else (), force=force)
@@ -248,3 +252,13 @@ def _evaluate(
             path = folder / SIMILARITY_MAP
             figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
     return report, tuple(figures)
+
+
+def write_evaluation(report: EvaluationReport, folder: Path) -> list[Path]:
+    """Write a report, and its decay curve if matplotlib is installed; returns the figures."""
+    report.write(folder / EVALUATION)
+    if not is_installed("matplotlib"):
+        return []
+    from sme_registry import plots
+
+    return [plots.decay_curve(report, folder / DECAY_CURVE)]

@@ -1,14 +1,16 @@
-"""Installed packages: their versions, and an error if an optional one is missing."""
+"""Installed packages: their versions, whether they are installed, and objects in them by name."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
 import platform
 import sys
 from collections.abc import Iterable, Mapping
 from importlib import metadata
+from typing import Any
 
-from sme_registry.errors import MissingDependencyError
+from sme_registry.errors import MissingDependencyError, SMEError, did_you_mean
 from sme_registry.version import __version__
 
 
@@ -54,3 +56,32 @@ def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> N
             f"{purpose}: {' and '.join(missing)} {verb} not installed. "
             f"Run `pip install 'sme-registry[{extra}]'`."
         )
+
+
+def import_object(name: str, field: str, error: type[SMEError]) -> Any:
+    """Import an object by name. The working directory is searched first.
+
+    Args:
+      name: `module:attribute`. Importing a module runs its code.
+      field: the argument that holds the name, for error messages.
+      error: the type of error to raise.
+
+    Raises:
+      SMEError: of that type: the module or attribute does not exist, or importing it fails.
+    """
+    module_name, _, attribute = name.partition(":")
+    folder, near = os.getcwd(), ""
+    sys.path.insert(0, folder)
+    try:
+        module = importlib.import_module(module_name)
+        near = did_you_mean(attribute, dir(module))
+        return getattr(module, attribute)
+    except SMEError:
+        raise
+    except Exception as reason:
+        raise error(
+            f"{field}={name!r}: cannot be imported: {type(reason).__name__}: {reason}.{near} It "
+            "must be module:function, with the module in the working directory or installed."
+        ) from reason
+    finally:
+        sys.path.remove(folder)
