@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from sme_registry.compiled.values import REWARD, SIMILARITY
 from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import (
     BehaviourPolicy,
@@ -173,7 +174,8 @@ def play(
     while running.any():
         action = np.clip(policy.act(batch.state, observation), 0.0, 1.0).astype(np.float32)
         step = batch.advance(action.astype(np.float64))
-        similarity, reward = step.values[0].mean(axis=0), step.values[3].mean(axis=0)
+        similarity = step.values[SIMILARITY].mean(axis=0)
+        reward = step.values[REWARD].mean(axis=0)
         sums += running * np.stack([reward, similarity, np.ones(lanes)])
         running &= ~(step.terminated | step.truncated)
         observation = step.observation

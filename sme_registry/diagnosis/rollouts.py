@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.values import REWARD, STEP_REWARD
 from sme_registry.diagnosis.document import POLICY, OnPolicy, RewardSignal, Score, Training
 from sme_registry.diagnosis.measure import MAX_NUMBERS
 from sme_registry.diagnosis.subject import Log
@@ -86,7 +87,7 @@ def rollout(act: Callable[[Observation], Array], task: Task, initial_states: Arr
         step = batch.advance(np.ascontiguousarray(a, np.float64))
         due = ((len(rows) + 1) % task.spec.k == 0) | step.truncated
         mae, constant_mae = (np.abs(x - step.optimal).mean(axis=1) for x in (a, 0.5))
-        reward, payout = step.values[1, 0].copy(), step.values[3, 0].copy()
+        reward, payout = step.values[STEP_REWARD, 0].copy(), step.values[REWARD, 0].copy()
         rows.append((s, mae, constant_mae, reward, payout, alive.copy(), due))
         terminated |= alive & step.terminated
         alive &= ~(step.terminated | step.truncated)

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
+from sme_registry.compiled.values import REWARD
 from sme_registry.envs import arguments
 from sme_registry.envs.base import RENDER_MODES, RenderMixin
 from sme_registry.envs.batch import Batch, BatchStep
@@ -191,33 +192,33 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         except ActionError:
             raise self._not_finite(joint) from None
         terminated, truncated = done.terminated.item(), done.truncated.item()
-        values = done.values.ravel().tolist()
+        values = done.values[:, :, 0].tolist()  # of the only lane
         infos = self._infos(done.optimal[0].copy(), values)
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
             self._record_step(joint, done)
-        names, n = self.possible_agents, len(self.possible_agents)
+        names = self.possible_agents
         return (
             self._by_agent(done.observation),
-            dict(zip(names, values[3 * n : 4 * n])),  # noqa: B905  # a keyword costs a percent
+            dict(zip(names, values[REWARD])),  # noqa: B905  # a keyword costs a percent
             dict.fromkeys(names, terminated),
             dict.fromkeys(names, truncated),
             infos,
         )
 
-    def _infos(self, optimal: Array, values: list[float]) -> dict[str, dict[str, Any]]:
-        """Each agent's info, from the values `[5 · n]` of a `BatchStep`."""
+    def _infos(self, optimal: Array, values: list[list[float]]) -> dict[str, dict[str, Any]]:
+        """Each agent's info, from the values `[5][n]` of a `BatchStep`."""
         if self._rescaled:
             optimal = arguments.from_unit(optimal, self._rescaled)
-        n = len(self.possible_agents)
+        similarity, step_reward, regret, _, accumulated = values
         return {
             name: {
                 "optimal_action": optimal[channels],
-                "similarity": values[agent],
-                "step_reward": values[n + agent],
-                "regret": values[2 * n + agent],
-                "accumulated_reward": values[4 * n + agent],
+                "similarity": similarity[agent],
+                "step_reward": step_reward[agent],
+                "regret": regret[agent],
+                "accumulated_reward": accumulated[agent],
             }
             for agent, name, channels in self._parts
         }
