@@ -27,8 +27,8 @@ from sme_registry.spec.document import (
     SchemaVersion,
     plain_number,
     refuse_repeated_names,
-    short_repr,
 )
+from sme_registry.spec.validation_errors import short_repr
 
 MAX_DIM = 2**20
 MAX_SEED = 2**53  # above it not every integer is a JSON number that all readers agree on

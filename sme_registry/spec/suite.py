@@ -14,9 +14,9 @@ from sme_registry.spec.document import (
     Name,
     SchemaVersion,
     refuse_repeated_names,
-    short_repr,
 )
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
+from sme_registry.spec.validation_errors import short_repr
 
 
 class SuiteClass(Document):

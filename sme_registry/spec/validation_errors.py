@@ -1,0 +1,136 @@
+"""Pydantic's validation errors as messages with field, value, allowed range and fix.
+
+The allowed range is read from the JSON Schema of the document, so it is written in one place only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from sme_registry.errors import SpecError, did_you_mean
+
+_MAX_REPR = 60
+
+
+def short_repr(value: Any) -> str:
+    """A value as an error repeats it: cut to a length that fits on a line."""
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply"
+    return text if len(text) <= _MAX_REPR else text[: _MAX_REPR - 1] + "…"
+
+
+def spec_error(error: ValidationError, source: str, schema: dict[str, Any]) -> SpecError:
+    """Pydantic's errors as a SpecError, one line each.
+
+    Args:
+      error: what the validation of a document raised.
+      source: what to call the document, such as its path.
+      schema: the JSON Schema of the document.
+    """
+    lines = error.errors()
+    parents = {line["loc"][:depth] for line in lines for depth in range(len(line["loc"]))}
+    # Pydantic counts only valid entries: a list of one invalid entry is also "too short".
+    lines = [line for line in lines if line["type"] != "too_short" or line["loc"] not in parents]
+    texts = [_explain(schema, line) for line in lines]
+    text = texts[0] if len(texts) == 1 else "".join(f"\n  {text}" for text in texts)
+    return SpecError(f"{source}: {text}")
+
+
+def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
+    """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
+    location, kind = line["loc"], line["type"]
+    path = ".".join(str(part) for part in location)
+    value = short_repr(line["input"])
+    if kind in ("extra_forbidden", "invalid_key"):
+        known = _resolved(root, _schema_at(root, location[:-1])).get("properties", {})
+        hint = did_you_mean(str(location[-1]), known) or f" Known fields: {', '.join(known)}."
+        if kind == "invalid_key":
+            return f"{path}: field names must be strings.{hint}"
+        return f"{path}={value}: unknown field.{hint} Rename or remove it."
+    schema = _schema_at(root, location)
+    if kind == "value_error":
+        message = str(line["ctx"]["error"])
+        if "properties" not in _resolved(root, schema):
+            return f"{path}={value}: {message}"
+        return f"{path}.{message}" if path else message  # of a model: names its field
+    if kind == "missing":
+        return f"{path}: missing: must be {_allowed(root, schema)}. Add it."
+    if kind in ("model_type", "model_attributes_type"):
+        return f"{path}{': ' if path else ''}must be an object of named fields, got {value}."
+    fix = "Correct it."
+    if "default" in schema:
+        fix = f"Leave it out for the default, {short_repr(schema['default'])}."
+    allowed = f"must be {_allowed(root, schema)}" if schema else line["msg"]
+    return f"{path}={value}: {allowed}. {fix}"
+
+
+def _schema_at(root: dict[str, Any], location: tuple[int | str, ...]) -> dict[str, Any]:
+    """The JSON Schema of a place in a document; empty where the schema does not describe it."""
+    schema = root
+    for part in location:
+        schema = _resolved(root, schema)
+        if isinstance(part, int):
+            schema = schema.get("items", {})
+        else:
+            named = schema.get("properties", {})
+            schema = named.get(part) or schema.get("additionalProperties") or {}
+    return schema
+
+
+def _resolved(root: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """The definition that a schema refers to, directly or as an optional value; else itself."""
+    for option in schema.get("anyOf", [schema]):
+        if "$ref" in option:
+            definition: dict[str, Any] = root["$defs"][option["$ref"].rpartition("/")[2]]
+            return definition
+    return schema
+
+
+def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
+    """What a JSON Schema allows, in words."""
+    if "anyOf" in schema:
+        return " or ".join(_allowed(root, option) for option in schema["anyOf"])
+    if "const" in schema or "enum" in schema:
+        return " or ".join(repr(value) for value in schema.get("enum", [schema.get("const")]))
+    schema = _resolved(root, schema)
+    match schema.get("type"):
+        case "integer":
+            return "an integer" + _interval(schema)
+        case "number":
+            return "a finite number" + _interval(schema)
+        case "string" if "pattern" in schema and "description" in schema:
+            return str(schema["description"])
+        case "string":
+            return "a string" + _length(schema, "Length", "characters")
+        case "array":
+            return "a list" + _length(schema, "Items", "entries")
+        case "object":
+            return f"an object: {', '.join(schema.get('properties', ['names with values']))}"
+        case "boolean":
+            return "true or false"
+    return str(schema.get("type", schema.get("description", "of another form")))
+
+
+def _interval(schema: dict[str, Any]) -> str:
+    low, high = "(−∞", "∞)"
+    for bound, value in schema.items():
+        match bound:
+            case "minimum":
+                low = f"[{value}"
+            case "exclusiveMinimum":
+                low = f"({value}"
+            case "maximum":
+                high = f"{value}]"
+            case "exclusiveMaximum":
+                high = f"{value})"
+    return "" if (low, high) == ("(−∞", "∞)") else f" in {low}, {high}"
+
+
+def _length(schema: dict[str, Any], of: str, unit: str) -> str:
+    shortest, longest = schema.get(f"min{of}", 0), schema.get(f"max{of}")
+    return "" if longest is None else f" of {shortest} to {longest} {unit}"
