@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from sme_registry.diagnosis import measure, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
@@ -12,13 +11,12 @@ from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.diagnosis.subject import Subject
 from sme_registry.io import integer_in, versions
 from sme_registry.spec import EvaluationProtocol
-from sme_registry.task import Task, materialize
+from sme_registry.task import materialize
 from sme_registry.training.numpy_policy import Perceptron
 
 __all__ = ["EPISODES", "STATES", "diagnose"]
 
 STATES, EPISODES = 8192, 64
-_EXPLORATION_STATES = 256
 
 
 def diagnose(
@@ -49,20 +47,18 @@ def diagnose(
       MissingDependencyError: the probe needs PyTorch, which is not installed.
       ResourceLimitError: the task does not fit in memory.
     """
-    measurer = _Measurer(
-        integer_in("states", states, 64, 1_000_000),
-        integer_in("episodes", episodes, 8, 10_000),
-        integer_in("seed", seed, 0, 2**53 - 1),
-        progress or (lambda description: None),
-    )
-    measurements = measurer.measurements(subject, probe_capacity)
-    judged, comparison = verdicts.judge(measurements, subject.spec), None
+    states = integer_in("states", states, 64, 1_000_000)
+    episodes = integer_in("episodes", episodes, 8, 10_000)
+    seed = integer_in("seed", seed, 0, 2**53 - 1)
+    report = progress or (lambda description: None)
+    measurements = _measurements(subject, states, episodes, seed, report)
+    if probe_capacity:
+        probe = _probe(subject, seed, report)
+        measurements = measurements.model_copy(update={"capacity": probe})
+    comparison = None
     if against is not None:
-        other = measurer.measurements(against, False)
-        comparison = compare(
-            subject, measurements, judged, against, other, verdicts.judge(other, against.spec)
-        )
-        judged = verdicts.judge(measurements, subject.spec, comparison)
+        other = _measurements(against, states, episodes, seed, report)
+        comparison = compare(subject, measurements, against, other)
     return Diagnosis(
         name=subject.name,
         spec=subject.spec,
@@ -70,7 +66,7 @@ def diagnose(
         plan=subject.plan,
         checkpoint_step=subject.checkpoint_step,
         level=verdicts.level(measurements),
-        verdicts=judged,
+        verdicts=verdicts.judge(measurements, subject.spec, comparison),
         comparison=comparison,
         thresholds=THRESHOLDS,
         measurements=measurements,
@@ -78,67 +74,54 @@ def diagnose(
     )
 
 
-@dataclass(frozen=True)
-class _Measurer:
-    """The amount and seed of the measurements, and where progress is reported."""
-
-    states: int
-    episodes: int
-    seed: int
-    report: Callable[[str], None]
-
-    def measurements(self, subject: Subject, probe_capacity: bool) -> Measurements:
-        task, policy, seed = materialize(subject.spec), subject.policy, self.seed
-        self.report(f"{subject.name}: uniform states")
-        references = measure.fit_references(task, self.states, seed)
-        count = measure.affordable(task, self.states)
-        protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-        states = measure.sample(policy, task, references, protocol, 0)
-        uniform = measure.scores(task, states)
-        time_dependence, time_variance = measure.time_dependence(policy, task, states)
-        squared_error = measure.squared_error(policy, task, states, time_variance)
-        response = measure.response(policy, task, states, seed)
-        self.report(f"{subject.name}: shells")
-        shells = measure.shells(policy, task, references, seed, uniform)
-        self.report(f"{subject.name}: episodes")
-        on_policy = rollouts.on_policy(policy, task, references, self.episodes, seed)
-        training = None
-        if subject.log is not None:
-            constant = min(on_policy.scores[name].regret for name in rollouts.CONSTANTS)
-            training = rollouts.training(subject.log, constant)
-        return Measurements(
-            uniform=uniform,
-            channels=measure.channels(task, states),
-            partitions=measure.partitions(task, states),
-            shells=shells,
-            squared_error=squared_error,
-            response=response,
-            time_dependence=time_dependence,
-            on_policy=on_policy,
-            training=training,
-            exploration_sd=self._exploration_sd(subject, states),
-            capacity=self._probe(subject, task) if probe_capacity else None,
-        )
-
-    def _exploration_sd(self, subject: Subject, states: measure.Sample) -> tuple[float, ...] | None:
-        if subject.explore is None:
-            return None
-        from sme_registry.diagnosis.networks import exploration_sd
-
-        observation = states.observation[:_EXPLORATION_STATES]
-        return tuple(exploration_sd(subject.explore, observation, self.seed).tolist())
-
-    def _probe(self, subject: Subject, task: Task) -> CapacityProbe | None:
-        network = subject.policy.act
-        if not isinstance(network, Perceptron):
-            return None
+def _measurements(
+    subject: Subject, states: int, episodes: int, seed: int, report: Callable[[str], None]
+) -> Measurements:
+    task, policy = materialize(subject.spec), subject.policy
+    report(f"{subject.name}: uniform states")
+    references = measure.fit_references(task, states, seed)
+    protocol = EvaluationProtocol(states_per_region=measure.affordable(task, states), seed=seed)
+    sample = measure.sample(policy, task, references, protocol, 0)
+    uniform = measure.scores(task, sample)
+    time_dependence, time_variance = measure.time_dependence(policy, task, sample)
+    squared_error = measure.squared_error(policy, task, sample, time_variance)
+    response = measure.response(policy, task, sample, seed)
+    report(f"{subject.name}: shells")
+    shells = measure.shells(policy, task, references, seed, uniform)
+    report(f"{subject.name}: episodes")
+    on_policy = rollouts.on_policy(policy, task, references, episodes, seed)
+    training = exploration_sd = None
+    if subject.log is not None:
+        constant = min(on_policy.scores[name].regret for name in rollouts.CONSTANTS)
+        training = rollouts.training(subject.log, constant)
+    if subject.explore is not None:
         from sme_registry.diagnosis import networks
 
-        def progress(done: int) -> None:
-            if done % 1000 == 0:
-                total = networks.GRADIENT_STEPS
-                self.report(f"{subject.name}: capacity, {done:,} of {total:,} gradient steps")
+        exploration_sd = networks.exploration_sd(subject.explore, sample.observation, seed)
+    return Measurements(
+        uniform=uniform,
+        channels=measure.channels(task, sample),
+        partitions=measure.partitions(task, sample),
+        shells=shells,
+        squared_error=squared_error,
+        response=response,
+        time_dependence=time_dependence,
+        on_policy=on_policy,
+        training=training,
+        exploration_sd=exploration_sd,
+    )
 
-        steps = subject.plan.get("steps")
-        count = steps if isinstance(steps, int) and steps else networks.DEFAULT_STATES
-        return networks.probe_capacity(network, task, count, self.seed, progress)
+
+def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> CapacityProbe | None:
+    network = subject.policy.act
+    if not isinstance(network, Perceptron):
+        return None
+    from sme_registry.diagnosis import networks
+
+    def progress(done: int) -> None:
+        total = networks.GRADIENT_STEPS
+        report(f"{subject.name}: capacity, {done:,} of {total:,} gradient steps")
+
+    steps = subject.plan.get("steps")
+    count = steps if isinstance(steps, int) and steps else networks.DEFAULT_STATES
+    return networks.probe_capacity(network, materialize(subject.spec), count, seed, progress)

@@ -12,13 +12,13 @@ Normalised regret does not depend on k, r_min or D, so it compares runs on diffe
 from __future__ import annotations
 
 import os
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
-from pydantic import Field, JsonValue
+from pydantic import JsonValue
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.io import read_json
-from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel
+from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 
 __all__ = [
     "POLICY",
@@ -43,7 +43,6 @@ __all__ = [
     "Verdict",
 ]
 
-Reals = Annotated[tuple[Real, ...], Field(strict=False)]
 Answer = Literal["yes", "no", "cannot tell"]
 Kind = Literal["where", "why"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
@@ -52,244 +51,156 @@ POLICY = "policy"  # the key of the diagnosed policy among the names of the refe
 
 
 class Score(StrictModel):
-    """One policy over a set of states: mean regret, mean |a − a*|, and normalised regret."""
+    """One policy over a set of states."""
 
-    regret: Real
+    regret: Real  # mean
     mae: Real
     normalised_regret: Real
 
 
 class Channel(StrictModel):
-    """One action channel over uniform states of the cube.
+    """One action channel over uniform states of the cube; the regrets add up to the mean regret."""
 
-    Attributes:
-      channel: from 1.
-      mae: mean |a − a*|.
-      normalised_regret: of the channel.
-      linear_normalised_regret: of the linear least-squares policy in this channel.
-      regret: the channel's part of the mean regret, in proportion to its part of the error in each
-        state. The channels add up to the mean regret.
-      offset: mean of a − a*.
-      slope: of the regression of a on a*: 1 at the optimum, 0 if a does not follow a*.
-      at_zero, at_one: share of states in which a is within 0.01 of the bound.
-      optimal_at_bounds: share of states in which a* is within 0.01 of either bound.
-    """
-
-    channel: Integer
+    channel: Integer  # from 1
     mae: Real
     normalised_regret: Real
-    linear_normalised_regret: Real
-    regret: Real
-    offset: Real
-    slope: Real
-    at_zero: Real
+    linear_normalised_regret: Real  # of the linear least-squares policy
+    regret: Real  # in proportion to the channel's part of the error in each state
+    offset: Real  # mean of a − a*
+    slope: Real  # of the regression of a on a*: 1 at the optimum, 0 if a does not follow a*
+    at_zero: Real  # share of states in which a is within 0.01 of the bound
     at_one: Real
-    optimal_at_bounds: Real
+    optimal_at_bounds: Real  # share of states in which a* is within 0.01 of either bound
 
 
 class Partition(StrictModel):
-    """Uniform states in bins of equal counts along one quantity.
+    """Uniform states in bins of equal counts along one quantity."""
 
-    Attributes:
-      state_channel: from 1; None for the distance from the cube's centre, E(s).
-      edges: of the bins, one more than there are bins.
-      regret, mae: mean of each bin.
-      explained_variance: share of the variance of the states' errors that lies between bins.
-    """
-
-    state_channel: Integer | None
-    edges: Reals
-    regret: Reals
-    mae: Reals
-    explained_variance: Real
+    state_channel: Integer | None  # from 1; None for the distance from the cube's centre, E(s)
+    edges: TupleOf[Real]  # of the bins, one more than there are bins
+    regret: TupleOf[Real]  # mean of each bin
+    mae: TupleOf[Real]
+    explained_variance: Real  # share of the variance of the states' errors between bins
 
 
 class Shell(StrictModel):
-    """A region of the protocol (WD, OOD 1, …) with the scores of the policy and references."""
+    """A region of the protocol (WD, OOD 1, …)."""
 
     region: str
     epsilon: Real
-    scores: dict[str, Score]
+    scores: dict[str, Score]  # of the policy and references
 
 
 class SquaredError(StrictModel):
-    """Shares of the squared error Σ (a − a*)² over uniform states.
+    """Shares of the squared error Σ (a − a*)² over uniform states."""
 
-    Attributes:
-      offset: a constant a − a* in each channel.
-      scale: a slope of a on a* other than 1.
-      residual: the rest; offset, scale and residual add up to 1.
-      noise: differs when the policy acts again in the same state.
-      time: varies with the input t/T in a fixed state.
-      accumulated_reward: varies with the input r_cum/k in a fixed state.
-    """
-
-    offset: Real
-    scale: Real
-    residual: Real
-    noise: Real
-    time: Real
-    accumulated_reward: Real
+    offset: Real  # a constant a − a* in each channel
+    scale: Real  # a slope of a on a* other than 1
+    residual: Real  # the rest; offset, scale and residual add up to 1
+    noise: Real  # differs when the policy acts again in the same state
+    time: Real  # varies with the input t/T in a fixed state
+    accumulated_reward: Real  # varies with the input r_cum/k in a fixed state
 
 
 class Response(StrictModel):
     """How actions follow the state, compared with π*.
 
-    Attributes:
-      nonlinear_variance: share of the variance of π* that no affine map of the state explains.
-      linear_slope, nonlinear_slope: slope of the policy's affine part on that of π*, and of its
-        remainder on that of π*: 1 at the optimum, 0 if nothing was learnt. None if π* has no such
-        part (below 1 % of its variance).
-      sensitivity: RMS change of a over RMS change of a*, for small steps of the state.
-      saturation, optimal_saturation: share of entries within 0.01 of a bound, of a and of a*.
+    A slope is that of a part of the policy on the same part of π*: 1 at the optimum, 0 if nothing
+    was learnt, None if π* has no such part (below 1 % of its variance).
     """
 
-    nonlinear_variance: Real
-    linear_slope: Real | None
-    nonlinear_slope: Real | None
-    sensitivity: Real
-    saturation: Real
-    optimal_saturation: Real
+    nonlinear_variance: Real  # share of the variance of π* that no affine map explains
+    linear_slope: Real | None  # of the affine part
+    nonlinear_slope: Real | None  # of the remainder
+    sensitivity: Real  # RMS change of a over RMS change of a*, for small steps of the state
+    saturation: Real  # share of the policy's entries within 0.01 of a bound
+    optimal_saturation: Real  # likewise of a*
 
 
 class TimeDependence(StrictModel):
-    """The input t/T varied in fixed uniform states.
+    """The input t/T varied in fixed uniform states."""
 
-    Attributes:
-      inputs: the values of t/T.
-      normalised_regret: at each value.
-      action_change: mean |a − mean over the values of a| at each value.
-    """
-
-    inputs: Reals
-    normalised_regret: Reals
-    action_change: Reals
+    inputs: TupleOf[Real]  # the values of t/T
+    normalised_regret: TupleOf[Real]  # at each value
+    action_change: TupleOf[Real]  # mean |a − mean over the values of a|, at each value
 
 
 class RewardSignal(StrictModel):
-    """How often a step is rewarded; `rewarded`, `gated` and `flat` are shares that add up to 1.
+    """How often a step is rewarded; `rewarded`, `gated` and `flat` are shares that add up to 1."""
 
-    Attributes:
-      rewarded: r > 0.
-      gated: r̂ > 0, but r_min sets it to 0.
-      flat: r̂ = 0, i.e. r̃ ≤ ¾.
-      shortfall: mean distance of r̃ below ¾ + r_min/4, above which r > 0; 0 beyond it.
-    """
-
-    rewarded: Real
-    gated: Real
-    flat: Real
-    shortfall: Real
+    rewarded: Real  # r > 0
+    gated: Real  # r̂ > 0, but r_min sets it to 0
+    flat: Real  # r̂ = 0, i.e. r̃ ≤ ¾
+    shortfall: Real  # mean distance of r̃ below ¾ + r_min/4, above which r > 0; 0 beyond it
 
 
 class OnPolicy(StrictModel):
     """Whole episodes from uniform initial states.
 
-    Attributes:
-      episodes: how many.
-      scores: of the policy and of references, each in the states that it visits.
-      edges: of the bins of time, in steps.
-      regret, mae: mean of each bin, over the episodes that still run; alive: the share of those.
-      mean_length: of an episode, in steps.
-      termination_rate: share of episodes that D terminated.
-      signal: in the states that the policy visits.
-      random_signal: under uniform random actions, as an untrained agent sees it.
-      credit, random_credit: squared correlation of a step's reward with the payout that includes
-        it: 1 at k = 1, about 1/k if rewards are independent. None if one of them is constant.
-      state_shift: Kolmogorov-Smirnov distance of the visited states from uniform, by state channel.
-      coverage: smallest share, over state channels, of twenty equal bins that were visited.
+    Credit is the squared correlation of a step's reward with the payout that includes it: 1 at
+    k = 1, about 1/k if rewards are independent. None if one of them is constant.
     """
 
-    episodes: Integer
-    scores: dict[str, Score]
-    edges: Reals
-    regret: Reals
-    mae: Reals
-    alive: Reals
-    mean_length: Real
-    termination_rate: Real
-    signal: RewardSignal
-    random_signal: RewardSignal
+    episodes: Integer  # number of episodes
+    scores: dict[str, Score]  # of the policy and of references, each in the states that it visits
+    edges: TupleOf[Real]  # of the bins of time, in steps
+    regret: TupleOf[Real]  # mean of each bin, over the episodes that still run
+    mae: TupleOf[Real]
+    alive: TupleOf[Real]  # the share of those
+    mean_length: Real  # of an episode, in steps
+    termination_rate: Real  # share of episodes that D terminated
+    signal: RewardSignal  # in the states that the policy visits
+    random_signal: RewardSignal  # under uniform random actions, as an untrained agent sees it
     credit: Real | None
     random_credit: Real | None
-    state_shift: Reals
-    coverage: Real
+    state_shift: TupleOf[Real]  # Kolmogorov-Smirnov distance from uniform, by state channel
+    coverage: Real  # smallest share, over state channels, of twenty equal bins that were visited
 
 
 class Training(StrictModel):
-    """A summary of the training log; the regrets are running medians over `window` rows.
+    """A summary of the training log; the regrets are running medians over `window` rows."""
 
-    Attributes:
-      source: "episodes" with exploration, or "evaluations" of the deterministic policy.
-      rows: of the log.
-      steps: environment steps at its last row.
-      window: rows of the running median.
-      first_regret, best_regret, last_regret: at the start, at its lowest, at the end.
-      best_step: at which it was lowest.
-      constant_regret: mean regret of the better constant policy on its own states.
-      improvement_step: the first at which it is below `constant_regret` by 0.02; None: never.
-      recent_improvement: its fall over the last third of the rows.
-      unrewarded: share of episodes without any reward; None if the log has no episodes.
-      termination_rate: share of episodes that D terminated; None likewise.
-    """
-
-    source: Literal["episodes", "evaluations"]
-    rows: Integer
-    steps: Integer
+    source: Literal["episodes", "evaluations"]  # with exploration, or of the deterministic policy
+    rows: Integer  # of the log
+    steps: Integer  # environment steps at its last row
     window: Integer
     first_regret: Real
-    best_regret: Real
-    best_step: Integer
+    best_regret: Real  # the lowest
+    best_step: Integer  # at which it was lowest
     last_regret: Real
-    constant_regret: Real
-    improvement_step: Integer | None
-    recent_improvement: Real
-    unrewarded: Real | None
-    termination_rate: Real | None
+    constant_regret: Real  # mean regret of the better constant policy on its own states
+    improvement_step: Integer | None  # the first at 0.02 below `constant_regret`; None: never
+    recent_improvement: Real  # fall over the last third of the rows
+    unrewarded: Real | None  # share of episodes without any reward; None for evaluations
+    termination_rate: Real | None  # share of episodes that D terminated; None likewise
 
 
 class CapacityProbe(StrictModel):
-    """A network of the same layers, fitted to a* by regression.
+    """A network of the same layers, fitted to a* by regression."""
 
-    Attributes:
-      layers: widths, from the observation to the action.
-      states: in the training set: as many as the training had steps, at most 50,000.
-      gradient_steps: of the fit.
-      train_normalised_regret: in states of the training set.
-      test_normalised_regret: in other states.
-      seconds: wall time.
-    """
-
-    layers: Annotated[tuple[Integer, ...], Field(strict=False)]
-    states: Integer
+    layers: TupleOf[Integer]  # widths, from the observation to the action
+    states: Integer  # in the training set: as many as the training had steps, at most 50,000
     gradient_steps: Integer
-    train_normalised_regret: Real
-    test_normalised_regret: Real
-    seconds: Real
+    train_normalised_regret: Real  # in states of the training set
+    test_normalised_regret: Real  # in other states
+    seconds: Real  # wall time
 
 
 class Measurements(StrictModel):
-    """Everything that was measured.
+    """Everything that was measured; None for what is unknown or was not measured."""
 
-    Attributes:
-      uniform: the policy and each reference in the same uniform states of the cube.
-      channels, partitions, shells, squared_error, response, time_dependence, on_policy: see there.
-      training: None if there is no log.
-      exploration_sd: for each action channel, the standard deviation of exploration around the
-        deterministic action at the end of training, in the unit range; None if unknown.
-      capacity: None if it was not probed.
-    """
-
-    uniform: dict[str, Score]
-    channels: Annotated[tuple[Channel, ...], Field(strict=False)]
-    partitions: Annotated[tuple[Partition, ...], Field(strict=False)]
-    shells: Annotated[tuple[Shell, ...], Field(strict=False)]
+    uniform: dict[str, Score]  # the policy and each reference in the same uniform states
+    channels: TupleOf[Channel]
+    partitions: TupleOf[Partition]
+    shells: TupleOf[Shell]
     squared_error: SquaredError
     response: Response
     time_dependence: TimeDependence
     on_policy: OnPolicy
     training: Training | None = None
-    exploration_sd: Reals | None = None
+    # For each action channel, the standard deviation of exploration around the deterministic action
+    # at the end of training, in the unit range.
+    exploration_sd: TupleOf[Real] | None = None
     capacity: CapacityProbe | None = None
 
     @property
@@ -299,23 +210,14 @@ class Measurements(StrictModel):
 
 
 class Verdict(StrictModel):
-    """The answer to one question, as data; `render.sentence` puts it in words.
+    """The answer to one question, as data; `render.sentence` puts it in words."""
 
-    Attributes:
-      question: such as "sparsity".
-      kind: "where" the error is, or "why" it is there.
-      answer: "cannot tell" if the evidence does not separate the causes.
-      reason: the rule's branch that decided; see `verdicts.QUESTIONS`.
-      evidence: the numbers that the branch compared or reports.
-      thresholds: those that the numbers were compared with.
-    """
-
-    question: str
-    kind: Kind
-    answer: Answer
-    reason: str
-    evidence: dict[str, JsonValue]
-    thresholds: dict[str, Real]
+    question: str  # such as "sparsity"
+    kind: Kind  # "where" the error is, or "why" it is there
+    answer: Answer  # "cannot tell" if the evidence does not separate the causes
+    reason: str  # the rule's branch that decided; see `verdicts.QUESTIONS`
+    evidence: dict[str, JsonValue]  # the numbers that the branch compared or reports
+    thresholds: dict[str, Real]  # those that the numbers were compared with
 
 
 class Difference(StrictModel):
@@ -327,50 +229,30 @@ class Difference(StrictModel):
 
 
 class Comparison(StrictModel):
-    """This run compared with another.
+    """This run compared with another; pairs are (this run, other run)."""
 
-    Attributes:
-      name: of the other run.
-      spec_fields, plan_fields: those that differ, as (this run, other run).
-      differences: of the main quantities.
-      answers: to each question whose answers differ, as (this run, other run).
-    """
-
-    name: str
-    spec_fields: dict[str, tuple[JsonValue, JsonValue]]
-    plan_fields: dict[str, tuple[JsonValue, JsonValue]]
-    differences: Annotated[tuple[Difference, ...], Field(strict=False)]
-    answers: dict[str, tuple[Answer, Answer]]
+    name: str  # of the other run
+    spec_fields: dict[str, tuple[JsonValue, JsonValue]]  # those that differ
+    plan_fields: dict[str, tuple[JsonValue, JsonValue]]  # likewise
+    differences: TupleOf[Difference]  # of the main quantities
+    answers: dict[str, tuple[Answer, Answer]]  # to each question whose answers differ
 
 
 class Diagnosis(StrictModel):
-    """The diagnosis of one policy.
-
-    Attributes:
-      name: of the run or policy.
-      spec, spec_digest: the task.
-      plan: algorithm, seed, steps and so on; empty for a policy without a run.
-      checkpoint_step: of an unfinished run, the steps done at its checkpoint; None otherwise.
-      level: normalised regret, ranked among the constant ½, the linear policy and the optimum.
-      verdicts: one for each question, in order.
-      comparison: with another run; None if there is none.
-      thresholds: all that verdicts use.
-      measurements: what the verdicts rest on.
-      versions: of Python and of the packages that the numbers depend on.
-    """
+    """The diagnosis of one policy."""
 
     schema_version: SchemaVersion = 1
-    name: str
+    name: str  # of the run or policy
     spec: SMESpec
     spec_digest: Digest
-    plan: dict[str, JsonValue]
-    checkpoint_step: Integer | None = None
-    level: Level
-    verdicts: Annotated[tuple[Verdict, ...], Field(strict=False)]
+    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
+    checkpoint_step: Integer | None = None  # of an unfinished run, the steps at its checkpoint
+    level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0
+    verdicts: TupleOf[Verdict]  # one for each question, in order
     comparison: Comparison | None = None
-    thresholds: dict[str, Real]
-    measurements: Measurements
-    versions: dict[str, str]
+    thresholds: dict[str, Real]  # all that verdicts use
+    measurements: Measurements  # what the verdicts rest on
+    versions: dict[str, str]  # of Python and of the packages that the numbers depend on
 
     def verdict(self, question: str) -> Verdict:
         """The verdict on a question, such as "sparsity"."""

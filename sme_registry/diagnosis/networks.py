@@ -20,8 +20,8 @@ from sme_registry.compiled import engine
 from sme_registry.diagnosis.document import CapacityProbe
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
-from sme_registry.errors import MissingDependencyError
 from sme_registry.evaluation import Policy
+from sme_registry.io import require_packages
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 from sme_registry.training.numpy_policy import Perceptron
@@ -33,7 +33,8 @@ DEFAULT_STATES = 20_000
 _MIN_STATES, _MAX_STATES = 256, 50_000
 _TEST_STATES = 4096
 _BATCH, _LEARNING_RATE = 256, 3e-3  # the rate decays to 0 along a cosine
-_EXPLORATION_SAMPLES = 16  # of the action in a state
+_EXPLORATION_STATES, _EXPLORATION_SAMPLES = 256, 16  # samples of the action in each state
+_PROGRESS = 1000  # gradient steps
 
 
 def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
@@ -60,11 +61,12 @@ def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | 
 
 def exploration_sd(
     explore: Callable[[Observation], Any], observation: Observation, seed: int
-) -> Array:
-    """`[A]` standard deviation of exploration in a state, over many states."""
+) -> tuple[float, ...]:
+    """The standard deviation of exploration in a state, by action channel, over a few states."""
     with _torch_seed(seed):
+        observation = observation[:_EXPLORATION_STATES]
         sampled = np.array([explore(observation.copy()) for _ in range(_EXPLORATION_SAMPLES)])
-    return np.asarray(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)))
+    return tuple(np.sqrt(sampled.var(axis=0, ddof=1).mean(axis=0)).tolist())
 
 
 def probe_capacity(
@@ -77,17 +79,14 @@ def probe_capacity(
       task: the task.
       states: in the training set; at most 50,000.
       seed: of the states and of the initial weights.
-      progress: called with the number of gradient steps done.
+      progress: called with the number of gradient steps done, every 1,000 steps.
 
     Raises:
       MissingDependencyError: PyTorch is not installed.
     """
-    try:
-        import torch
-    except ImportError:
-        raise MissingDependencyError(
-            "probe_capacity: PyTorch is not installed. Run `pip install 'sme-registry[train]'`."
-        ) from None
+    require_packages("probe_capacity", {"torch": "PyTorch"}, "train")
+    import torch
+
     begun = time.monotonic()
     count = max(_MIN_STATES, min(states, _MAX_STATES))
     train = _pairs(task, count, seed, "diagnosis/told")
@@ -134,7 +133,7 @@ def _fit(
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-        if step % 100 == 99:
+        if (step + 1) % _PROGRESS == 0:
             progress(step + 1)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from sme_registry.diagnosis.document import POLICY, Channel
@@ -12,11 +13,12 @@ __all__ = ["WHERE"]
 
 WHERE: dict[str, Question] = {}
 """Questions about the policy, in order."""
+_question = partial(add_to, WHERE, "where")
 
 _TINY = 1e-9
 
 
-@add_to(WHERE, "where", some_channels_unlearnt="yes", spread_over_channels="no")
+@_question(some_channels_unlearnt="yes", spread_over_channels="no")
 def _action_channels(case: Case) -> Outcome:
     channels = case.measurements.channels
     unlearnt = [c for c in channels if c.normalised_regret >= _T["unlearnt"]]
@@ -40,7 +42,7 @@ def _channel(channel: Channel) -> dict[str, Any]:
     return channel.model_dump(include={"channel", "normalised_regret", "slope"})
 
 
-@add_to(WHERE, "where", error_localised="yes", error_not_localised="no")
+@_question(error_localised="yes", error_not_localised="no")
 def _state_region(case: Case) -> Outcome:
     partitions = case.measurements.partitions
     most = max(partitions, key=lambda p: p.explained_variance)
@@ -62,7 +64,7 @@ def _state_region(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", similarity_lost="yes", similarity_kept="no")
+@_question(similarity_lost="yes", similarity_kept="no")
 def _out_of_distribution(case: Case) -> Outcome:
     inside, outside = case.measurements.shells[0], case.measurements.shells[-1]
     wd, ood = inside.scores[POLICY], outside.scores[POLICY]
@@ -80,7 +82,7 @@ def _out_of_distribution(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", error_changes="yes", error_steady="no")
+@_question(error_changes="yes", error_steady="no")
 def _time_in_episode(case: Case) -> Outcome:
     episodes = case.measurements.on_policy
     first, last = episodes.mae[0], episodes.mae[-1]
@@ -93,13 +95,7 @@ def _time_in_episode(case: Case) -> Outcome:
     )
 
 
-@add_to(
-    WHERE,
-    "where",
-    lower_regret_where_visited="yes",
-    higher_regret_where_visited="yes",
-    similar_regret="no",
-)
+@_question(lower_regret_where_visited="yes", higher_regret_where_visited="yes", similar_regret="no")
 def _visited_states(case: Case) -> Outcome:
     episodes, uniform = case.measurements.on_policy, case.measurements.policy.normalised_regret
     visited = episodes.scores[POLICY].normalised_regret
@@ -123,7 +119,7 @@ def _visited_states(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", offset_dominant="yes", offset_minor="no")
+@_question(offset_dominant="yes", offset_minor="no")
 def _constant_offset(case: Case) -> Outcome:
     share = case.measurements.squared_error.offset
     worst = max(case.measurements.channels, key=lambda c: abs(c.offset))
@@ -135,7 +131,7 @@ def _constant_offset(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", underreaction="yes", overreaction="yes", scale_minor="no")
+@_question(underreaction="yes", overreaction="yes", scale_minor="no")
 def _response_scale(case: Case) -> Outcome:
     share, channels = case.measurements.squared_error.scale, case.measurements.channels
     slope = sum(c.slope for c in channels) / len(channels)
@@ -147,9 +143,7 @@ def _response_scale(case: Case) -> Outcome:
     return Outcome(reason, evidence, ("dominant_share",))
 
 
-@add_to(
-    WHERE,
-    "where",
+@_question(
     nonlinear_part_unlearnt="yes",
     nonlinear_part_learnt="no",
     neither_part_learnt="no",
@@ -173,7 +167,7 @@ def _linear_only(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", saturated="yes", not_saturated="no")
+@_question(saturated="yes", not_saturated="no")
 def _saturation(case: Case) -> Outcome:
     response = case.measurements.response
     worst = max(case.measurements.channels, key=lambda c: c.at_zero + c.at_one)
@@ -188,16 +182,14 @@ def _saturation(case: Case) -> Outcome:
     )
 
 
-@add_to(WHERE, "where", noisy="yes", repeatable="no")
+@_question(noisy="yes", repeatable="no")
 def _action_noise(case: Case) -> Outcome:
     share = case.measurements.squared_error.noise
     noisy = share >= _T["noise_or_time_share"]
     return Outcome("noisy" if noisy else "repeatable", {"share": share}, ("noise_or_time_share",))
 
 
-@add_to(
-    WHERE, "where", depends_on_time="yes", depends_on_accumulated_reward="yes", independent="no"
-)
+@_question(depends_on_time="yes", depends_on_accumulated_reward="yes", independent="no")
 def _time_dependence(case: Case) -> Outcome:
     error, time = case.measurements.squared_error, case.measurements.time_dependence
     dependent = max(error.time, error.accumulated_reward) >= _T["noise_or_time_share"]

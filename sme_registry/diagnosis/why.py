@@ -5,6 +5,7 @@ The answer is "cannot tell" unless a number separates the causes.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from sme_registry.diagnosis.document import POLICY
@@ -15,13 +16,12 @@ __all__ = ["WHY"]
 
 WHY: dict[str, Question] = {}
 """Questions about training, in order."""
+_question = partial(add_to, WHY, "why")
 
 _DETERMINISTIC_SD = 1e-6
 
 
-@add_to(
-    WHY,
-    "why",
+@_question(
     no_training_log="cannot tell",
     beat_constant_in_training="no",
     policy_beats_constant="no",
@@ -57,7 +57,7 @@ def _exploration_sd(case: Case) -> dict[str, Any]:
     return {"exploration_sd": [min(sd), max(sd)], "explores": max(sd) >= _DETERMINISTIC_SD}
 
 
-@add_to(WHY, "why", paid_every_step="no", delayed_payout="cannot tell")
+@_question(paid_every_step="no", delayed_payout="cannot tell")
 def _credit_assignment(case: Case) -> Outcome:
     k, episodes = case.spec.k, case.measurements.on_policy
     if k == 1:
@@ -66,9 +66,7 @@ def _credit_assignment(case: Case) -> Outcome:
     return Outcome("delayed_payout", evidence)
 
 
-@add_to(
-    WHY,
-    "why",
+@_question(
     no_reward_threshold="no",
     rewards_gated="yes",
     rewards_frequent="no",
@@ -93,9 +91,7 @@ def _sparsity(case: Case) -> Outcome:
     return Outcome("effect_unknown", evidence, ("gated_share", "gated_rewarded_share"))
 
 
-@add_to(
-    WHY,
-    "why",
+@_question(
     not_probed="cannot tell",
     network_does_better="no",
     network_cannot_fit="yes",
@@ -124,7 +120,7 @@ def _capacity(case: Case) -> Outcome:
     return Outcome(reason, evidence, ("probe_better", "probe_no_better"))
 
 
-@add_to(WHY, "why", too_few_states="yes", states_sufficient="no", not_separated="cannot tell")
+@_question(too_few_states="yes", states_sufficient="no", not_separated="cannot tell")
 def _dimension(case: Case) -> Outcome:
     probe, regret = case.measurements.capacity, case.measurements.policy.normalised_regret
     channels = case.measurements.channels
@@ -145,7 +141,7 @@ def _dimension(case: Case) -> Outcome:
     return Outcome("not_separated", evidence, ("unlearnt",))
 
 
-@add_to(WHY, "why", no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
+@_question(no_survival_threshold="no", episodes_cut_short="yes", episodes_long_enough="no")
 def _survival(case: Case) -> Outcome:
     spec, episodes, log = case.spec, case.measurements.on_policy, case.measurements.training
     if spec.D == 0:
@@ -169,9 +165,7 @@ def _survival(case: Case) -> Outcome:
     )
 
 
-@add_to(
-    WHY,
-    "why",
+@_question(
     no_training_log="cannot tell",
     log_too_short="cannot tell",
     regressed="no",

@@ -9,6 +9,7 @@ from sme_registry.spec.document import (
     Real,
     SchemaVersion,
     StrictModel,
+    TupleOf,
 )
 from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
 from sme_registry.spec.protocol import EvaluationProtocol
@@ -43,5 +44,6 @@ __all__ = [
     "SuiteClass",
     "SuiteFile",
     "TeamSpec",
+    "TupleOf",
     "as_spec",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import rfc8785
 from pydantic import (
@@ -44,8 +44,11 @@ def _integer_only(value: Any) -> Any:
     return number
 
 
+_Part = TypeVar("_Part")
+
 Integer = int
 Real = Annotated[float, Field(allow_inf_nan=False)]
+TupleOf = Annotated[tuple[_Part, ...], Field(strict=False)]  # in JSON a list
 SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
 Name = Annotated[
     str,
