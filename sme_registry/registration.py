@@ -177,7 +177,7 @@ def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
       UnknownNameError, SpecError: see `load`.
       FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
     """
-    from sme_registry.envs.naming import content_id
+    from sme_registry.envs.base import content_id
     from sme_registry.spec import SMESpec
     from sme_registry.task import load_spec
 

@@ -161,7 +161,7 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
 
 def _env_id(spec: SMESpec) -> str:
     """The environment's id: its released name, or its name by content."""
-    from sme_registry.envs.naming import content_id
+    from sme_registry.envs.base import content_id
 
     title = catalogue.title(spec)
     return content_id(spec) if title.endswith(spec.content_name) else title

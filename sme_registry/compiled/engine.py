@@ -12,7 +12,7 @@ import os
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -38,39 +38,20 @@ Observation: TypeAlias = npt.NDArray[np.float32]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 
-class StepLane(Protocol):
-    """One step of one lane of a single agent; see `kernels.step_lane`."""
+StepLane: TypeAlias = Callable[
+    [Array, npt.NDArray[Any], Array, Observation],
+    tuple[float, float, float, float, float, float],
+]
+"""One step of one lane of a single agent; see `kernels.step_lane` without its packed task.
 
-    def __call__(
-        self, buffer: Array, action: npt.NDArray[Any], optimal: Array, observation: Observation, /
-    ) -> tuple[float, float, float, float, float, float]:
-        """Advance `buffer`, and write `optimal` `[A]` and `observation` `[S + 2]`.
+From a lane's buffer and an action to similarity, step reward, regret, reward, r_cum, and the end;
+it writes `optimal` `[A]` and the observation `[S + 2]`.
+"""
 
-        Returns:
-          Similarity, step reward, regret, reward, r_cum, and the end: 1 for terminated plus 2 for
-          truncated, or −1 where the action was refused and nothing has moved.
-        """
-        ...
-
-
-class StepMany(Protocol):
-    """One step of `B` lanes of a team of n agents; see `kernels.step_many`."""
-
-    def __call__(
-        self,
-        s: Array,
-        t: npt.NDArray[np.int64],
-        accumulated: Array,
-        action: Array,
-        moved: Array,
-        observation: Observation,
-        optimal: Array,
-        values: Array,
-        ends: Mask,
-        /,
-    ) -> bool:
-        """Advance `t` and `accumulated`, write the arguments after `action`; False: refused."""
-        ...
+StepMany: TypeAlias = Callable[
+    [Array, npt.NDArray[np.int64], Array, Array, Array, Observation, Array, Array, Mask], bool
+]
+"""One step of `B` lanes of a team of n agents; see `kernels.step_many` without its packed task."""
 
 
 @dataclass(frozen=True, eq=False)

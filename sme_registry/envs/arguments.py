@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from sme_registry.envs.types import Array, Mask
 from sme_registry.errors import ActionError, OptionError, SpecError, StateError, did_you_mean
-from sme_registry.spec.document import plain_number
+from sme_registry.io import choice, integer_in
+from sme_registry.spec import ACTION_RANGES
 from sme_registry.task import Task
 
 
@@ -25,8 +26,7 @@ def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.B
     Raises:
       OptionError: not "unit" or "symmetric".
     """
-    if action_range not in ("unit", "symmetric"):
-        raise OptionError(f"action_range={action_range!r}: must be 'unit' or 'symmetric'.")
+    choice("action_range", action_range, ACTION_RANGES)
     low = 0.0 if action_range == "unit" else -1.0
     return gymnasium.spaces.Box(low, 1.0, (action_dim,), np.float32), low < 0.0
 
@@ -77,12 +77,8 @@ def checked_seed(seed: Any) -> int | None:
     Raises:
       OptionError: neither.
     """
-    if seed is None:
-        return None
-    seed = plain_number(seed)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise OptionError(f"seed={seed!r:.60}: must be an integer of at least 0, or None.")
-    return seed
+    advice = "Leave it out to continue the generator's stream."
+    return None if seed is None else integer_in("seed", seed, 0, advice=advice)
 
 
 def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:

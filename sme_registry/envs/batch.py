@@ -10,17 +10,19 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.utils import seeding
 
 from sme_registry.compiled import engine
 from sme_registry.compiled.values import ROWS
 from sme_registry.envs.arguments import not_finite_error
-from sme_registry.envs.initial_states import InitialStates
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.task import Task, observe
 from sme_registry.task.memory import refuse_above_limit
 
 _FLOAT64 = np.dtype(np.float64)
+_AHEAD = 16  # states drawn at once for a lane
+_MAX_NUMBERS = 2**19  # held in advance for all lanes, 4 MiB
 
 
 class BatchStep(NamedTuple):
@@ -40,6 +42,38 @@ class BatchStep(NamedTuple):
     values: Array
     terminated: Mask
     truncated: Mask
+
+
+class InitialStates:
+    """The initial states of a batch: uniform in the cube, drawn in advance, a generator per lane.
+
+    Lane i draws what a single environment with its seed would draw, in the same order. Drawing one
+    state from each of 1,024 generators costs as much as six steps of the whole batch. Drawing
+    sixteen states at once costs little more and gives the same numbers.
+    """
+
+    def __init__(self, lanes: int, state_dim: int) -> None:
+        self._generators: list[np.random.Generator | None] = [None] * lanes
+        self._ahead = max(1, min(_AHEAD, _MAX_NUMBERS // (lanes * state_dim)))
+        self._drawn = np.empty((lanes, self._ahead, state_dim))
+        self._used = np.full(lanes, self._ahead)
+
+    def seed(self, lane: int, seed: int) -> None:
+        """Restart a lane's stream."""
+        self._generators[lane] = seeding.np_random(seed)[0]
+        self._used[lane] = self._ahead
+
+    def draw(self, lanes: Lanes) -> Array:
+        """The next state of each of these lanes, `[len(lanes), state_dim]`."""
+        for lane in lanes[self._used[lanes] == self._ahead].tolist():
+            generator = self._generators[lane]
+            if generator is None:
+                generator = self._generators[lane] = seeding.np_random(None)[0]
+            generator.random(out=self._drawn[lane])
+            self._used[lane] = 0
+        states: Array = self._drawn[lanes, self._used[lanes]]
+        self._used[lanes] += 1
+        return states
 
 
 class Batch:

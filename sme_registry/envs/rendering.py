@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sme_registry.envs.single import SMEEnv
 
 Frame = npt.NDArray[np.uint8]
+_Colour = tuple[int, int, int]
 
 WIDTH, HEIGHT = 800, 520
 _MARGIN = 24
@@ -64,14 +65,12 @@ class Renderer:
     def __init__(self, spec: SMESpec, mode: str, metadata: dict[str, Any]) -> None:
         self._pygame = _import_pygame()
         self._spec, self._mode, self._fps = spec, mode, metadata["render_fps"]
-        self._title = _title(spec)
-        self._owned = _owned(spec)
         self._window: pygame.Surface | None = None
         self._begun = False
 
     # A copy keeps the recorded steps, and opens a new window.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_pygame", "_window", "_clock", "_small", "_normal")
+        dropped = ("_pygame", "_window", "_clock", "_surface", "_small", "_normal")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -152,82 +151,76 @@ class Renderer:
         # Fonts do not outlive pygame.quit(), which other environments call when they close.
         self._pygame.font.init()
         self._small, self._normal = (self._pygame.font.Font(None, size) for size in (18, 22))
+        self._surface = surface
         surface.fill(_PAPER)
         right, half = WIDTH - _MARGIN, WIDTH // 2
-        self._text(surface, self._title, (_MARGIN, 18), _INK, self._normal)
-        self._progress(surface, _MARGIN, 44, right)
-        self._states(surface, _MARGIN, 96, half - 20, 250)
-        self._actions(surface, half + 20, 96, right, 250)
-        self._numbers(surface, 288)
-        self._curve(
-            surface, (_MARGIN, 374, half - 20, 492), "similarity", self._similarities, 1.0, _ACTION
-        )
-        top = max(self._regrets[-1], 1.0)
-        self._curve(surface, (half + 20, 374, right, 492), "regret", self._regrets, top, _REGRET)
+        self._text(_title(self._spec), (_MARGIN, 18), _INK, self._normal)
+        self._progress(_MARGIN, 44, right)
+        self._states(_MARGIN, 96, half - 20, 250)
+        self._actions(half + 20, 96, right, 250)
+        self._numbers(288)
+        left_box, right_box = (_MARGIN, 374, half - 20, 492), (half + 20, 374, right, 492)
+        self._curve(left_box, "similarity", self._similarities, 1.0, _ACTION)
+        top_value = max(self._regrets[-1], 1.0)
+        self._curve(right_box, "regret", self._regrets, top_value, _REGRET)
 
-    def _progress(self, surface: pygame.Surface, left: int, y: int, right: int) -> None:
-        T, t = self._spec.horizon, len(self._similarities)
-        rect, width = self._pygame.draw.rect, right - left - 90
-        rect(surface, _TRACK, (left, y, width, 6), border_radius=3)
+    def _rect(self, colour: _Colour, box: tuple[int, int, int, int], radius: int = -1) -> None:
+        """Fill `(x, y, width, height)`."""
+        self._pygame.draw.rect(self._surface, colour, box, border_radius=radius)
+
+    def _progress(self, left: int, y: int, right: int) -> None:
+        T, t, width = self._spec.horizon, len(self._similarities), right - left - 90
+        self._rect(_TRACK, (left, y, width, 6), 3)
         if t:
-            rect(surface, _INK, (left, y, max(6, width * t // T), 6), border_radius=3)
-        self._text(surface, f"t = {t} / {T}", (right, y - 3), _INK, self._small, align=1.0)
+            self._rect(_INK, (left, y, max(6, width * t // T), 6), 3)
+        self._text(f"t = {t} / {T}", (right, y - 3), _INK, self._small, align=1.0)
 
-    def _states(
-        self, surface: pygame.Surface, left: int, top: int, right: int, bottom: int
-    ) -> None:
-        S = self._spec.state_dim
-        self._heading(surface, "state", S, left, top)
-        for x, width, value in _columns(self._state[:_CHANNELS_SHOWN].tolist(), left, right):
-            height = bottom - top - 22
-            filled = round(height * value)
-            rect = self._pygame.draw.rect
-            rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
-            rect(surface, _STATE, (x, bottom - filled, width, filled), border_radius=2)
-        self._text(surface, "0 … 1", (right, top), _FAINT, self._small, align=1.0)
-
-    def _actions(
-        self, surface: pygame.Surface, left: int, top: int, right: int, bottom: int
-    ) -> None:
-        """Each action as a dot, the optimal one as a bar; the line between them is the error."""
-        A, rect = self._spec.action_dim, self._pygame.draw.rect
-        self._heading(surface, "last action", A, left, top)
+    def _states(self, left: int, top: int, right: int, bottom: int) -> None:
+        self._heading("state", self._spec.state_dim, left, top)
         height = bottom - top - 22
-        tracks = [0.0] * min(A, _CHANNELS_SHOWN)
-        columns = _columns(tracks, left, right)
+        for x, width, value in _columns(self._state[:_CHANNELS_SHOWN].tolist(), left, right):
+            filled = round(height * value)
+            self._rect(_TRACK, (x, bottom - height, width, height), 2)
+            self._rect(_STATE, (x, bottom - filled, width, filled), 2)
+        self._text("0 … 1", (right, top), _FAINT, self._small, align=1.0)
+
+    def _actions(self, left: int, top: int, right: int, bottom: int) -> None:
+        """Each action as a dot, the optimal one as a bar; the line between them is the error."""
+        A, height = self._spec.action_dim, bottom - top - 22
+        self._heading("last action", A, left, top)
+        columns = _columns([0.0] * min(A, _CHANNELS_SHOWN), left, right)
         for x, width, _ in columns:
-            rect(surface, _TRACK, (x, bottom - height, width, height), border_radius=2)
-        for channels in self._owned:
+            self._rect(_TRACK, (x, bottom - height, width, height), 2)
+        for channels in _owned(self._spec):
             if owned := columns[channels]:
                 end = owned[-1][0] + owned[-1][1]
-                rect(surface, _FAINT, (owned[0][0], bottom + 4, end - owned[0][0], 3))
+                self._rect(_FAINT, (owned[0][0], bottom + 4, end - owned[0][0], 3))
         if self._action is None or self._optimal is None:
             return
         x = right
-        for word, colour in (
-            (f"{self._low:.0f} … 1", _FAINT), ("optimal", _OPTIMAL), ("taken", _ACTION)
-        ):  # fmt: skip
-            x -= self._text(surface, word, (x, top), colour, self._small, align=1.0) + 10
+        legend = (f"{self._low:.0f} … 1", _FAINT), ("optimal", _OPTIMAL), ("taken", _ACTION)
+        for word, colour in legend:
+            x -= self._text(word, (x, top), colour, self._small, align=1.0) + 10
         scale = height / (1.0 - self._low)
         actions = self._action[:_CHANNELS_SHOWN].tolist()
-        optimal = self._optimal[:_CHANNELS_SHOWN].tolist()
-        for (x, width, a), best in zip(_columns(actions, left, right), optimal, strict=True):
+        for (x, width, _), a, best in zip(columns, actions, self._optimal.tolist(), strict=False):
             middle = x + width // 2
             y = bottom - round((a - self._low) * scale)
             y_best = bottom - round((best - self._low) * scale)
             wide = max(1, min(6, width // 2))
-            rect(surface, _REGRET, (middle - wide // 2, min(y, y_best), wide, abs(y - y_best)))
-            rect(surface, _OPTIMAL, (x, y_best - 2, width, 4))
-            self._pygame.draw.circle(surface, _ACTION, (middle, y), max(2, min(6, width // 2)))
+            self._rect(_REGRET, (middle - wide // 2, min(y, y_best), wide, abs(y - y_best)))
+            self._rect(_OPTIMAL, (x, y_best - 2, width, 4))
+            radius = max(2, min(6, width // 2))
+            self._pygame.draw.circle(self._surface, _ACTION, (middle, y), radius)
 
-    def _heading(self, surface: pygame.Surface, name: str, count: int, left: int, top: int) -> None:
+    def _heading(self, name: str, count: int, left: int, top: int) -> None:
         number = f"{count} channels" if count > 1 else "1 channel"
         if count > _CHANNELS_SHOWN:
             number = f"the first {_CHANNELS_SHOWN} of {count} channels"
-        width = self._text(surface, name, (left, top), _INK, self._normal)
-        self._text(surface, number, (left + width + 8, top + 2), _FAINT, self._small)
+        width = self._text(name, (left, top), _INK, self._normal)
+        self._text(number, (left + width + 8, top + 2), _FAINT, self._small)
 
-    def _numbers(self, surface: pygame.Surface, y: int) -> None:
+    def _numbers(self, y: int) -> None:
         last = self._similarities[-1] if self._similarities else None
         regret = self._regrets[-1] - self._regrets[-2] if self._similarities else None
         columns: Sequence[tuple[str, float | None, tuple[int, int, int]]] = (
@@ -241,36 +234,31 @@ class Renderer:
         step = (WIDTH - 2 * _MARGIN) / len(columns)
         for i, (name, value, colour) in enumerate(columns):
             x = round(_MARGIN + i * step)
-            self._text(surface, name, (x, y), _FAINT, self._small)
+            self._text(name, (x, y), _FAINT, self._small)
             text = "–" if value is None else f"{value:.3f}"
-            self._text(surface, text, (x, y + 18), colour, self._normal)
+            self._text(text, (x, y + 18), colour, self._normal)
 
     def _curve(
         self,
-        surface: pygame.Surface,
         box: tuple[int, int, int, int],
         name: str,
         values: Sequence[float],
         top_value: float,
-        colour: tuple[int, int, int],
+        colour: _Colour,
     ) -> None:
         left, top, right, bottom = box
-        self._text(surface, f"{name} so far", (left, top - 26), _INK, self._normal)
-        self._text(surface, f"0 … {top_value:.3g}", (right, top - 24), _FAINT, self._small, 1.0)
-        draw = self._pygame.draw
+        self._text(f"{name} so far", (left, top - 26), _INK, self._normal)
+        self._text(f"0 … {top_value:.3g}", (right, top - 24), _FAINT, self._small, align=1.0)
+        surface, draw = self._surface, self._pygame.draw
         draw.line(surface, _TRACK, (left, top), (right, top))
         draw.line(surface, _FAINT, (left, bottom), (right, bottom))
         # One point a pixel at most, on the scale of the whole episode.
         stride = max(1, len(values) // (right - left))
         reach = (right - left) / max(1, self._spec.horizon)
         first = 0 if values is self._regrets else 1
-        points = [
-            (
-                left + (i * stride + first) * reach,
-                bottom - (bottom - top) * min(value / top_value, 1.0),
-            )
-            for i, value in enumerate(values[::stride])
-        ]
+        xs = [left + (i + first) * reach for i in range(0, len(values), stride)]
+        ys = [bottom - (bottom - top) * min(value / top_value, 1.0) for value in values[::stride]]
+        points = list(zip(xs, ys, strict=True))
         for start, end in itertools.pairwise(points):
             draw.line(surface, colour, start, end, 2)
         if points:
@@ -278,16 +266,15 @@ class Renderer:
 
     def _text(
         self,
-        surface: pygame.Surface,
         text: str,
         place: tuple[int, int],
-        colour: tuple[int, int, int],
+        colour: _Colour,
         font: pygame.font.Font,
         align: float = 0.0,
     ) -> int:
         """Write a line whose top left (`align` 0) or top right (1) is `place`; its width."""
         image = font.render(text, True, colour)
-        surface.blit(image, (round(place[0] - align * image.get_width()), place[1]))
+        self._surface.blit(image, (round(place[0] - align * image.get_width()), place[1]))
         return image.get_width()
 
 

@@ -16,22 +16,9 @@ from sme_registry.envs.base import GymnasiumMixin, check_time_limit
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.io import choice, integer_in
 from sme_registry.spec import ActionRange, SpecLike
-from sme_registry.spec.document import plain_number
 from sme_registry.task import load_task
-
-
-def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    """Gymnasium's enum, from itself or its string.
-
-    Raises:
-      OptionError: neither.
-    """
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        known = ", ".join(repr(member.value) for member in AutoresetMode)
-        raise OptionError(f"autoreset_mode={mode!r}: must be one of {known}.") from None
 
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
@@ -65,15 +52,15 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
-        num_envs = plain_number(num_envs)
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
+        num_envs = integer_in("num_envs", num_envs, 1)
         if render_mode is not None:
             raise OptionError(
                 f"render_mode={render_mode!r}: must be None: a batch cannot be rendered. Make a "
                 "single environment to watch an episode."
             )
-        self.mode = _autoreset_mode(autoreset_mode)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            choice("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
+        self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
         self.render_mode = None
         self._task = arguments.single_agent(load_task(spec, **overrides))
@@ -207,12 +194,10 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""
         seeds = np.full(self.num_envs, None, dtype=object)
-        if seed is None:
-            return seeds
-        seed = plain_number(seed)
-        if not isinstance(seed, list | tuple | np.ndarray):
-            first = arguments.checked_seed(seed) or 0
-            seeds[:] = [first + lane for lane in range(self.num_envs)]
+        if not isinstance(seed, list | tuple | np.ndarray) or np.ndim(seed) == 0:
+            first = arguments.checked_seed(seed)
+            if first is not None:
+                seeds[:] = [first + lane for lane in range(self.num_envs)]
             return seeds
         if len(seed) != self.num_envs:
             raise OptionError(

@@ -16,6 +16,7 @@ from sme_registry.envs.shared import (
 )
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.io import integer_in
 from sme_registry.sb3.lanes import Lane, LanesVecEnv, StepResult, infos_by_lane
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.task import load_task
@@ -50,8 +51,7 @@ class SMETeamVecEnv(LanesVecEnv):
         action_range: ActionRange = "symmetric",
         **overrides: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise OptionError(f"num_envs={num_envs!r}: must be an integer of at least 1.")
+        num_envs = integer_in("num_envs", num_envs, 1)
         task = load_task(spec_or_id, **overrides)
         self._width = shared_action_dim(task)
         action_space, self._rescaled = arguments.action_space(action_range, self._width)

@@ -1,6 +1,5 @@
 """Documents: specs, suites, protocols and plans, frozen and hashed, and their files."""
 
-from sme_registry.spec.arguments import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.spec.document import (
     Digest,
     Document,
@@ -12,8 +11,16 @@ from sme_registry.spec.document import (
     TupleOf,
 )
 from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
-from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.sme_spec import AgentSpec, SMESpec, TeamSpec, as_spec
+from sme_registry.spec.protocol import EvaluationProtocol, ProtocolLike
+from sme_registry.spec.sme_spec import (
+    ACTION_RANGES,
+    ActionRange,
+    AgentSpec,
+    SMESpec,
+    SpecLike,
+    TeamSpec,
+    as_spec,
+)
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import Suite, SuiteClass
 

@@ -39,7 +39,10 @@ class Envelope(StrictModel):
     """
 
     content: ClassVar[str]
-    remedy: ClassVar[str]
+    remedy: ClassVar[str] = (
+        "write the changed {content} as a new file, in Python "
+        "`{kind}(name=…, digest={content}.digest, {content}={content}).write(path)`"
+    )
 
     name: Name
     version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
@@ -65,7 +68,7 @@ class Envelope(StrictModel):
           DigestMismatchError: the digest is not the document's.
         """
         name = source or cls.__name__
-        remedy = cls.remedy.format(source=name)
+        remedy = cls.remedy.format(source=name, kind=cls.__name__, content=cls.content)
         document: Any = cls.model_fields[cls.content].annotation
         if isinstance(data, dict) and data and "digest" not in data:
             is_bare_document = data.keys() <= document.model_fields.keys()
@@ -118,10 +121,6 @@ class SuiteFile(Envelope):
     """A suite's file: `specs/suites/*.json`."""
 
     content = "suite"
-    remedy = (
-        "write the changed suite as a new file, in Python "
-        "`SuiteFile(name=…, digest=suite.digest, suite=suite).write(path)`"
-    )
 
     suite: Suite
 
@@ -156,9 +155,5 @@ class ProtocolFile(Envelope):
     """A protocol's file: `specs/protocols/*.json`."""
 
     content = "protocol"
-    remedy = (
-        "write the changed protocol as a new file, in Python "
-        "`ProtocolFile(name=…, digest=protocol.digest, protocol=protocol).write(path)`"
-    )
 
     protocol: EvaluationProtocol

@@ -7,7 +7,8 @@ region m the half-open shell X_{ε_m} \\ X_{ε_{m−1}} (OOD m); states uniform 
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Literal, Self
+import os
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -44,3 +45,7 @@ class EvaluationProtocol(Document):
         """`(ε_low, ε_high)` of each region, WD first: (0, 0), (0, ε_1), (ε_1, ε_2), …"""
         levels = (0.0, *self.epsilons)
         return ((0.0, 0.0), *itertools.pairwise(levels))
+
+
+ProtocolLike: TypeAlias = EvaluationProtocol | dict[str, Any] | str | os.PathLike[str]
+"""A protocol: itself, its fields, its name in the catalogue, or the path of its file."""

@@ -11,9 +11,8 @@ from typing import Any
 from sme_registry.errors import MalformedDocumentError, UnknownNameError
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
-from sme_registry.spec.arguments import SpecLike
 from sme_registry.spec.envelope import EnvFile, Fingerprint, SuiteFile
-from sme_registry.spec.sme_spec import SMESpec, as_spec
+from sme_registry.spec.sme_spec import SMESpec, SpecLike, as_spec
 
 _HEX_DIGITS = 12  # fewest digits that name a spec
 

@@ -6,8 +6,9 @@ C_π* `complexity` (L), T `horizon`, H `hidden_width`.
 
 from __future__ import annotations
 
+import os
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 
 from pydantic import (
     Field,
@@ -29,6 +30,11 @@ from sme_registry.spec.document import (
     refuse_repeated_names,
 )
 from sme_registry.spec.validation_errors import short_repr
+
+ActionRange: TypeAlias = Literal["unit", "symmetric"]
+"""The range of actions: [0, 1], the paper's, or [−1, 1], which Stable-Baselines3 prefers."""
+
+ACTION_RANGES: tuple[str, ...] = get_args(ActionRange)
 
 MAX_DIM = 2**20
 MAX_SEED = 2**53  # above it not every integer is a JSON number that all readers agree on
@@ -214,6 +220,10 @@ class SMESpec(Setting):
           SpecError: an unknown field, or a value outside its range.
         """
         return SMESpec.from_dict({**self.to_dict(), **overrides}) if overrides else self
+
+
+SpecLike: TypeAlias = SMESpec | dict[str, Any] | str | os.PathLike[str]
+"""A task: its spec, the spec's fields, an id, a digest or a path; see `resolve`."""
 
 
 def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:

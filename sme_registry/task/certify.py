@@ -26,13 +26,12 @@ L 1..20). Mean r̃ of the constant policy: smallest, median, largest. Spread: sm
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal, cast
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from sme_registry.errors import OptionError
+from sme_registry.io import integer_in
 from sme_registry.spec import SpecLike
 from sme_registry.task import memory
 from sme_registry.task.draw import Array, Layer
@@ -41,6 +40,9 @@ from sme_registry.task.streams import uniform
 from sme_registry.task.task import Task
 
 Outcome = Literal["passed", "warning", "refused", "reported"]
+_WORST_FIRST: tuple[Outcome, ...] = ("refused", "warning")
+
+_INF = math.inf
 
 STATES = 20_000  # the standard error of mean r̃ is then below 0.001
 LANES = 4_096
@@ -49,6 +51,7 @@ CONSTANT_STEPS = 2_000
 _TOGETHER = 256
 _CHANNELS_FOLLOWED = 256
 _CELLS = 16
+_BLOCK = 4_096  # states
 _FALSE_ALARM = 1e-6  # chance that a uniform ensemble is refused by one of the uniformity checks
 _LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
 _ROUNDING = 1e-9
@@ -94,10 +97,7 @@ class Certificate:
     def outcome(self) -> Outcome:
         """The worst of the checks: "passed", "warning" or "refused"."""
         outcomes = {check.outcome for check in self.checks}
-        for worst in ("refused", "warning"):
-            if worst in outcomes:
-                return cast(Outcome, worst)
-        return "passed"
+        return next((worst for worst in _WORST_FIRST if worst in outcomes), "passed")
 
     @property
     def passed(self) -> bool:
@@ -110,13 +110,12 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON data."""
-        checks = [dict(vars(check)) for check in self.checks]
         return {
             "digest": self.digest,
             "seed": self.seed,
             "outcome": self.outcome,
             "passed": self.passed,
-            "checks": checks,
+            "checks": [asdict(check) for check in self.checks],
         }
 
 
@@ -135,8 +134,7 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
       ResourceLimitError: the task, or the states to measure it with, would not fit in memory.
       FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**53:
-        raise OptionError(f"seed={seed!r}: must be an integer in [0, 2**53). Leave it out for 0.")
+    seed = integer_in("seed", seed, 0, 2**53 - 1, advice="Leave it out for 0.")
     if not isinstance(task, Task):
         task = load_task(task)
     S, A = task.spec.state_dim, task.spec.action_dim
@@ -161,19 +159,20 @@ def _check(
     value: float,
     meaning: str,
     *,
-    passes: tuple[float | None, float | None],
-    warns: tuple[float | None, float | None] | None = None,
+    passes: tuple[float, float],
+    warns: tuple[float, float] | None = None,
 ) -> Check:
-    def inside(bounds: tuple[float | None, float | None]) -> bool:
-        low, high = bounds
-        return (low is None or value >= low) and (high is None or value <= high)
-
+    low, high = (bound if math.isfinite(bound) else None for bound in passes)
     outcome: Outcome = "refused"
-    if inside(passes):
+    if passes[0] <= value <= passes[1]:
         outcome = "passed"
-    elif warns is not None and inside(warns):
+    elif warns is not None and warns[0] <= value <= warns[1]:
         outcome = "warning"
-    return Check(name, value, *passes, outcome, meaning)
+    return Check(name, value, low, high, outcome, meaning)
+
+
+def _report(name: str, value: float | None, meaning: str) -> Check:
+    return Check(name, value, None, None, "reported", meaning)
 
 
 def _draw(task: Task, seed: int, name: str, *shape: int) -> Array:
@@ -183,29 +182,26 @@ def _draw(task: Task, seed: int, name: str, *shape: int) -> Array:
 
 
 def _parameters(task: Task) -> tuple[Check, ...]:
-    rows = float(np.abs(task.W.sum(axis=1) - 1.0).max())
     every = [layer for policy in task.policies for layer in policy]
     unit_rows = task.spec.policy_init == "unit_variance"
-    orthogonal = max(_orthogonality_error(layer, unit_rows) for layer in every)
-    centred = max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every)
     return (
         _check(
             "transition_row_sums",
-            rows,
+            float(np.abs(task.W.sum(axis=1) - 1.0).max()),
             "How far a row of W is from the sum 1, which keeps an action's mass.",
-            passes=(None, 0.0),
+            passes=(-_INF, 0.0),
         ),
         _check(
             "layers_orthogonal",
-            orthogonal,
+            max(_orthogonality_error(layer, unit_rows) for layer in every),
             "How far W/√12 of a layer of π* is from semi-orthogonal (rescaled: from unit rows).",
-            passes=(None, _ROUNDING),
+            passes=(-_INF, _ROUNDING),
         ),
         _check(
             "layers_centred",
-            centred,
+            max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every),
             "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
-            passes=(None, _ROUNDING),
+            passes=(-_INF, _ROUNDING),
         ),
     )
 
@@ -239,21 +235,18 @@ def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
             _distance_from_uniform(s),
             f"Largest √N·KS distance of a state channel from uniform, {MIXING_STEPS} random "
             "actions after uniform starts.",
-            passes=(None, bound),
+            passes=(-_INF, bound),
         ),
         _check(
             "coverage",
             _coverage(s, pairs=S > 1),
             f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state channels "
             "that these states lie in.",
-            passes=(0.95 if lanes == LANES else 0.5, None),
+            passes=(0.95 if lanes == LANES else 0.5, _INF),
         ),
-        Check(
+        _report(
             "coverage_from_one_start",
             _coverage(together, pairs=False),
-            None,
-            None,
-            "reported",
             f"Smallest share of {_CELLS} cells of a state channel that {_TOGETHER} lanes reach by "
             f"the same number of random actions, all from one start.",
         ),
@@ -292,16 +285,13 @@ def _no_collapse(task: Task, seed: int) -> Check:
     for t in range(CONSTANT_STEPS):
         s = task.transition(s, a)
         history[t] = s[::lanes, : history.shape[2]]
-    shares = (
-        _distinct(history),
-        _distinct(s.reshape(len(constants), lanes, S).swapaxes(0, 1)),
-    )
+    last = s.reshape(len(constants), lanes, S).swapaxes(0, 1)
     return _check(
         "distinct_states",
-        min(shares),
+        min(_distinct(history), _distinct(last)),
         f"Smallest share of distinct values of a state channel, over {CONSTANT_STEPS:,} steps of "
         f"one constant action and over {lanes} lanes after them: floating point must not collapse.",
-        passes=(0.99, None),
+        passes=(0.99, _INF),
     )
 
 
@@ -311,13 +301,14 @@ def _distinct(values: Array) -> float:
     return float((1 + (np.diff(ranked, axis=0) > 0).sum(axis=0)).min()) / len(values)
 
 
-def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
+def _difficulty(task: Task, seed: int, states: int) -> list[Check]:
     """How far from trivial π* is: the scores of policies that know nothing, and its spread."""
-    S = task.spec.state_dim
-    s = _draw(task, seed, "difficulty", states, S)
-    optimal = _in_blocks(task, s)
-    similarity = task.similarity_of(np.full_like(optimal, 0.5), optimal)
-    return (
+    s = _draw(task, seed, "difficulty", states, task.spec.state_dim)
+    # In blocks: a deep policy's inner layers of all states would not fit in cache.
+    optimal = np.concatenate([task.policy(s[i : i + _BLOCK]) for i in range(0, states, _BLOCK)])
+    constant = np.full_like(optimal, 0.5)
+    similarity = task.similarity_of(constant, optimal)
+    checks = [
         _check(
             "constant_policy_similarity",
             float(similarity.mean()),
@@ -330,64 +321,48 @@ def _difficulty(task: Task, seed: int, states: int) -> tuple[Check, ...]:
             "constant_policy_reward",
             float(task.reward_of(similarity).mean()),
             "Mean step reward of the constant action ½, which an agent earns without learning.",
-            passes=(None, 0.30),
-            warns=(None, 0.60),
+            passes=(-_INF, 0.30),
+            warns=(-_INF, 0.60),
         ),
         _check(
             "channel_spread",
             float(optimal.std(axis=0).min()),
             "Smallest standard deviation of a channel of π* over uniform states; 0.289 where it "
             "is uniform, 0 where the channel has collapsed to a constant.",
-            passes=(0.15, None),
-            warns=(0.05, None),
+            passes=(0.15, _INF),
+            warns=(0.05, _INF),
         ),
-        *_least_typical_agent(task, optimal),
-        _linear_policy(task, seed, s, optimal),
-    )
+    ]
+    if task.spec.team is not None:
+        # The mean over all channels would hide an agent that has nothing to learn among others.
+        means = task.similarities_of(constant, optimal).mean(axis=0)
+        agent = int(np.abs(means - 0.75).argmax())
+        checks.append(
+            _check(
+                "agent_constant_policy_similarity",
+                float(means[agent]),
+                f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
+                "farthest from 0.75.",
+                passes=_CONSTANT_PASSES,
+                warns=_CONSTANT_WARNS,
+            )
+        )
+    return [*checks, _linear_policy(task, s, optimal)]
 
 
-def _least_typical_agent(task: Task, optimal: Array) -> tuple[Check, ...]:
-    """The constant action's r̃ of the agent where it is farthest from 0.75; none without a team.
-
-    The mean over all channels would hide an agent that has nothing to learn among others that do.
-    """
-    if task.spec.team is None:
-        return ()
-    means = task.similarities_of(np.full_like(optimal, 0.5), optimal).mean(axis=0)
-    agent = int(np.abs(means - 0.75).argmax())
-    return (
-        _check(
-            "agent_constant_policy_similarity",
-            float(means[agent]),
-            f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
-            "farthest from 0.75.",
-            passes=_CONSTANT_PASSES,
-            warns=_CONSTANT_WARNS,
-        ),
-    )
-
-
-def _in_blocks(task: Task, s: Array, rows: int = 4_096) -> Array:
-    """π* of `[N, S]` states; a deep policy's inner layers of all of them would not fit in cache."""
-    return np.concatenate([task.policy(s[i : i + rows]) for i in range(0, len(s), rows)])
-
-
-def _linear_policy(task: Task, seed: int, s: Array, optimal: Array) -> Check:
+def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
     """The mean step reward of the best affine policy, fitted on one half, scored on the other."""
     S, half = task.spec.state_dim, len(s) // 2
     name = "linear_policy_reward"
     if S > _LINEAR_LIMIT or half < 4 * (S + 1):
         meaning = f"Not measured: a fit over state_dim={S} channels takes too long."
-        return Check(name, None, None, None, "reported", meaning)
-    fitted, *_ = np.linalg.lstsq(_affine(s[:half]), optimal[:half], rcond=None)
-    actions = np.clip(_affine(s[half:]) @ fitted, 0.0, 1.0)
+        return _report(name, None, meaning)
+    affine = np.concatenate([s, np.ones((len(s), 1))], axis=1)
+    fitted, *_ = np.linalg.lstsq(affine[:half], optimal[:half], rcond=None)
+    actions = np.clip(affine[half:] @ fitted, 0.0, 1.0)
     value = task.reward_of(task.similarity_of(actions, optimal[half:])).mean()
     meaning = (
         "Mean step reward of the least-squares linear policy, which needs no deep learning. It "
         "has no range: it is high at complexity 1 by construction."
     )
-    return Check(name, float(value), None, None, "reported", meaning)
-
-
-def _affine(s: Array) -> npt.NDArray[np.float64]:
-    return np.concatenate([s, np.ones((len(s), 1))], axis=1)
+    return _report(name, float(value), meaning)
