@@ -162,7 +162,7 @@ def save(
     return Path(path)
 
 
-def env_spec(spec: SMESpec, **kwargs: Any) -> EnvSpec:
+def env_spec(spec: SpecLike, **kwargs: Any) -> EnvSpec:
     """Gymnasium's `EnvSpec` of any spec, unregistered; its kwargs are plain JSON.
 
     Args:
@@ -205,7 +205,7 @@ def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEEnv`.
     """
-    return gymnasium.make(_makeable(spec_or_id), **kwargs)
+    return gymnasium.make(registered_or_new(spec_or_id), **kwargs)
 
 
 def make_vec(
@@ -224,15 +224,15 @@ def make_vec(
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
     """
-    return gymnasium.make_vec(_makeable(spec_or_id), num_envs=num_envs, **kwargs)
+    return gymnasium.make_vec(registered_or_new(spec_or_id), num_envs=num_envs, **kwargs)
 
 
-def _makeable(spec_or_id: Any) -> str | EnvSpec:
-    """An id as it is registered, so that `env.spec.id` is the name; else an `EnvSpec`."""
+def registered_or_new(spec_or_id: SpecLike) -> EnvSpec:
+    """The `EnvSpec` of an id as it is registered, which keeps the id's name; else `env_spec`."""
     if isinstance(spec_or_id, str):
         for env_id in (spec_or_id, f"SME/{spec_or_id}", f"SME/{spec_or_id}-v1", f"{spec_or_id}-v1"):
             if env_id in gymnasium.registry and env_id.startswith("SME/"):
-                return env_id
+                return gymnasium.registry[env_id]
     return env_spec(spec_or_id)
 
 
@@ -254,12 +254,7 @@ def make_parallel(spec_or_id: SpecLike, **kwargs: Any) -> SMETeamEnv:
 def make_aec(spec_or_id: SpecLike, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """The same as a PettingZoo AEC environment: agents act in turn, the step is joint.
 
-    Args:
-      spec_or_id: the task; one without a team is a team of one, `agent_0`.
-      **kwargs: spec fields to override, `action_range`, `render_mode`.
-
-    Raises:
-      UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    Arguments and errors are those of `make_parallel`.
     """
     from sme_registry.teams import env
 

@@ -10,7 +10,6 @@ many `SMETeamEnv`s stepped in a loop.
 """
 
 from sme_registry.sb3.lanes import LanesVecEnv
-from sme_registry.sb3.single import SMEVecEnv
-from sme_registry.sb3.team import SMETeamVecEnv
+from sme_registry.sb3.vec_envs import SMETeamVecEnv, SMEVecEnv
 
 __all__ = ["LanesVecEnv", "SMETeamVecEnv", "SMEVecEnv"]

@@ -1,17 +1,14 @@
-"""What the two `VecEnv`s share: lanes, their attributes, and each lane's info."""
+"""`LanesVecEnv`: what does not depend on how the lanes of a `VecEnv` are stepped."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.envs import SMEVectorEnv
-from sme_registry.envs.batch import Batch
-from sme_registry.envs.types import Array, Mask, Observation
+from sme_registry.envs.types import Mask, Observation
 from sme_registry.errors import EpisodeError, MissingDependencyError
 from sme_registry.spec import SMESpec
 
@@ -26,25 +23,6 @@ except ImportError:
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""
-
-
-class Lane:
-    """One environment, as SB3 sees it: attributes shared by all lanes, and its own."""
-
-    def __init__(self, batch: SMEVectorEnv | Batch, row: int, **shared: Any) -> None:
-        self._batch, self._row = batch, row
-        vars(self).update(shared)
-
-    @property
-    def state(self) -> Array:
-        """The present state, `[S]` (a copy); for an agent, that of its team."""
-        state: Array = self._batch.state[self._row]
-        return state
-
-    @property
-    def unwrapped(self) -> Lane:
-        """Itself, as environments without a wrapper have it."""
-        return self
 
 
 class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
@@ -86,19 +64,11 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         """Do nothing: no resource is open."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each lane: `task`, `sme_spec`, `spec`, `state`, or one set before.
-
-        Raises:
-          AttributeError: the lanes have no such attribute.
-        """
+        """An attribute of each lane: `task`, `sme_spec`, `spec`, `state`, or one set before."""
         return [getattr(self._lanes[i], attr_name) for i in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of each lane.
-
-        Raises:
-          AttributeError: it cannot be set.
-        """
+        """Set an attribute of each lane."""
         for i in self._get_indices(indices):
             setattr(self._lanes[i], attr_name, value)
 
@@ -109,11 +79,7 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Call a method of each lane, such as `reset`.
-
-        Raises:
-          AttributeError: the lanes have no such method.
-        """
+        """Call a method of each lane, such as `reset` of a single agent's."""
         lanes = [self._lanes[i] for i in self._get_indices(indices)]
         return [getattr(lane, method_name)(*method_args, **method_kwargs) for lane in lanes]
 
@@ -124,22 +90,3 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
     ) -> list[bool]:
         """False for each lane: wrap the `VecEnv` instead, as `VecMonitor` does."""
         return [False for _ in self._get_indices(indices)]
-
-
-def infos_by_lane(
-    columns: dict[str, list[Any]], timed_out: Mask, dones: Mask, last: npt.NDArray[Any]
-) -> Iterator[dict[str, Any]]:
-    """Each lane's info, from the values of each key for all lanes.
-
-    Args:
-      columns: for each key of the info, its values, one a lane.
-      timed_out: `[B]` lanes that were truncated and not terminated.
-      dones: `[B]` lanes whose episode has ended.
-      last: `[B, …]` the last observations of these episodes.
-    """
-    columns = {**columns, "TimeLimit.truncated": timed_out.tolist()}
-    for lane, row in enumerate(zip(*columns.values(), strict=True)):
-        info = dict(zip(columns, row, strict=True))
-        if dones[lane]:
-            info["terminal_observation"] = last[lane]
-        yield info

@@ -161,7 +161,7 @@ def test_unusable_actions_are_refused_and_no_lane_moves(
         ({"num_envs": True}, OptionError, "num_envs=True"),
         ({"num_envs": "3"}, OptionError, "num_envs='3'"),
         ({"num_envs": 2**40}, ResourceLimitError, "fewer lanes"),
-        ({"autoreset_mode": "Sometimes"}, OptionError, "'NextStep', 'SameStep', 'Disabled'"),
+        ({"autoreset_mode": "Sometimes"}, OptionError, "'NextStep', 'SameStep' or 'Disabled'"),
         ({"autoreset_mode": None}, OptionError, "autoreset_mode=None"),
         ({"render_mode": "rgb_array"}, OptionError, "single environment"),
         ({"action_range": "wide"}, OptionError, "action_range='wide'"),

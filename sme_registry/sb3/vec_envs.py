@@ -1,0 +1,268 @@
+"""`SMEVecEnv` and `SMETeamVecEnv`: a native batch of single agents or of teams as a `VecEnv`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from sme_registry.envs import arguments
+from sme_registry.envs.base import renamed_by_content
+from sme_registry.envs.batch import Batch
+from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
+from sme_registry.envs.types import Array, Mask, Observation
+from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.io import integer_in
+from sme_registry.registration import registered_or_new
+from sme_registry.sb3.lanes import LanesVecEnv, StepResult
+from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.task import Task, load_task
+
+
+class Lane:
+    """One agent's environment, as SB3 sees it: attributes shared by all lanes, and its own."""
+
+    def __init__(self, vec_env: _BatchVecEnv, team: int, agent: str, **shared: Any) -> None:
+        self._vec_env, self._team, self.agent = vec_env, team, agent
+        vars(self).update(shared)
+
+    @property
+    def state(self) -> Array:
+        """The present state of the agent's team, `[S]` (a copy)."""
+        state: Array = self._vec_env._batch.state[self._team]
+        return state
+
+    @property
+    def unwrapped(self) -> Lane:
+        """Itself, as environments without a wrapper have it."""
+        return self
+
+
+class _SingleLane(Lane):
+    """A lane of a single agent's task, which can be reset alone."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode in this lane alone; see `SMEEnv.reset`."""
+        start = self._vec_env._start([options or {}])
+        observations = self._vec_env._begin({self._team: (seed, start)})
+        return observations[self._team], {}
+
+
+class _BatchVecEnv(LanesVecEnv):
+    """Every agent of every team of a `Batch` is a lane; a single agent is a team of one.
+
+    Lane e·n + i is agent i of team e. This class leaves joint observations and actions as they are,
+    which suits a single agent.
+    """
+
+    _lane_type = Lane
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        action_range: str,
+        observation_dim: int,
+        action_dim: int,
+        env_spec: EnvSpec | None = None,
+    ) -> None:
+        self.num_teams, self.agents = integer_in("num_envs", num_envs, 1), task.names
+        self._task, self._batch = task, Batch(task, self.num_teams)
+        self._begun = np.zeros(self.num_teams, bool)
+        action_space, self._rescaled = arguments.action_space(action_range, action_dim)
+        observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
+        shared = {
+            "render_mode": None, "spec": env_spec, "sme_spec": task.spec, "task": task,
+            "observation_space": observation_space, "action_space": action_space,
+        }  # fmt: skip
+        teams = range(self.num_teams)
+        super().__init__(
+            [self._lane_type(self, team, name, **shared) for team in teams for name in self.agents]
+        )
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Seed team e with seed + e at the next reset; None draws a seed.
+
+        Returns:
+          The seed of each lane, its team's.
+        """
+        first = list(super().seed(seed))
+        self._seeds = [first[lane // len(self.agents)] for lane in range(self.num_envs)]
+        return self._seeds
+
+    def reset(self) -> Observation:
+        """Begin an episode in every lane, with the seeds and options set before.
+
+        Returns:
+          Observations, a row for each lane, float32.
+
+        Raises:
+          StateError, OptionError: the options of `set_options` are invalid.
+        """
+        n = len(self.agents)
+        options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
+        starts = [self._start(of_team) for of_team in options]
+        observations = self._begin(dict(enumerate(zip(self._seeds[::n], starts, strict=True))))
+        self._clear_reset_arguments()
+        return observations
+
+    def _begin(self, teams: dict[int, tuple[int | None, Array | None]]) -> Observation:
+        """Begin an episode in these teams, each with a seed and an initial state, or None."""
+        seeds = {team: arguments.checked_seed(seed) for team, (seed, _) in teams.items()}
+        joint = self._batch.observe()
+        for team, (_, start) in teams.items():
+            seed = seeds[team]
+            if seed is not None:
+                self._batch.initial_states.seed(team, seed)
+            self._batch.begin(np.array([team]), joint, start)
+            self._begun[team] = True
+        return self._observations(joint)
+
+    def _start(self, options: list[dict[str, Any]]) -> Array | None:
+        """The initial state of a team, `[1, S]`, from the options of its lanes; None: draw it."""
+        for of_lane in options:
+            arguments.refuse_unknown_options(of_lane, ("state",))
+        shape = (self._task.spec.state_dim,)
+        states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
+        if not states:
+            return None
+        if len(states) < len(options) or any((state != states[0]).any() for state in states):
+            raise OptionError("options: a team has one state. Give the same to each of its lanes.")
+        return states[0][None]
+
+    def step_wait(self) -> StepResult:
+        """One step of every lane.
+
+        Returns:
+          Observations and rewards, float32, and dones, each with a row for each lane; infos.
+
+        Raises:
+          ActionError: wrong shape, not numbers, or not finite; no state has changed then.
+          EpisodeError: before the first reset.
+        """
+        actions = self._take_actions()
+        if not self._begun.all():
+            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
+        n, shape = len(self.agents), (self.num_envs, *self.action_space.shape)
+        unit = arguments.to_unit(actions, shape, self._rescaled)
+        done = self._batch.advance(self._joint_actions(unit))
+
+        similarity, step_reward, regret, reward, accumulated = (
+            agents.T.reshape(-1) for agents in done.values
+        )
+        optimal = arguments.from_unit(done.optimal, self._rescaled)
+        columns: dict[str, list[Any]] = {
+            "optimal_action": [row[part] for row in optimal for part in self._task.owned],
+            "similarity": similarity.tolist(),
+            "step_reward": step_reward.tolist(),
+            "regret": regret.tolist(),
+            "accumulated_reward": accumulated.tolist(),
+            "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
+        }
+        infos: list[dict[str, Any]] = [
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+        ]
+        ended: Mask = done.terminated | done.truncated
+        dones = np.repeat(ended, n)
+        if ended.any():
+            last = self._observations(done.observation.copy())
+            for lane in np.flatnonzero(dones):
+                infos[lane]["terminal_observation"] = last[lane]
+            self._batch.begin(np.flatnonzero(ended), done.observation)
+        return self._observations(done.observation), reward.astype(np.float32), dones, infos
+
+    def _observations(self, joint: Observation) -> Observation:
+        """Each lane's observation, from joint observations `[teams, S + 1 + n]`."""
+        return joint
+
+    def _joint_actions(self, unit: Array) -> Array:
+        """Joint actions `[teams, A]`, from those of all lanes in the unit range."""
+        return unit
+
+
+class SMEVecEnv(_BatchVecEnv):
+    """`num_envs` lanes of one task for SB3's algorithms and `VecEnv` wrappers.
+
+    As in SB3's `VecEnv`s, a finished lane begins its next episode at once, its last observation is
+    `terminal_observation` in its info, `TimeLimit.truncated` is True where it was truncated and
+    not terminated, and `seed(n)` seeds lane i with n + i at the next reset. Observations are
+    `[B, S + 2]`, as those of `SMEEnv`.
+
+    Args:
+      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
+      num_envs: B, the lanes, at least 1.
+      action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
+      **overrides: spec fields to change.
+
+    Raises:
+      SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
+    """
+
+    _lane_type = _SingleLane
+
+    def __init__(
+        self,
+        spec_or_id: SpecLike,
+        num_envs: int = 1,
+        *,
+        action_range: ActionRange = "symmetric",
+        **overrides: Any,
+    ) -> None:
+        named = registered_or_new(spec_or_id)
+        task = arguments.single_agent(load_task(named.kwargs["spec"], **overrides))
+        kwargs = {**named.kwargs, "action_range": action_range, **overrides}
+        env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), task.spec)
+        S, A = task.spec.state_dim, task.spec.action_dim
+        super().__init__(task, num_envs, action_range, S + 2, A, env_spec)
+
+
+class SMETeamVecEnv(_BatchVecEnv):
+    """`num_envs` teams of one task, each of their agents a lane: one policy for all agents.
+
+    Lane e·n + i is agent i of team e. Its *shared observation* `[S + 2 + n]` in [0, 1] is the state
+    with the channels that it does not observe set to 0, t/T, its own r_cum/k, and the one-hot of i.
+    Its action is `[max a_i]`, of which its first a_i are used. Reward and info are that agent's,
+    with the keys of `SMEEnv`. All agents of a team end together, and the team begins its next
+    episode at once. `seed(n)` seeds team e with n + e at the next reset. All lanes of a team
+    take the same options.
+
+    Args:
+      spec_or_id: the task: a spec, its fields, an id, a digest or a path. One without a team is a
+        team of one.
+      num_envs: the teams, at least 1; `num_envs` of the VecEnv is the lanes, teams times agents.
+      action_range: "symmetric", [−1, 1], or "unit", [0, 1].
+      **overrides: spec fields to change.
+
+    Raises:
+      SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+    """
+
+    def __init__(
+        self,
+        spec_or_id: SpecLike,
+        num_envs: int = 1,
+        *,
+        action_range: ActionRange = "symmetric",
+        **overrides: Any,
+    ) -> None:
+        task = load_task(spec_or_id, **overrides)
+        # For each channel of the joint action: the agent that owns it, and the entry of its action.
+        self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
+        self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])
+        observation_dim, action_dim = shared_observation_dim(task), shared_action_dim(task)
+        super().__init__(task, num_envs, action_range, observation_dim, action_dim)
+
+    def _observations(self, joint: Observation) -> Observation:
+        return shared_observation(self._task, joint).reshape(self.num_envs, -1)
+
+    def _joint_actions(self, unit: Array) -> Array:
+        # Every entry must be finite, also the last ones of agents that own fewer channels.
+        if not np.isfinite(unit).all():
+            raise arguments.not_finite_error()
+        by_agent = unit.reshape(self.num_teams, len(self.agents), -1)
+        return np.ascontiguousarray(by_agent[:, self._owner, self._entry])
