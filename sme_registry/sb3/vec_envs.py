@@ -72,7 +72,7 @@ class _BatchVecEnv(LanesVecEnv):
         env_spec: EnvSpec | None = None,
     ) -> None:
         self.num_teams, self.agents = integer_in("num_envs", num_envs, 1), task.names
-        self._task, self._batch = task, Batch(task, self.num_teams)
+        self._task, self._batch, self._action_dim = task, Batch(task, self.num_teams), action_dim
         self._begun = np.zeros(self.num_teams, bool)
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
         observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
@@ -148,7 +148,7 @@ class _BatchVecEnv(LanesVecEnv):
         actions = self._take_actions()
         if not self._begun.all():
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
-        n, shape = len(self.agents), (self.num_envs, *self.action_space.shape)
+        n, shape = len(self.agents), (self.num_envs, self._action_dim)
         unit = arguments.to_unit(actions, shape, self._rescaled)
         done = self._batch.advance(self._joint_actions(unit))
 
