@@ -22,7 +22,7 @@ from leaderboard.cli.options import (
 )
 from leaderboard.cli.results import LABELS, SYMBOLS, find_entry
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import Knowledge
+from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.terminal import Progress, err, out, print_json
@@ -285,5 +285,5 @@ def withdraw(
     else:
         with Store.open(Path(board)) as store:
             id = find_entry(store, id).id
-            intake.withdraw(store, intake.withdrawal_of(id, signing_key, reason))
+            intake.withdraw(store, SignedWithdrawal.create(id, signing_key, reason))
     out().print(f"{id} withdrawn", soft_wrap=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
@@ -37,6 +37,7 @@ MAX_RUNS = 10_000
 Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]
 
+_Model = TypeVar("_Model", bound=StrictModel)
 _Line = Annotated[str, Field(min_length=1, max_length=80)]
 _Text = Annotated[str, Field(max_length=2000)]
 _Link = Annotated[
@@ -166,24 +167,12 @@ class SignedSubmission(StrictModel):
         Raises:
           Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
         """
-        if len(text) > MAX_BYTES:
-            raise Rejection(
-                "too_large",
-                f"{FILE}: must be at most {MAX_BYTES:,} bytes. "
-                "List fewer runs, or shorten the texts.",
-            )
-        try:
-            plain = parse_json(text, FILE)
-        except MalformedDocumentError as error:
-            raise Rejection("not_json", str(error)) from None
+        plain = _parse(text, FILE, "List fewer runs, or shorten the texts.")
         if isinstance(plain, dict) and "signature" not in plain:
             raise Rejection(
                 "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
             )
-        try:
-            signed = cls.from_dict(plain, FILE)
-        except SpecError as error:
-            raise Rejection("schema", str(error)) from None
+        signed = _validate(cls, plain, FILE)
         submission = signed.submission
         if not verifies(
             submission.submitter.key, signed.signature, "submission", submission.digest
@@ -219,6 +208,41 @@ class SignedWithdrawal(StrictModel):
 
     withdrawal: Withdrawal
     signature: Signature
+
+    @classmethod
+    def create(cls, id: str, key: SigningKey, reason: str = "") -> SignedWithdrawal:
+        """A new withdrawal; `key` must be the one that signed the submission of this id."""
+        withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
+        return cls(withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest))
+
+    @classmethod
+    def read(cls, text: bytes) -> SignedWithdrawal:
+        """Parse a withdrawal. `Store.withdraw` verifies the signature, with the submission's key.
+
+        Raises:
+          Rejection: `too_large`, `not_json` or `schema`.
+        """
+        plain = _parse(text, "withdrawal", "Shorten the reason.")
+        return _validate(cls, plain, "withdrawal")
+
+
+def _parse(text: bytes, name: str, remedy: str) -> Any:
+    if len(text) > MAX_BYTES:
+        raise Rejection(
+            "too_large",
+            f"{name}: {len(text):,} bytes: must be at most {MAX_BYTES:,} bytes. {remedy}",
+        )
+    try:
+        return parse_json(text, name)
+    except MalformedDocumentError as error:
+        raise Rejection("not_json", str(error)) from None
+
+
+def _validate(kind: type[_Model], plain: Any, name: str) -> _Model:
+    try:
+        return kind.from_dict(plain, name)
+    except SpecError as error:
+        raise Rejection("schema", str(error)) from None
 
 
 def utc(moment: datetime.datetime) -> str:

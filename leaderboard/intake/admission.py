@@ -15,22 +15,17 @@ from collections.abc import Callable
 from leaderboard.artefact.gate import inspect
 from leaderboard.bundle import Bundle
 from leaderboard.documents.checks import check_submission, check_text
-from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import (
-    MAX_BYTES,
     Artefact,
     SignedSubmission,
     SignedWithdrawal,
     Submission,
-    Withdrawal,
-    now,
+    utc,
 )
 from leaderboard.errors import Rejection
-from leaderboard.intake.quotas import check_submissions
 from leaderboard.store import Store
-from sme_registry.errors import MalformedDocumentError, SpecError
-from sme_registry.io import parse_json
 
+_DAY = datetime.timedelta(days=1)
 ReadArtefact = Callable[[str], bytes]
 
 
@@ -68,14 +63,14 @@ def admit(
     submission = signed.submission
     key = submission.submitter.key
     check_submission(store.document, submission, moment)
-    check_submissions(store, key, moment)
+    _check_quotas(store, key, moment)
     _check_artefacts(store, submission, artefact)
     if artefact is not None:
         for digest in _artefacts(submission):
             if not store.objects.has(digest):
                 store.put_object(digest, [artefact(digest)], by=key)
     with store.transaction():  # no other submission can use the quota in between
-        check_submissions(store, key, moment)
+        _check_quotas(store, key, moment)
         return store.receive(signed)
 
 
@@ -91,14 +86,6 @@ def submit_bundle(store: Store, folder: str | os.PathLike[str]) -> str:
     bundle = Bundle.read(folder)
     admit(store, bundle.signed, artefact=bundle.artefact)
     return bundle.signed.id
-
-
-def withdrawal_of(id: str, key: SigningKey, reason: str = "") -> SignedWithdrawal:
-    """A signed withdrawal of a submission; the key must be the one that signed the submission."""
-    withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
-    return SignedWithdrawal(
-        withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest)
-    )
 
 
 def withdraw(store: Store, signed: SignedWithdrawal) -> str:
@@ -123,23 +110,29 @@ def unknown_submission(id: str) -> Rejection:
     return Rejection("unknown_submission", f"submission={id}: is not on this board. Check the id.")
 
 
-def read_withdrawal(text: bytes) -> SignedWithdrawal:
-    """Parse a withdrawal; `withdraw` verifies the signature.
+def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
+    """Reject one more submission of a key if its quota, or the queue, is full.
 
-    Raises:
-      Rejection: `too_large`, `not_json` or `schema`.
+    The board's own key has no quota, because nothing is shown without the reference rows.
     """
-    if len(text) > MAX_BYTES:
+    limits = store.document.limits
+    if key == store.document.key:
+        return
+    times = store.submission_times(key, utc(moment - _DAY))
+    if len(times) >= limits.submissions_per_day:
+        free = datetime.datetime.fromisoformat(times[-limits.submissions_per_day]) + _DAY
         raise Rejection(
-            "too_large",
-            f"withdrawal: {len(text):,} bytes: must be at most {MAX_BYTES:,}. Shorten the reason.",
+            "quota",
+            f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
+            f"within 24 hours. Send the next one after {utc(free)}.",
         )
-    try:
-        return SignedWithdrawal.from_dict(parse_json(text, "withdrawal"), "withdrawal")
-    except MalformedDocumentError as error:
-        raise Rejection("not_json", str(error)) from None
-    except SpecError as error:
-        raise Rejection("schema", str(error)) from None
+    waiting = store.queue.waiting()
+    if waiting >= limits.waiting_submissions:
+        raise Rejection(
+            "quota",
+            f"board: the queue is full, with {waiting} of {limits.waiting_submissions} waiting "
+            "submissions. Send it again when some of them are scored.",
+        )
 
 
 def _artefacts(submission: Submission) -> dict[str, Artefact]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 from collections import Counter
 from collections.abc import Callable
@@ -20,7 +21,6 @@ from leaderboard.documents.submission import (
     Submitter,
 )
 from leaderboard.intake.admission import admit
-from leaderboard.intake.quotas import parse_utc
 from leaderboard.store import Store
 from sme_registry.spec import SMESpec
 
@@ -71,7 +71,7 @@ def submit_references(store: Store) -> list[str]:
             ids.append(existing[reference.name])
             continue
         signed, artefacts = _submission(store, key, opened, reference)
-        admit(store, signed, parse_utc(opened), artefacts.__getitem__)
+        admit(store, signed, datetime.datetime.fromisoformat(opened), artefacts.__getitem__)
         ids.append(signed.id)
     return ids
 

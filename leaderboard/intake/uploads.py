@@ -1,4 +1,4 @@
-"""Upload permissions: a header, signed by the uploader's key, for one object and ten minutes.
+"""Uploads: a signed permission for one object and ten minutes, and the quotas in bytes.
 
 Authorization: SME-Ed25519 key=<64 hex>,time=<utc>,signature=<128 hex>
 signature = Ed25519(key, "sme-leaderboard/upload/" digest " " time)
@@ -12,9 +12,10 @@ import re
 from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.documents.submission import now, utc
 from leaderboard.errors import Rejection
-from leaderboard.intake.quotas import parse_utc
+from leaderboard.store import Store
 
 UPLOAD_MINUTES = 10
+_DAY = datetime.timedelta(days=1)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
     r"time=(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ),"
@@ -58,7 +59,8 @@ def uploader(header: str | None, digest: str, at: datetime.datetime | None = Non
         )
     moment = at or datetime.datetime.now(datetime.UTC)
     try:
-        fresh = abs(moment - parse_utc(time)) <= datetime.timedelta(minutes=UPLOAD_MINUTES)
+        age = abs(moment - datetime.datetime.fromisoformat(time))
+        fresh = age <= datetime.timedelta(minutes=UPLOAD_MINUTES)
     except ValueError:
         fresh = False
     if not fresh:
@@ -68,3 +70,48 @@ def uploader(header: str | None, digest: str, at: datetime.datetime | None = Non
             "Set your clock, and sign each upload just before sending it.",
         )
     return key
+
+
+def check_upload(
+    store: Store,
+    key: str,
+    size: int,
+    *,
+    pending: int = 0,
+    pending_of_key: int = 0,
+    at: datetime.datetime | None = None,
+) -> None:
+    """Reject an upload that is too large, or exceeds the key's or the board's quota.
+
+    Args:
+      store: the board.
+      key: the uploader's public key.
+      size: of the object, in bytes.
+      pending: bytes of all uploads in progress.
+      pending_of_key: bytes of this key's uploads in progress.
+      at: time of arrival; now by default.
+
+    Raises:
+      Rejection: `too_large` or `quota`.
+    """
+    limits = store.document.limits
+    if size > limits.artefact_bytes:
+        raise Rejection(
+            "too_large",
+            f"object: {size:,} bytes: must be at most {limits.artefact_bytes:,}. "
+            "Export a smaller network.",
+        )
+    moment = at or datetime.datetime.now(datetime.UTC)
+    used = store.uploaded_bytes(key, utc(moment - _DAY)) + pending_of_key
+    if used + size > limits.upload_bytes_per_day:
+        raise Rejection(
+            "quota",
+            f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
+            "within 24 hours. Upload the rest 24 hours after the first of them.",
+        )
+    if store.total_bytes() + pending + size > limits.total_bytes:
+        raise Rejection(
+            "quota",
+            f"objects: the board's {limits.total_bytes:,} bytes are full. "
+            "Ask its owner to raise the limit or to run `sme-leaderboard gc`.",
+        )

@@ -113,7 +113,7 @@ def verify(
     folder = Folder(path)
     folder.read()
     document = read_document(folder, folder.board, BoardDocument)
-    with contextlib.closing(Index.empty(None, folder, document)) as index:
+    with contextlib.closing(Index.empty(folder, document)) as index:
         verifier = _Verifier(folder, document, index, rescore, progress)
         verifier.check_opening()
         verifier.follow_log()
@@ -251,11 +251,10 @@ class _Verifier:
 
     def check_index(self) -> int:
         """Compare the board's index with the rebuilt one, row by row; returns the rows."""
-        path = self.folder.index
         try:
-            index = Index.snapshot(path, self.folder, self.document)
+            index = Index.open(self.folder, self.document, in_memory=True)
         except IndexUnusable as error:
-            if not path.exists():
+            if not self.folder.index.exists():
                 return 0
             _refuse_index("index.sqlite", str(error))
         rows = 0

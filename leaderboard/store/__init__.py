@@ -6,13 +6,12 @@ next one continues from the state it leaves.
 """
 
 from leaderboard.store.files import digest_of, read_document
+from leaderboard.store.garbage import Garbage, collect_garbage
 from leaderboard.store.index import EntryRow, Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import ATTEMPTS, LEASE_SECONDS, Claim, Queue
 from leaderboard.store.store import Store
-from leaderboard.store.upkeep import Garbage, collect_garbage
-from leaderboard.store.usage import Usage
 
 __all__ = [
     "ATTEMPTS",
@@ -29,7 +28,6 @@ __all__ = [
     "Objects",
     "Queue",
     "Store",
-    "Usage",
     "collect_garbage",
     "digest_of",
     "read_document",

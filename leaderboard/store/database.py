@@ -14,6 +14,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.keys import SigningKey
@@ -29,32 +30,29 @@ from sme_registry.spec import StrictModel
 
 
 class Database:
-    """The log and its index.
+    """The log and its index; a context manager, which `connect` opens.
 
     Args:
-      folder, document: the board's.
-      objects: the board's artefacts; a rebuilt index counts those that no submission names.
+      path: the board's folder.
       read_only: write nothing, not even the index, which is then held in memory.
     """
 
-    def __init__(
-        self, folder: Folder, document: BoardDocument, objects: Objects, *, read_only: bool
-    ) -> None:
-        self.folder = folder
-        self.document = document
+    def __init__(self, path: str | Path, *, read_only: bool) -> None:
+        self.folder = Folder(path)
+        self.document: BoardDocument = self.folder.read()
         self.read_only = read_only
-        self.log = Log(folder, document.key)
-        self._objects = objects
+        self.objects = Objects(self.folder)
+        self._log = Log(self.folder, self.document.key)
         self._thread_lock = threading.RLock()
         self._in_transaction = False
         self._key: SigningKey | None = None
         self._index: Index | None = None
         self._inode = (0, 0)
-        if not self.log.has(0):
+        if not self._log.has(0):
             raise TamperedError("log/00000000.json", "is missing; every log starts with it")
-        self._lock = FolderLock(folder.log)
+        self._lock = FolderLock(self.folder.log)
 
-    def open(self, *, reindex: bool) -> None:
+    def connect(self, *, reindex: bool) -> None:
         """Connect to the index and bring it up to date; rebuild it if it is unusable.
 
         Args:
@@ -88,6 +86,12 @@ class Database:
                 self._index = None
             self._lock.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Block all writers for a short while; a writable store also blocks all readers."""
@@ -97,6 +101,8 @@ class Database:
     @contextlib.contextmanager
     def transaction(self) -> Iterator[Index]:
         """Write to the board while every other process and thread waits. Nests.
+
+        Several calls inside one block (check a quota, then `receive`) see no change in between.
 
         Yields:
           The index, up to date.
@@ -135,7 +141,7 @@ class Database:
         key = self.signing_key()
         index = self._connected
         write_document(path, document)
-        index.apply(self.log.append(key, index.head, event, subject, digest_of(document)))
+        index.apply(self._log.append(key, index.head, event, subject, digest_of(document)))
 
     def signing_key(self) -> SigningKey:
         """The board's key.
@@ -164,7 +170,7 @@ class Database:
         if self.read_only:
             raise BoardError(f"{self.folder.path}: opened read-only. Open it for writing.")
 
-    def rebuild(self) -> None:
+    def reindex(self) -> None:
         """Rebuild the index from the log and the documents, whatever its state.
 
         Raises:
@@ -186,14 +192,14 @@ class Database:
         index = self._connected
         if self.read_only:
             self._catch_up(index)
-        elif self._replaced() or self.log.has(index.head.sequence + 1):
+        elif self._replaced() or self._log.has(index.head.sequence + 1):
             with self.transaction():
                 pass
 
     def _catch_up(self, index: Index) -> None:
         head = index.head
-        while self.log.has(head.sequence + 1):
-            entry = self.log.read_after(head)
+        while self._log.has(head.sequence + 1):
+            entry = self._log.read_after(head)
             index.apply(entry)
             head = entry.head
 
@@ -206,15 +212,14 @@ class Database:
         previous, self._index = self._index, None
         if previous is not None:
             previous.close()
-        connect = Index.snapshot if self.read_only else Index.open
         if not rebuild:
             with contextlib.suppress(IndexUnusable):
-                self._index = connect(self.folder.index, self.folder, self.document)
+                self._index = Index.open(self.folder, self.document, in_memory=self.read_only)
         if self._index is not None:
             self._inode = _inode(self.folder.index)
             self._refuse_lost_log(self._index.head)
         elif self.read_only:
-            self._index = Index.empty(None, self.folder, self.document)
+            self._index = Index.empty(self.folder, self.document)
         else:
             self._rebuild()
 
@@ -224,9 +229,9 @@ class Database:
             return
         where = f"log/{head.sequence:08d}.json"
         remedy = "Restore the log, or accept the present one with `sme-leaderboard reindex`"
-        if not self.log.has(head.sequence):
+        if not self._log.has(head.sequence):
             raise TamperedError(where, f"is missing, but the index recorded it. {remedy}")
-        if self.log.read(head.sequence).digest != head.digest:
+        if self._log.read(head.sequence).digest != head.digest:
             raise TamperedError(where, f"differs from the entry that the index recorded. {remedy}")
 
     def _rebuild(self) -> None:
@@ -235,7 +240,7 @@ class Database:
         with self._explained():
             self._build(path)
         try:
-            self._index = Index.open(path, self.folder, self.document)
+            self._index = Index.open(self.folder, self.document, in_memory=False)
         except IndexUnusable as error:
             raise BoardError(
                 f"{path}: {error}, although it was just built. Find the process that removes it, "
@@ -246,7 +251,7 @@ class Database:
     def _build(self, path: Path) -> None:
         temporary = temporary_beside(path)
         try:
-            index = Index.empty(temporary, self.folder, self.document)
+            index = Index.empty(self.folder, self.document, temporary)
             try:
                 with index.transaction():
                     self._catch_up(index)
@@ -272,7 +277,7 @@ class Database:
 
     def _add_uploads(self, index: Index) -> None:
         """Count the artefacts that no submission names; who uploaded them is no longer known."""
-        for digest, path in self._objects.paths():
+        for digest, path in self.objects.paths():
             if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
                 stat = path.stat()
                 uploaded = utc(datetime.datetime.fromtimestamp(stat.st_mtime, datetime.UTC))

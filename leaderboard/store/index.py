@@ -123,49 +123,34 @@ class Index:
         self.document = document
 
     @classmethod
-    def open(cls, path: Path, folder: Folder, document: BoardDocument) -> Index:
-        """Open an existing index for writing.
+    def open(cls, folder: Folder, document: BoardDocument, *, in_memory: bool) -> Index:
+        """Open a board's index, or a copy in memory, which writes nothing into the folder.
 
         Raises:
           IndexUnusable: it must be rebuilt.
         """
-        if not path.is_file():
+        if not folder.index.is_file():
             raise IndexUnusable("is missing")
-        with _unusable_if_broken():
-            connection = _connect(f"{path.absolute().as_uri()}?mode=rw")
         try:
-            with _unusable_if_broken():
-                connection.execute("PRAGMA journal_mode = WAL")
-                connection.execute("PRAGMA synchronous = FULL")
+            connection = _connect(":memory:" if in_memory else _uri(folder.index, "rw"))
+            try:
+                if in_memory:
+                    _copy_index(folder.index, connection)
+                else:
+                    connection.execute("PRAGMA journal_mode = WAL")
+                    connection.execute("PRAGMA synchronous = FULL")
                 _refuse_unusable(connection, document)
-        except IndexUnusable:
-            connection.close()
-            raise
+            except BaseException:
+                connection.close()
+                raise
+        except (sqlite3.DatabaseError, OSError) as error:
+            raise IndexUnusable(str(error)) from None
         return cls(connection, folder, document)
 
     @classmethod
-    def snapshot(cls, path: Path, folder: Folder, document: BoardDocument) -> Index:
-        """Copy an existing index into memory; writes nothing into a read-only folder.
-
-        Raises:
-          IndexUnusable: it must be rebuilt.
-        """
-        if not path.is_file():
-            raise IndexUnusable("is missing")
-        memory = _connect(":memory:")
-        try:
-            with _unusable_if_broken():
-                _copy_index(path, memory)
-                _refuse_unusable(memory, document)
-        except IndexUnusable:
-            memory.close()
-            raise
-        return cls(memory, folder, document)
-
-    @classmethod
-    def empty(cls, path: Path | None, folder: Folder, document: BoardDocument) -> Index:
-        """Create an empty index in a new file or in memory; `apply` fills it."""
-        connection = _connect(":memory:" if path is None else str(path))
+    def empty(cls, folder: Folder, document: BoardDocument, path: str | Path = ":memory:") -> Index:
+        """Create an empty index in memory or in a new file; `apply` fills it."""
+        connection = _connect(str(path))
         connection.executescript(f"PRAGMA user_version = {VERSION}; BEGIN; {SCHEMA} COMMIT;")
         return cls(connection, folder, document)
 
@@ -312,6 +297,10 @@ class Index:
                 yield table, str(row[0]), row[1:]
 
 
+def _uri(path: Path, mode: str) -> str:
+    return f"{path.absolute().as_uri()}?mode={mode}"
+
+
 def _connect(target: str) -> sqlite3.Connection:
     # Transactions begin explicitly; the store's lock admits one thread at a time.
     return sqlite3.connect(
@@ -338,16 +327,8 @@ def _copy_index(path: Path, memory: sqlite3.Connection) -> None:
 
 
 def _backup(path: Path, memory: sqlite3.Connection) -> None:
-    with contextlib.closing(_connect(f"{path.absolute().as_uri()}?mode=ro")) as source:
+    with contextlib.closing(_connect(_uri(path, "ro"))) as source:
         source.backup(memory)
-
-
-@contextlib.contextmanager
-def _unusable_if_broken() -> Iterator[None]:
-    try:
-        yield
-    except (sqlite3.DatabaseError, OSError) as error:
-        raise IndexUnusable(str(error)) from None
 
 
 def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) -> None:

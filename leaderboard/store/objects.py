@@ -18,7 +18,7 @@ class Objects:
     def __init__(self, folder: Folder) -> None:
         self.folder = folder
 
-    def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> bool:
+    def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> int | None:
         """Write an artefact while its bytes arrive; it exists only once all of it is verified.
 
         Args:
@@ -27,7 +27,7 @@ class Objects:
           limit: the largest size allowed, in bytes.
 
         Returns:
-          True if it is new.
+          Its size in bytes if it is new, otherwise None.
 
         Raises:
           Rejection: `too_large` or `artefact_digest`.
@@ -36,7 +36,7 @@ class Objects:
         path = self.folder.object(digest)
         try:
             os.utime(path)  # so that `gc` keeps it for the submission that follows
-            return False
+            return None
         except FileNotFoundError:
             pass
         except OSError as error:
@@ -60,7 +60,7 @@ class Objects:
                     f"artefact={digest[:19]}…: the bytes have the digest {actual[:19]}…. "
                     "Upload the file that was hashed.",
                 )
-        return True
+        return size
 
     def has(self, digest: str) -> bool:
         """Whether the artefact exists."""

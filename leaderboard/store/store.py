@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, TypeVar
 
 from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.checks import refuse_unsubmittable
@@ -14,25 +13,19 @@ from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.store import upkeep
 from leaderboard.store.database import Database
-from leaderboard.store.files import (
-    digest_of,
-    make_folder,
-    read_document,
-    write_document,
-)
-from leaderboard.store.index import EntryRow, Index
+from leaderboard.store.files import digest_of, make_folder, read_document, write_document
+from leaderboard.store.index import EntryRow
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
-from leaderboard.store.objects import Objects
 from leaderboard.store.queue import Queue
-from leaderboard.store.usage import Usage
 from sme_registry.errors import UnknownNameError
 from sme_registry.io import build_folder
-from sme_registry.spec import EvaluationProtocol, Suite
+from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
+
+_Model = TypeVar("_Model", bound=StrictModel)
 
 
-class Store:
+class Store(Database):
     """A board's folder, opened by `create` or `open`; a context manager.
 
     Attributes:
@@ -41,17 +34,11 @@ class Store:
       read_only: whether it was opened read-only.
       objects: the artefacts; `put_object` adds one.
       queue: the submissions that wait to be scored.
-      usage: what keys have uploaded and submitted.
     """
 
     def __init__(self, path: str | Path, *, read_only: bool) -> None:
-        self.folder = Folder(path)
-        self.document: BoardDocument = self.folder.read()
-        self.read_only = read_only
-        self.objects = Objects(self.folder)
-        self._database = Database(self.folder, self.document, self.objects, read_only=read_only)
-        self.queue = Queue(self._database)
-        self.usage = Usage(self._database)
+        super().__init__(path, read_only=read_only)
+        self.queue = Queue(self)
 
     @classmethod
     def create(
@@ -115,23 +102,23 @@ class Store:
         """
         store = cls(path, read_only=read_only)
         try:
-            store._database.open(reindex=reindex)
+            store.connect(reindex=reindex)
             if not read_only:
-                upkeep.remove_unlogged_results(store)
+                store._remove_unlogged_results()
         except BaseException:
             store.close()
             raise
         return store
 
-    def close(self) -> None:
-        """Release all files and locks; closing twice does nothing."""
-        self._database.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _remove_unlogged_results(self) -> None:
+        """Remove results of scorers that died before they logged them."""
+        if not self.folder.results.is_dir():
+            return
+        with self.transaction() as index:
+            for path in self.folder.results.glob("[!.]*.json"):
+                id = f"sha256:{path.stem}"
+                if not index.one("SELECT 1 FROM entry WHERE id = ? AND result IS NOT NULL", id):
+                    path.unlink()
 
     def put_object(self, digest: str, chunks: Iterable[bytes], *, by: str) -> bool:
         """Store an artefact while its bytes arrive, up to the board's size limit.
@@ -148,17 +135,10 @@ class Store:
           Rejection: `too_large` or `artefact_digest`.
           BoardError: it cannot be written, or the board's key is missing.
         """
-        self._database.refuse_read_only()
-        self._database.signing_key()  # without it no submission could follow
-        size = 0
-
-        def counted() -> Iterator[bytes]:
-            nonlocal size
-            for chunk in chunks:
-                size += len(chunk)
-                yield chunk
-
-        if not self.objects.put(digest, counted(), self.document.limits.artefact_bytes):
+        self.refuse_read_only()
+        self.signing_key()  # without it no submission could follow
+        size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
+        if size is None:
             return False
         with self.transaction() as index:
             if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
@@ -179,8 +159,7 @@ class Store:
         with self.transaction() as index:
             if index.status(signed.id) is not None:
                 return False
-            path = self.folder.submission(signed.id)
-            self._database.record("received", signed.id, path, signed)
+            self.record("received", signed.id, self.folder.submission(signed.id), signed)
         return True
 
     def withdraw(self, signed: SignedWithdrawal) -> bool:
@@ -208,7 +187,7 @@ class Store:
             if index.status(withdrawal.submission) == "withdrawn":
                 return False
             path = self.folder.withdrawal(withdrawal.submission)
-            self._database.record("withdrawn", withdrawal.submission, path, signed)
+            self.record("withdrawn", withdrawal.submission, path, signed)
         return True
 
     def submission(self, id: str) -> SignedSubmission:
@@ -218,10 +197,8 @@ class Store:
           UnknownNameError: there is no such submission.
           TamperedError: its file differs from the logged one.
         """
-        digest = self._logged("document", id)
-        if digest is None:
-            _refuse_unknown(id)
-        return read_document(self.folder, self.folder.submission(id), SignedSubmission, digest)
+        signed = self._read("document", id, self.folder.submission, SignedSubmission)
+        return _refuse_unknown(id) if signed is None else signed
 
     def result(self, id: str) -> Result | None:
         """A submission's result; None if it has none, or does not exist.
@@ -229,10 +206,7 @@ class Store:
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        digest = self._logged("result", id)
-        if digest is None:
-            return None
-        return read_document(self.folder, self.folder.result(id), Result, digest)
+        return self._read("result", id, self.folder.result, Result)
 
     def withdrawal(self, id: str) -> SignedWithdrawal | None:
         """A submission's withdrawal; None if there is none.
@@ -240,26 +214,59 @@ class Store:
         Raises:
           TamperedError: its file differs from the logged one.
         """
-        digest = self._logged("withdrawal", id)
-        if digest is None:
+        return self._read("withdrawal", id, self.folder.withdrawal, SignedWithdrawal)
+
+    def _read(
+        self, column: str, id: str, path_of: Callable[[str], Path], kind: type[_Model]
+    ) -> _Model | None:
+        """A document of a submission, whose digest in the log the index has in `column`."""
+        with self.reading() as index:
+            row = index.one(f"SELECT {column} FROM entry WHERE id = ?", id)
+        if row is None or row[0] is None:
             return None
-        return read_document(self.folder, self.folder.withdrawal(id), SignedWithdrawal, digest)
+        return read_document(self.folder, path_of(id), kind, row[0])
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
-        with self._database.reading() as index:
+        with self.reading() as index:
             return index.entries()
 
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
-        with self._database.reading() as index:
+        with self.reading() as index:
             return index.entry(id)
 
     @property
     def head(self) -> Head:
         """Number, digest and time of the last log entry."""
-        with self._database.reading() as index:
+        with self.reading() as index:
             return index.head
+
+    def uploaded_bytes(self, key: str, since: str) -> int:
+        """Bytes that a key has uploaded since a time in the form of `submission.now()`."""
+        with self.reading() as index:
+            return index.number(
+                "SELECT (SELECT coalesce(sum(size), 0) FROM object WHERE key = ?1 AND received >= "
+                "?2) + (SELECT coalesce(sum(size), 0) FROM upload WHERE key = ?1 AND time >= ?2)",
+                *(key, since),
+            )
+
+    def total_bytes(self) -> int:
+        """Bytes of all artefacts."""
+        with self.reading() as index:
+            return index.number(
+                "SELECT (SELECT coalesce(sum(size), 0) FROM object)"
+                " + (SELECT coalesce(sum(size), 0) FROM upload)"
+            )
+
+    def submission_times(self, key: str, since: str) -> list[str]:
+        """When each submission of a key since a time was received, in order."""
+        with self.reading() as index:
+            rows = index.connection.execute(
+                "SELECT received FROM entry WHERE key = ? AND received >= ? ORDER BY received",
+                (key, since),
+            )
+            return [received for (received,) in rows]
 
     def log(self, start: int = 0, count: int = 100) -> list[LogEntry]:
         """At most `count` log entries, from number `start` on.
@@ -268,28 +275,7 @@ class Store:
           TamperedError: an entry was altered.
         """
         stop = min(start + count, self.head.sequence + 1)
-        return [self._database.log.read(sequence) for sequence in range(max(start, 0), stop)]
-
-    def transaction(self) -> contextlib.AbstractContextManager[Index]:
-        """Write while every other process and thread waits; see `Database.transaction`.
-
-        Several calls inside one block (check a quota, then `receive`) see no change in between.
-        """
-        return self._database.transaction()
-
-    def locked(self) -> contextlib.AbstractContextManager[None]:
-        """Block all writers for the block, which must be short."""
-        return self._database.locked()
-
-    def reindex(self) -> None:
-        """Rebuild the index from the log and the documents; see `Database.rebuild`."""
-        self._database.rebuild()
-
-    def _logged(self, column: str, id: str) -> str | None:
-        """The digest of a submission's document, result or withdrawal in the log."""
-        with self._database.reading() as index:
-            row = index.one(f"SELECT {column} FROM entry WHERE id = ?", id)
-        return None if row is None else row[0]
+        return [self._log.read(sequence) for sequence in range(max(start, 0), stop)]
 
 
 def _refuse_unfit(document: BoardDocument) -> None:

@@ -30,7 +30,7 @@ from starlette.responses import JSONResponse, Response
 
 from leaderboard import exports, intake
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.submission import SignedSubmission
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import Rejection
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
@@ -181,7 +181,7 @@ class _Routes:
         text = await limits.read_document(request, "withdrawal")
 
         def withdraw() -> str:
-            return intake.withdraw(self._store, intake.read_withdrawal(text))
+            return intake.withdraw(self._store, SignedWithdrawal.read(text))
 
         id = await to_thread.run_sync(withdraw, limiter=self._admissions)
         return JSONResponse({"id": id, "status": "withdrawn"})

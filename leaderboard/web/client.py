@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
-from leaderboard.intake import upload_header, withdrawal_of
+from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, MissingDependencyError, OptionError
 from sme_registry.io import parse_json
 
@@ -110,7 +111,7 @@ def withdraw(
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
-    signed = withdrawal_of(f"sha256:{_digits(id)}", key, reason)
+    signed = SignedWithdrawal.create(f"sha256:{_digits(id)}", key, reason)
     with _Client(url, insecure=insecure) as client:
         client.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 

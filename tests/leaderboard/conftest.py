@@ -15,7 +15,6 @@ from leaderboard.documents.submission import (
     SignedSubmission,
     SignedWithdrawal,
     Submission,
-    Withdrawal,
     now,
 )
 from leaderboard.store import Store
@@ -129,10 +128,7 @@ def put_submission(
 
 def signed_withdrawal(id: str, key: SigningKey) -> SignedWithdrawal:
     """A withdrawal of a submission, signed by this key."""
-    withdrawal = Withdrawal(submission=id, created=now(), reason="a test")
-    return SignedWithdrawal(
-        withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest)
-    )
+    return SignedWithdrawal.create(id, key, "a test")
 
 
 @pytest.fixture

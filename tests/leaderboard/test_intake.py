@@ -11,7 +11,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission, utc
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import Rejection
 from leaderboard.intake import references
 from leaderboard.scoring.ranking import refuse_unpublishable
@@ -139,7 +139,7 @@ def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path: Path, key: Signin
         put_submission(store, key, 2)
         signed, artefacts = tiny_submission(store, key, 3)
         put(store, key, artefacts)
-        first = store.usage.submission_times(key.public, ANY_TIME)[0]
+        first = store.submission_times(key.public, ANY_TIME)[0]
         free = datetime.datetime.fromisoformat(first) + datetime.timedelta(days=1)
         with pytest.raises(Rejection, match=f"quota: .* after {utc(free)}") as caught:
             receive(store, signed)
@@ -248,7 +248,7 @@ def test_the_name_of_a_reference_row_does_not_make_one(store: Store, key: Signin
 
 def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
-    withdrawal = intake.withdrawal_of(signed.id, key, "a bug")
+    withdrawal = SignedWithdrawal.create(signed.id, key, "a bug")
     for _ in range(2):
         assert intake.withdraw(store, withdrawal) == signed.id
     entry = store.entry(signed.id)
@@ -259,9 +259,9 @@ def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
 
 def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
-    forged = intake.withdrawal_of(signed.id, SigningKey.generate())
+    forged = SignedWithdrawal.create(signed.id, SigningKey.generate())
     assert code_of(lambda: intake.withdraw(store, forged)) == "bad_signature"
-    board = intake.withdrawal_of(signed.id, store.folder.signing_key())
+    board = SignedWithdrawal.create(signed.id, store.folder.signing_key())
     assert code_of(lambda: intake.withdraw(store, board)) == "bad_signature"
 
 
@@ -270,23 +270,23 @@ def test_a_reason_may_not_contain_control_characters(
     store: Store, key: SigningKey, letter: str
 ) -> None:
     signed = put_submission(store, key)
-    unsafe = intake.withdrawal_of(signed.id, key, f"a bug{letter}[2J")
+    unsafe = SignedWithdrawal.create(signed.id, key, f"a bug{letter}[2J")
     assert code_of(lambda: intake.withdraw(store, unsafe)) == "unsafe_name"
     assert store.withdrawal(signed.id) is None
-    intake.withdraw(store, intake.withdrawal_of(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+    intake.withdraw(store, SignedWithdrawal.create(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
 
 
 def test_an_unknown_submission_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
-    withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key)
+    withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key)
     assert code_of(lambda: intake.withdraw(store, withdrawal)) == "unknown_submission"
 
 
 def test_a_withdrawal_is_read_back(key: SigningKey) -> None:
-    withdrawal = intake.withdrawal_of("sha256:" + "0" * 64, key, "a bug")
-    assert intake.read_withdrawal(withdrawal.model_dump_json().encode()) == withdrawal
-    assert code_of(lambda: intake.read_withdrawal(b"{")) == "not_json"
-    assert code_of(lambda: intake.read_withdrawal(b"[]")) == "schema"
-    assert code_of(lambda: intake.read_withdrawal(b" " * 10**6)) == "too_large"
+    withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key, "a bug")
+    assert SignedWithdrawal.read(withdrawal.model_dump_json().encode()) == withdrawal
+    assert code_of(lambda: SignedWithdrawal.read(b"{")) == "not_json"
+    assert code_of(lambda: SignedWithdrawal.read(b"[]")) == "schema"
+    assert code_of(lambda: SignedWithdrawal.read(b" " * 10**6)) == "too_large"
 
 
 # Uploads.

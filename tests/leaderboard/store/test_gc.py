@@ -38,7 +38,7 @@ def litter(store, key, submit):
 
 def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     old, young, named = litter
-    before = store.usage.total_bytes()
+    before = store.total_bytes()
     garbage = collect_garbage(store)
     assert (garbage.temporary, garbage.objects) == (3, 1)
     assert garbage.files == 4
@@ -47,7 +47,7 @@ def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     assert store.objects.has(young)
     assert store.objects.has(named)
     assert [path.name for path in store.folder.path.rglob(".*.tmp")] == [".alive.12345678.tmp"]
-    assert store.usage.total_bytes() == before - len(b"old, and of nobody")
+    assert store.total_bytes() == before - len(b"old, and of nobody")
     assert collect_garbage(store).files == 0
 
 

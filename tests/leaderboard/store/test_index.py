@@ -158,8 +158,8 @@ def test_submissions_are_counted_by_key_and_time(store, key, submit):
     put_submission(store, SigningKey.generate(), 3)
     now = datetime.datetime.now(datetime.UTC)
     day = datetime.timedelta(days=1)
-    assert len(store.usage.submission_times(key.public, utc(now - day))) == 2
-    assert store.usage.submission_times(key.public, utc(now + day)) == []
+    assert len(store.submission_times(key.public, utc(now - day))) == 2
+    assert store.submission_times(key.public, utc(now + day)) == []
 
 
 @pytest.mark.parametrize("harm", ["missing", "empty", "noise", "torn", "schema", "another board"])
@@ -291,7 +291,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
         with Store.open(board, read_only=True) as read:
             assert len(read.entries()) == (5 if killed else 4)
             assert read.result(read.entries()[0].id) is not None
-            with read._database.reading() as index:
+            with read.reading() as index:
                 assert list(index.derived_rows()) == expected
         with pytest.raises(BoardError):
             Store.open(board)

@@ -88,14 +88,14 @@ def test_a_path_is_not_a_digest(store):
 def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, submit):
     since = "2000-01-01T00:00:00Z"
     store.put_object(digest(b"12345"), [b"12345"], by=key.public)
-    assert store.usage.uploaded_bytes(key.public, since) == store.usage.total_bytes() == 5
+    assert store.uploaded_bytes(key.public, since) == store.total_bytes() == 5
     signed = submit()
     size = 5 + signed.submission.runs[0].artefact.size
-    assert store.usage.uploaded_bytes(key.public, since) == store.usage.total_bytes() == size
-    assert store.usage.uploaded_bytes(key.public, "2999-01-01T00:00:00Z") == 0
-    assert store.usage.uploaded_bytes(KEY, since) == 0
+    assert store.uploaded_bytes(key.public, since) == store.total_bytes() == size
+    assert store.uploaded_bytes(key.public, "2999-01-01T00:00:00Z") == 0
+    assert store.uploaded_bytes(KEY, since) == 0
     store.reindex()  # who brought what nobody submitted is forgotten, but not its size
-    assert store.usage.total_bytes() == size
+    assert store.total_bytes() == size
 
 
 def test_many_threads_upload_the_same_object_once(store):
@@ -113,4 +113,4 @@ def test_many_threads_upload_the_same_object_once(store):
     assert len(new) == 8
     assert any(new)
     assert files(store) == [store.folder.object(digest(data)).name]
-    assert store.usage.total_bytes() == len(data)
+    assert store.total_bytes() == len(data)

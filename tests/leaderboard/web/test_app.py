@@ -18,7 +18,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission, utc
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
 from leaderboard.web.errors import HTTP_CODES, STATUSES
@@ -351,7 +351,7 @@ def test_an_artefact_is_uploaded_once_and_downloaded_unchanged(
     assert HTTP.head(path).status_code == 200
     assert HTTP.get(path).content == data
     assert store.objects.read(sha256(data)) == data
-    assert store.usage.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
+    assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
 
 
 def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
@@ -679,7 +679,7 @@ def test_the_submission_quota_states_when_it_frees_up(tmp_path: Path, key: Signi
         with serving(store.folder.path) as url:
             answer = post(url, uploaded(url, store, key, 3).to_bytes())
             assert refusal(answer) == (429, "quota")
-            received = store.usage.submission_times(key.public, "2000-01-01T00:00:00Z")[0]
+            received = store.submission_times(key.public, "2000-01-01T00:00:00Z")[0]
             tomorrow = datetime.datetime.fromisoformat(received) + datetime.timedelta(days=1)
             assert f"after {utc(tomorrow)}" in answer.json()["message"]
             other = SigningKey.generate()
@@ -698,12 +698,12 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
     signed = uploaded(url, store, key)
     post(url, signed.to_bytes())
     path = f"{url}/api/withdrawals"
-    stranger = intake.withdrawal_of(signed.id, SigningKey.generate())
+    stranger = SignedWithdrawal.create(signed.id, SigningKey.generate())
     answer = HTTP.post(path, json=stranger.to_dict())
     assert refusal(answer) == (403, "bad_signature")
-    unknown = intake.withdrawal_of("sha256:" + "0" * 64, key)
+    unknown = SignedWithdrawal.create("sha256:" + "0" * 64, key)
     assert refusal(HTTP.post(path, json=unknown.to_dict())) == (404, "unknown_submission")
-    own = intake.withdrawal_of(signed.id, key, "a bug")
+    own = SignedWithdrawal.create(signed.id, key, "a bug")
     for _ in range(2):
         answer = HTTP.post(path, json=own.to_dict())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")

@@ -91,7 +91,7 @@ def test_a_hundred_large_uploads_at_once_take_little_memory(store: Store, key: S
     assert peak - before < UPLOADS * UPLOAD_BYTES / 4
     stored = [store.folder.object(digest).stat().st_size for digest in digests]
     assert stored == [UPLOAD_BYTES] * UPLOADS
-    assert store.usage.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == UPLOADS * UPLOAD_BYTES
+    assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == UPLOADS * UPLOAD_BYTES
     assert len(store.objects.read(digests[0])) == UPLOAD_BYTES  # which hashes it anew
     shutil.rmtree(store.folder.objects)
 

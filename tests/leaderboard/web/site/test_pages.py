@@ -15,7 +15,6 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedWithdrawal, Withdrawal
 from leaderboard.errors import BoardError, NotPublishable
-from leaderboard.intake import withdrawal_of
 from leaderboard.store import Store
 from leaderboard.web.site import STATIC, Pages, content_type, rows, write_site
 from leaderboard.web.site import pages as site_pages
@@ -261,7 +260,7 @@ def test_the_page_of_a_withdrawn_submission_gives_its_reason_as_text(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         id = boards.submit(store, key, "PPO", [0.2] * 6)
         assert "Reason:" not in Page(Pages(store).submission(id)).words
-        store.withdraw(withdrawal_of(id, key, boards.HOSTILE))
+        store.withdraw(SignedWithdrawal.create(id, key, boards.HOSTILE))
         page = Page(Pages(store).submission(id))
     assert f"Reason: {boards.HOSTILE}" in page.words
 

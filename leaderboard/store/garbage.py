@@ -1,17 +1,14 @@
-"""Removal of files that dead processes and missing submissions leave behind."""
+"""`collect_garbage`: remove what dead processes and missing submissions leave behind."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from leaderboard.store.files import unwritable
+from leaderboard.store.store import Store
 from sme_registry.io import TEMPORARY
-
-if TYPE_CHECKING:
-    from leaderboard.store.store import Store
 
 
 @dataclass(frozen=True)
@@ -82,14 +79,3 @@ def collect_garbage(
             for digest in objects:
                 index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
     return Garbage(len(temporary), len(objects), size)
-
-
-def remove_unlogged_results(store: Store) -> None:
-    """Remove results of scorers that died before they logged them."""
-    if not store.folder.results.is_dir():
-        return
-    with store.transaction() as index:
-        for path in store.folder.results.glob("[!.]*.json"):
-            id = f"sha256:{path.stem}"
-            if not index.one("SELECT 1 FROM entry WHERE id = ? AND result IS NOT NULL", id):
-                path.unlink()
