@@ -11,9 +11,9 @@ import io
 from typing import Any
 
 from leaderboard.documents.board import BoardDocument
-from leaderboard.documents.result import METRICS, Estimate
+from leaderboard.documents.result import METRICS, Estimate, Metric
 from leaderboard.documents.submission import now
-from leaderboard.scoring.ranking import Metric, RankedRow
+from leaderboard.scoring.ranking import RankedRow
 from sme_registry.io import to_json as plain_to_json
 from sme_registry.terminal import escape_latex, fixed
 

@@ -98,11 +98,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
 
 
 def _refuse_other_files(folder: Path) -> None:
-    """Refuse a folder with files that no demonstration created.
-
-    Raises:
-      OptionError: names them.
-    """
+    """Refuse a folder with files that no demonstration created."""
     existing = [folder / name for name in sorted(_FOLDERS) if os.path.lexists(folder / name)]
     if existing and not _is_demonstration(folder / "board"):
         raise OptionError(

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from leaderboard.cli.options import BoardFolder, Json
+from leaderboard.documents.result import Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
-from sme_registry.terminal import Progress, err, fixed, out, print_json, print_pairs
+from sme_registry.terminal import Progress, err, fixed, out, print_json, print_pairs, table
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from leaderboard.documents.result import Estimate, Result
     from leaderboard.public_view import PublicView
     from leaderboard.scoring.ranking import RankedRow
     from leaderboard.store import EntryRow, Store
 
-Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
 LABELS = {
     "wd_regret": "WD regret N₀",
@@ -86,36 +87,29 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
 
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
-    table = Table(
-        title=f"{LABELS[metric]} on {suite} (0 optimal, 1 the constant ½; 95 % intervals)",
-        caption="\n".join(f"{mark} not ranked: {REASONS[reason]}" for reason, mark in notes.items())
-        or None,
-        title_justify="left",
-        caption_justify="left",
+    ranking = table(
+        f"{LABELS[metric]} on {suite} (0 optimal, 1 the constant ½; 95 % intervals)",
+        {},
+        caption="\n".join(f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()),
     )
-    table.add_column("rank", justify="right", no_wrap=True)
-    table.add_column("method")
-    table.add_column("submitter")
+    ranking.add_column("rank", justify="right", no_wrap=True)
+    ranking.add_column("method")
+    ranking.add_column("submitter")
     for name, symbol in SYMBOLS.items():
-        table.add_column(symbol, justify="right", no_wrap=True, style="bold" * (name == metric))
-    table.add_column("runs", justify="right")
+        ranking.add_column(symbol, justify="right", no_wrap=True, style="bold" * (name == metric))
+    ranking.add_column("runs", justify="right")
     for row in rows:
         entry = row.entry
         scores = {name: getattr(entry.scores, name) for name in SYMBOLS}
-        table.add_row(
-            notes.get(row.reason, "") if row.first is None else rank_range(row.first, row.last),
+        ranking.add_row(
+            row.ranks or notes.get(row.reason, ""),
             escape(f"{entry.method} {entry.version}".strip()),
             escape(entry.submitter),
             *(_interval(v) if name == metric else fixed(v.value) for name, v in scores.items()),
             str(entry.runs),
             style="dim" if row.first is None else None,
         )
-    return table
-
-
-def rank_range(first: int, last: int | None) -> str:
-    """`3`, or `2–5` if the interval allows several ranks."""
-    return str(first) if last in (None, first) else f"{first}–{last}"
+    return ranking
 
 
 def _interval(value: Estimate) -> str:
@@ -189,26 +183,24 @@ def _print_submission(view: PublicView) -> None:
 
 def _scores_table(result: Result) -> Table:
     assert result.scores is not None
-    table = Table(title="normalised regret (0 optimal, 1 the constant ½)", title_justify="left")
-    table.add_column("")
-    for name in ("θ", "low", "high"):
-        table.add_column(name, justify="right")
+    scores = table(
+        "normalised regret (0 optimal, 1 the constant ½)",
+        {"": "text", "θ": "number", "low": "number", "high": "number"},
+    )
     rows = {label: getattr(result.scores, name) for name, label in LABELS.items()}
     for m, value in enumerate(result.scores.normalised_regret):
         rows[f"N in OOD {m}" if m else "N in WD"] = value
     for label, value in rows.items():
-        table.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
-    return table
+        scores.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
+    return scores
 
 
 def _class_table(result: Result) -> Table:
-    table = Table(title="by class", title_justify="left")
-    for name in ("class", "runs", "N₀", "N̄"):
-        table.add_column(name, justify="left" if name == "class" else "right")
+    classes = table("by class", {"class": "text", "runs": "number", "N₀": "number", "N̄": "number"})
     for member in result.classes:
         scores = (fixed(member.wd_regret, 4), fixed(member.ood_regret, 4))
-        table.add_row(escape(member.name), str(member.runs), *scores)
-    return table
+        classes.add_row(escape(member.name), str(member.runs), *scores)
+    return classes
 
 
 def find_entry(store: Store, id: str) -> EntryRow:

@@ -146,11 +146,7 @@ def new(
 
 
 def _expanded(patterns: list[str]) -> list[Path]:
-    """The paths that match, sorted, without duplicates.
-
-    Raises:
-      OptionError: nothing matches a pattern.
-    """
+    """The paths that match, in the patterns' order, without duplicates."""
     paths: dict[Path, None] = {}
     for pattern in patterns:
         path = Path(pattern)
@@ -275,7 +271,6 @@ def withdraw(
 
       sme-leaderboard withdraw board 3f2a --reason "a bug in the wrapper"
     """
-    from leaderboard import intake
     from leaderboard.store import Store
     from leaderboard.web import client
 
@@ -285,5 +280,5 @@ def withdraw(
     else:
         with Store.open(Path(board)) as store:
             id = find_entry(store, id).id
-            intake.withdraw(store, SignedWithdrawal.create(id, signing_key, reason))
+            store.withdraw(SignedWithdrawal.create(id, signing_key, reason))
     out().print(f"{id} withdrawn", soft_wrap=True)

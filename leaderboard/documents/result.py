@@ -30,6 +30,9 @@ from sme_registry.spec import (
     StrictModel,
 )
 
+Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
+"""The metrics that a board ranks by."""
+
 METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 

@@ -1,6 +1,6 @@
-"""What a board accepts: uploads, submissions, withdrawals, and its own reference rows."""
+"""What a board accepts: uploads, submissions, and its own reference rows."""
 
-from leaderboard.intake.admission import admit, submit_bundle, unknown_submission, withdraw
+from leaderboard.intake.admission import admit, submit_bundle
 from leaderboard.intake.references import submit_references
 from leaderboard.intake.uploads import UPLOAD_MINUTES, check_upload, upload_header, uploader
 
@@ -10,8 +10,6 @@ __all__ = [
     "check_upload",
     "submit_bundle",
     "submit_references",
-    "unknown_submission",
     "upload_header",
     "uploader",
-    "withdraw",
 ]

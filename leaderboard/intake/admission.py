@@ -1,4 +1,4 @@
-"""Submissions and withdrawals: read, checked against the board and its quotas, then stored.
+"""Submissions: read, checked against the board and its quotas, then stored.
 
     read → known? → document against board → quotas → artefacts present → gate → store
 
@@ -14,11 +14,10 @@ from collections.abc import Callable
 
 from leaderboard.artefact.gate import inspect
 from leaderboard.bundle import Bundle
-from leaderboard.documents.checks import check_submission, check_text
+from leaderboard.documents.checks import check_submission
 from leaderboard.documents.submission import (
     Artefact,
     SignedSubmission,
-    SignedWithdrawal,
     Submission,
     utc,
 )
@@ -86,28 +85,6 @@ def submit_bundle(store: Store, folder: str | os.PathLike[str]) -> str:
     bundle = Bundle.read(folder)
     admit(store, bundle.signed, artefact=bundle.artefact)
     return bundle.signed.id
-
-
-def withdraw(store: Store, signed: SignedWithdrawal) -> str:
-    """Withdraw a submission at its submitter's request; a second withdrawal changes nothing.
-
-    Returns:
-      The submission's id.
-
-    Raises:
-      Rejection: `unknown_submission`, `unsafe_name` or `bad_signature`.
-    """
-    id = signed.withdrawal.submission
-    if store.entry(id) is None:
-        raise unknown_submission(id)
-    check_text("reason", signed.withdrawal.reason)
-    store.withdraw(signed)
-    return id
-
-
-def unknown_submission(id: str) -> Rejection:
-    """The rejection of an id that no submission on the board has."""
-    return Rejection("unknown_submission", f"submission={id}: is not on this board. Check the id.")
 
 
 def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:

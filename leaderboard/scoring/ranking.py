@@ -14,12 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from leaderboard.documents.result import Estimate, Scores
+from leaderboard.documents.result import Estimate, Metric, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.scoring.metrics import rank_ranges
 from leaderboard.store import EntryRow
 
-Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 NotRanked = Literal["", "reference", "too_few_runs", "not_learned"]
 
 REFERENCES = {"optimal": 0.0, "constant": 1.0}  # N_m of each reference row, by its method's name
@@ -47,6 +46,13 @@ class RankedRow:
     first: int | None
     last: int | None
     reason: NotRanked
+
+    @property
+    def ranks(self) -> str:
+        """`3`, or `2–5` if the intervals allow several ranks; empty without one."""
+        if self.first is None:
+            return ""
+        return str(self.first) if self.last == self.first else f"{self.first}–{self.last}"
 
 
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:

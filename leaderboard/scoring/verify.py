@@ -14,7 +14,6 @@ import contextlib
 import itertools
 import random
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -26,6 +25,7 @@ from leaderboard.documents.submission import Artefact, Run, SignedSubmission, Si
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.score import (
+    Progress,
     evaluation_seed,
     failed_run,
     never_listed,
@@ -43,9 +43,7 @@ from leaderboard.store import (
     read_document,
 )
 from sme_registry.errors import OptionError
-from sme_registry.io import TEMPORARY
-
-Progress = Callable[[int, int], None]
+from sme_registry.io import TEMPORARY, integer_in
 
 EXACT = 1e-9
 """Tolerance for numbers recomputed from the same runs: another machine may sum in another order."""
@@ -107,22 +105,25 @@ def verify(
       BoardError: the folder holds no board.
       OptionError: `rescore` is negative, or `contains` is not a digest.
     """
-    if rescore < 0:
-        raise OptionError(f"rescore={rescore}: must be at least 0. Leave it out for none.")
+    integer_in("rescore", rescore, 0, advice="Leave it out for none.")
     digest = None if contains is None else _entry_digest(contains)
     folder = Folder(path)
     folder.read()
     document = read_document(folder, folder.board, BoardDocument)
     with contextlib.closing(Index.empty(folder, document)) as index:
-        verifier = _Verifier(folder, document, index, rescore, progress)
+        verifier = _Verifier(index, rescore, progress)
         verifier.check_opening()
         verifier.follow_log()
         with Store.open(path, read_only=True) as store:
             with store.locked():
                 verifier.follow_log()  # entries logged in the meantime
                 verifier.check_numbering()
-                if digest is not None:
-                    verifier.check_contains(digest)
+                if digest is not None and digest not in verifier.digests:
+                    raise TamperedError(
+                        "log",
+                        f"has no entry with the digest {digest}. If it was an entry of this board, "
+                        "the log was cut or rewritten since",
+                    )
                 unlogged = verifier.count_unlogged()
                 rows = verifier.check_index()
             verifier.check_signatures()
@@ -157,24 +158,16 @@ def _entry_digest(text: str) -> str:
 class _Verifier:
     """The checks of one board; `follow_log` fills its empty index from the log."""
 
-    def __init__(
-        self,
-        folder: Folder,
-        document: BoardDocument,
-        index: Index,
-        rescore: int,
-        progress: Progress | None,
-    ) -> None:
-        self.folder = folder
-        self.document = document
+    def __init__(self, index: Index, rescore: int, progress: Progress | None) -> None:
         self.index = index
-        self.log = Log(folder, document.key)
-        self.objects = Objects(folder)
+        self.folder, self.document = index.folder, index.document
+        self.log = Log(self.folder, self.document.key)
+        self.objects = Objects(self.folder)
         self.digests: set[str] = set()
         self._progress = progress
         self._done = 0
         self._total = rescore + sum(1 for _ in self.objects.paths())
-        self._total += len(_names(folder.log)) + len(_names(folder.results))
+        self._total += len(_names(self.folder.log)) + len(_names(self.folder.results))
 
     def count_row(self) -> None:
         """Report one more row as done; the total is an estimate."""
@@ -213,15 +206,6 @@ class _Verifier:
                 self._refuse(
                     self.folder.log_entry(following), "is missing, but later entries exist"
                 )
-
-    def check_contains(self, digest: str) -> None:
-        """Check that the log has the entry with this digest."""
-        if digest not in self.digests:
-            raise TamperedError(
-                "log",
-                f"has no entry with the digest {digest}. If it was an entry of this board, the log "
-                "was cut or rewritten since",
-            )
 
     def count_unlogged(self) -> int:
         """Check that no file passes for a logged one; count those about to be logged."""

@@ -24,16 +24,15 @@ from pathlib import Path
 from types import FrameType
 
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.scoring.score import score_submission
+from leaderboard.scoring.score import Progress, score_submission
 from leaderboard.store import LEASE_SECONDS, Claim, Store
-from sme_registry.errors import MissingDependencyError, OptionError, SMEError
+from sme_registry.errors import MissingDependencyError, SMEError
+from sme_registry.io import integer_in
 from sme_registry.terminal.interrupts import (
     block_interrupts,
     defer_interrupts,
     unblock_interrupts,
 )
-
-Progress = Callable[[int, int], None]
 
 _POLL_SECONDS = 0.2
 _STOP_SECONDS = 10.0
@@ -176,7 +175,7 @@ def run_scorers(
     Args:
       path: the board's folder.
       workers: the largest number of processes.
-      until_empty: return when nothing waits, whoever scores it; otherwise wait for more.
+      until_empty: return when nothing waits, even for another process; otherwise wait for more.
       progress: called with the submissions done since the start, and these plus those that wait.
       stop: called a few times a second; True ends the scoring.
       started: called with the process id of each new process.
@@ -191,8 +190,7 @@ def run_scorers(
         nothing.
       TamperedError: a file of the board differs from the logged one.
     """
-    if workers < 1:
-        raise OptionError(f"workers={workers}: must be at least 1. Leave it out for one.")
+    integer_in("workers", workers, 1, advice="Leave it out for one.")
     with Store.open(path) as store:
         scorers = _Scorers(path, store, workers, until_empty, lease_seconds)
         before, done = store.queue.done(), 0

@@ -11,7 +11,7 @@ from leaderboard.store.index import EntryRow, Index, IndexUnusable
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import ATTEMPTS, LEASE_SECONDS, Claim, Queue
-from leaderboard.store.store import Store
+from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [
     "ATTEMPTS",
@@ -31,4 +31,5 @@ __all__ = [
     "collect_garbage",
     "digest_of",
     "read_document",
+    "unknown_submission",
 ]

@@ -24,17 +24,15 @@ _Model = TypeVar("_Model", bound=StrictModel)
 
 @contextlib.contextmanager
 def durable_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
-    """`sme_registry.io.atomic_file` whose result survives a loss of power.
-
-    Args:
-      path: the target; its folder is created if it does not exist.
-      new: never replace an existing file.
+    """`sme_registry.io.atomic_file` in a folder that need not exist, durable on a loss of power.
 
     Raises:
       BoardError: the disk is full, the folder is not writable, or (`new`) the file exists.
     """
     try:
-        make_folder(path.parent)
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            io.sync_folder(path.parent.parent)
         with io.atomic_file(path, new=new) as stream:
             os.fchmod(stream.fileno(), 0o644)
             yield stream
@@ -47,13 +45,6 @@ def write_file(path: Path, data: bytes, *, new: bool = False) -> None:
     """Write a whole file; arguments and errors as for `durable_file`."""
     with durable_file(path, new=new) as stream:
         stream.write(data)
-
-
-def make_folder(path: Path) -> None:
-    """Create a folder, if it does not exist, so that it survives a loss of power."""
-    if not path.is_dir():
-        path.mkdir(parents=True, exist_ok=True)
-        io.sync_folder(path.parent)
 
 
 def unwritable(path: Path, error: OSError) -> BoardError:

@@ -41,7 +41,6 @@ def collect_garbage(
     """Remove half-written files of dead processes and artefacts that no submission names.
 
     Args:
-      store: the board's.
       temporary_older_than: seconds since a temporary file was last written to; a younger one may
         belong to an upload in progress.
       objects_older_than: seconds since an artefact was uploaded; the submission of a younger one

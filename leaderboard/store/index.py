@@ -108,12 +108,7 @@ _ROW = ", ".join(_COLUMNS)
 
 
 class Index:
-    """A connection to an index.
-
-    Args:
-      connection: to a database with the schema's tables.
-      folder, document: the board's.
-    """
+    """A connection to a database with the schema's tables, of a board's folder and document."""
 
     def __init__(
         self, connection: sqlite3.Connection, folder: Folder, document: BoardDocument

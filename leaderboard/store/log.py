@@ -7,7 +7,7 @@ entry_n.signature = by the board's key, over the entry without it
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import rfc8785
 from pydantic import Field
@@ -64,7 +64,9 @@ class LogEntry(Document):
     @property
     def signed_digest(self) -> str:
         """Digest of the entry without its signature."""
-        return _digest_without_signature(self)
+        fields = self.to_dict()
+        del fields["signature"]
+        return _digest(fields)
 
     @property
     def head(self) -> Head:
@@ -124,23 +126,19 @@ class Log:
         Raises:
           BoardError: it cannot be written, or another process has used its number.
         """
-        unsigned = LogEntry.model_construct(
-            schema_version=1,
-            sequence=head.sequence + 1,
-            previous=head.digest,
-            time=max(now(), head.time),
-            event=event,
-            subject=subject,
-            document=document,
-            signature="",
-        )
-        signature = key.sign("log", _digest_without_signature(unsigned))
-        entry = LogEntry.from_dict({**unsigned.to_dict(), "signature": signature})
+        fields = {
+            "schema_version": 1,
+            "sequence": head.sequence + 1,
+            "previous": head.digest,
+            "time": max(now(), head.time),
+            "event": event,
+            "subject": subject,
+            "document": document,
+        }
+        entry = LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
         write_document(self.folder.log_entry(entry.sequence), entry, new=True)
         return entry
 
 
-def _digest_without_signature(entry: LogEntry) -> str:
-    plain = entry.to_dict()
-    del plain["signature"]
-    return "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()
+def _digest(fields: dict[str, Any]) -> str:
+    return "sha256:" + hashlib.sha256(rfc8785.dumps(fields)).hexdigest()

@@ -73,7 +73,7 @@ class Queue:
                     return None
                 id, reference, attempts, lost = row
                 if lost >= ATTEMPTS and not reference:
-                    self._record(self._scoring_failed(id))
+                    self._database.record("result", id, self._scoring_failed(id))
                     continue
                 boot, at = _uptime()
                 index.connection.execute(
@@ -128,7 +128,7 @@ class Queue:
         with self._database.transaction() as index:
             if not _is_current(index, claim):
                 return False
-            self._record(result)
+            self._database.record("result", claim.id, result)
         return True
 
     def waiting(self) -> int:
@@ -150,10 +150,6 @@ class Queue:
     def _count(self, clauses: str, *values: Any) -> int:
         with self._database.reading() as index:
             return index.number(f"SELECT count(*) {clauses}", *values)
-
-    def _record(self, result: Result) -> None:
-        path = self._database.folder.result(result.submission)
-        self._database.record("result", result.submission, path, result)
 
     def _scoring_failed(self, id: str) -> Result:
         return Result(

@@ -5,20 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from leaderboard.documents.board import BoardDocument, Folder
-from leaderboard.documents.checks import refuse_unsubmittable
+from leaderboard.documents.checks import check_text, refuse_unsubmittable
 from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.store.database import Database
-from leaderboard.store.files import digest_of, make_folder, read_document, write_document
+from leaderboard.store.files import digest_of, read_document, write_document
 from leaderboard.store.index import EntryRow
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
-from sme_registry.errors import UnknownNameError
 from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
 
@@ -159,7 +158,7 @@ class Store(Database):
         with self.transaction() as index:
             if index.status(signed.id) is not None:
                 return False
-            self.record("received", signed.id, self.folder.submission(signed.id), signed)
+            self.record("received", signed.id, signed)
         return True
 
     def withdraw(self, signed: SignedWithdrawal) -> bool:
@@ -169,15 +168,16 @@ class Store(Database):
           False if it was withdrawn before.
 
         Raises:
-          UnknownNameError: there is no such submission.
-          Rejection: `bad_signature`, if the submission's own key did not sign it.
+          Rejection: `unknown_submission`, `unsafe_name` (the reason), or `bad_signature`, if the
+            submission's own key did not sign it.
           BoardError: it cannot be written.
         """
         withdrawal = signed.withdrawal
         with self.transaction() as index:
             row = index.one("SELECT key FROM entry WHERE id = ?", withdrawal.submission)
             if row is None:
-                _refuse_unknown(withdrawal.submission)
+                raise unknown_submission(withdrawal.submission)
+            check_text("reason", withdrawal.reason)
             if not verifies(row[0], signed.signature, "withdrawal", withdrawal.digest):
                 raise Rejection(
                     "bad_signature",
@@ -186,19 +186,20 @@ class Store(Database):
                 )
             if index.status(withdrawal.submission) == "withdrawn":
                 return False
-            path = self.folder.withdrawal(withdrawal.submission)
-            self.record("withdrawn", withdrawal.submission, path, signed)
+            self.record("withdrawn", withdrawal.submission, signed)
         return True
 
     def submission(self, id: str) -> SignedSubmission:
         """A submission as it was signed.
 
         Raises:
-          UnknownNameError: there is no such submission.
+          Rejection: `unknown_submission`.
           TamperedError: its file differs from the logged one.
         """
         signed = self._read("document", id, self.folder.submission, SignedSubmission)
-        return _refuse_unknown(id) if signed is None else signed
+        if signed is None:
+            raise unknown_submission(id)
+        return signed
 
     def result(self, id: str) -> Result | None:
         """A submission's result; None if it has none, or does not exist.
@@ -293,16 +294,17 @@ def _refuse_unfit(document: BoardDocument) -> None:
 
 
 def _write_board(folder: Folder, document: BoardDocument, key: SigningKey) -> None:
-    for part in (folder.log, folder.submissions, folder.withdrawals, folder.results):
-        make_folder(part)
-    make_folder(folder.objects)
+    parts = (folder.log, folder.submissions, folder.withdrawals, folder.results, folder.objects)
+    for part in parts:  # `build_folder` flushes them to disk
+        part.mkdir()
     key.write(folder.key)
     write_document(folder.board, document, new=True)
     Log(folder, key.public).append(key, EMPTY, "opened", document.digest, digest_of(document))
 
 
-def _refuse_unknown(id: str) -> NoReturn:
-    raise UnknownNameError(
-        f"submission={id[:80]!r}: no submission on this board has this id. "
-        "Ids are 'sha256:' and 64 hex digits; `sme-leaderboard rank` lists them."
+def unknown_submission(id: str) -> Rejection:
+    """The rejection of an id that no submission on the board has."""
+    return Rejection(
+        "unknown_submission",
+        f"submission={id[:80]}: is not on this board. Check the id: 'sha256:' and 64 hex digits.",
     )

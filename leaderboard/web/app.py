@@ -17,11 +17,13 @@ server keeps no sessions and sets no cookies; every request that changes the boa
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 import tempfile
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from typing import IO, Any, TypeVar, get_args
+from typing import IO, Any, NamedTuple, get_args
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI, Request
@@ -30,23 +32,23 @@ from starlette.responses import JSONResponse, Response
 
 from leaderboard import exports, intake
 from leaderboard.documents.board import hex_of
+from leaderboard.documents.result import Metric
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import Rejection
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
-from leaderboard.store import Store
+from leaderboard.store import Store, unknown_submission
 from leaderboard.web import errors, limits
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
-from leaderboard.web.page_cache import PAGES_KEPT, PageCache
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import SMEError
 
-METRICS: tuple[ranking.Metric, ...] = get_args(ranking.Metric)
+METRICS: tuple[Metric, ...] = get_args(Metric)
+PAGES_KEPT = 256
 _CHUNK = 2**18  # bytes
 _LOG_ENTRIES = 100
-_T = TypeVar("_T")
 
 
 def create_app(
@@ -115,7 +117,7 @@ class _Routes:
         self._admissions = CapacityLimiter(1)
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
-        self._pages = PageCache(store, pages_kept)
+        self._pages = _PageCache(store, pages_kept)
 
     async def health(self) -> Response:
         return JSONResponse({"status": "ok"})
@@ -123,17 +125,18 @@ class _Routes:
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
         limit = self._store.document.limits.artefact_bytes
-        size = limits.declared_length(request, limit)
+        # The HTTP parser accepts digits only, and holds the body to them.
+        size = int(request.headers.get("Content-Length", limit))
         try:
             key = intake.uploader(request.headers.get("Authorization"), digest)
             async with self._reservations.reserve(key, size):
                 # Without a name, and in the board's file system.
-                with await _in_thread(
+                with await to_thread.run_sync(
                     lambda: tempfile.TemporaryFile(dir=self._store.folder.path)
                 ) as spool:
                     async for chunk in limits.body_chunks(request, size, self._upload_seconds):
-                        await _in_thread(spool.write, chunk)
-                    new = await _in_thread(self._store_object, spool, digest, key)
+                        await to_thread.run_sync(spool.write, chunk)
+                    new = await to_thread.run_sync(self._store_object, spool, digest, key)
         except Rejection:
             if size <= limit:
                 await limits.drain(request, limit, self._upload_seconds)
@@ -146,7 +149,7 @@ class _Routes:
 
     async def get_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
-        if not await _in_thread(self._store.objects.has, digest):
+        if not await to_thread.run_sync(self._store.objects.has, digest):
             raise RequestError("not_found", f"object={digest}: is not on this board.")
         headers = {
             "Cache-Control": "public, max-age=31536000, immutable",
@@ -154,7 +157,7 @@ class _Routes:
         }
         data = b""
         if request.method != "HEAD":
-            data = await _in_thread(self._store.objects.read, digest)
+            data = await to_thread.run_sync(self._store.objects.read, digest)
         return Response(data, headers=headers, media_type="application/octet-stream")
 
     async def post_submission(self, request: Request) -> Response:
@@ -169,19 +172,23 @@ class _Routes:
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 
     async def get_submission(self, digits: str) -> Response:
-        return JSONResponse(await _in_thread(self._submission, _digest(digits)))
+        id = _digest(digits)
 
-    def _submission(self, id: str) -> dict[str, Any]:
-        entry = self._store.entry(id)
-        if entry is None:
-            raise intake.unknown_submission(id)
-        return public_view(self._store, entry).to_dict()
+        def view() -> dict[str, Any]:
+            entry = self._store.entry(id)
+            if entry is None:
+                raise unknown_submission(id)
+            return public_view(self._store, entry).to_dict()
+
+        return JSONResponse(await to_thread.run_sync(view))
 
     async def post_withdrawal(self, request: Request) -> Response:
         text = await limits.read_document(request, "withdrawal")
 
         def withdraw() -> str:
-            return intake.withdraw(self._store, SignedWithdrawal.read(text))
+            signed = SignedWithdrawal.read(text)
+            self._store.withdraw(signed)
+            return signed.withdrawal.submission
 
         id = await to_thread.run_sync(withdraw, limiter=self._admissions)
         return JSONResponse({"id": id, "status": "withdrawn"})
@@ -206,7 +213,7 @@ class _Routes:
         if not re.fullmatch(r"\d{1,8}", text, re.ASCII):
             raise RequestError("bad_request", f"start={text!r:.80}: must be in [0, 99999999].")
         start = int(text)
-        entries = await _in_thread(self._store.log, start, _LOG_ENTRIES)
+        entries = await to_thread.run_sync(self._store.log, start, _LOG_ENTRIES)
         return JSONResponse(
             {
                 "entries": [entry.to_dict() for entry in entries],
@@ -243,6 +250,44 @@ class _Routes:
         return Response(file.content, headers=headers, media_type=media_type)
 
 
+class _CachedFile(NamedTuple):
+    """A rendered file and its ETag."""
+
+    content: bytes
+    tag: str
+
+
+class _PageCache:
+    """Rendered files, discarded when the log grows.
+
+    One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
+    page that is not cached wait for one rendering of it. It keeps at most `kept` files.
+    """
+
+    def __init__(self, store: Store, kept: int) -> None:
+        self._store = store
+        self._kept = kept
+        self._head: object = None
+        self._pages = Pages(store)
+        self._files: OrderedDict[str, _CachedFile] = OrderedDict()
+
+    def get(self, name: str, render: Callable[[Pages], bytes]) -> _CachedFile:
+        """The file of this name, rendered if it is not cached."""
+        head = self._store.head
+        if head != self._head or not self._kept:
+            self._head, self._pages = head, Pages(self._store)
+            self._files.clear()
+        if name not in self._files:
+            content = render(self._pages)
+            tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+            self._files[name] = _CachedFile(content, tag)
+        file = self._files[name]
+        self._files.move_to_end(name)
+        if len(self._files) > self._kept:
+            self._files.popitem(last=False)
+        return file
+
+
 def _digest(digits: str) -> str:
     if not re.fullmatch(r"[0-9a-f]{64}", digits):
         raise Rejection(
@@ -251,7 +296,3 @@ def _digest(digits: str) -> str:
             "'sha256:'.",
         )
     return f"sha256:{digits}"
-
-
-async def _in_thread(function: Callable[..., _T], *args: Any) -> _T:
-    return await to_thread.run_sync(function, *args)

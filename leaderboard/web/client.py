@@ -12,7 +12,7 @@ import ipaddress
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 from leaderboard.bundle import Bundle
@@ -21,8 +21,8 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
-from sme_registry.errors import MalformedDocumentError, MissingDependencyError, OptionError
-from sme_registry.io import parse_json
+from sme_registry.errors import MalformedDocumentError, OptionError
+from sme_registry.io import parse_json, require_packages
 
 if TYPE_CHECKING:
     import httpx
@@ -71,10 +71,8 @@ def submit(
                 client.request("PUT", path, content.artefact(digest), sign)
             if progress is not None:
                 progress(done, len(digests))
-        answer = client.request("POST", "/api/submissions", content.signed.to_bytes())
-    if not isinstance(answer, dict) or answer.get("id") != content.signed.id:
-        raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
-    return content.signed.id
+        _, answer = client.request("POST", "/api/submissions", content.signed.to_bytes())
+    return str(_answer_for(content.signed.id, answer, url)["id"])
 
 
 def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
@@ -88,10 +86,8 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
       OptionError: the URL or the id is invalid.
     """
     with _Client(url, insecure=insecure) as client:
-        answer = client.request("GET", f"/api/submissions/{_digits(id)}")
-    if not isinstance(answer, dict) or answer.get("id") != f"sha256:{_digits(id)}":
-        raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
-    return answer
+        _, answer = client.request("GET", f"/api/submissions/{_digits(id)}")
+    return _answer_for(f"sha256:{_digits(id)}", answer, url)
 
 
 def withdraw(
@@ -120,13 +116,9 @@ class _Client:
     """An HTTP client of one board, which repeats requests after network failures."""
 
     def __init__(self, url: str, *, insecure: bool) -> None:
-        try:
-            import httpx
-        except ImportError:
-            raise MissingDependencyError(
-                "httpx: is not installed and is required to reach a served board. "
-                "Run `pip install 'sme-registry[leaderboard]'`."
-            ) from None
+        require_packages("reaching a served board", {"httpx": "httpx"}, "leaderboard")
+        import httpx
+
         self._httpx = httpx
         self._url, is_local = _checked(httpx.URL, url, insecure=insecure)
         self._client = httpx.Client(timeout=httpx.Timeout(30.0, read=120.0), trust_env=not is_local)
@@ -139,10 +131,7 @@ class _Client:
 
     def has(self, path: str) -> bool:
         """Whether a path of the board exists."""
-        code, answer = self._send("HEAD", path)
-        if code != 404:
-            self._raise_error(code, answer)
-        return code != 404
+        return self.request("HEAD", path, allowed=(404,))[0] != 404
 
     def request(
         self,
@@ -150,57 +139,43 @@ class _Client:
         path: str,
         content: bytes | None = None,
         sign: Callable[[], str] | None = None,
-    ) -> Any:
-        """The JSON of the board's answer; None if it is not JSON."""
-        code, answer = self._send(method, path, content, sign)
-        self._raise_error(code, answer)
-        return answer
-
-    def _raise_error(self, code: int, answer: Any) -> None:
-        if 200 <= code < 300:
-            return
-        error = answer if isinstance(answer, dict) else {}
-        message = _printable(error.get("message") or f"answered with HTTP status {code}")
-        if (reason := str(error.get("code"))) in CODES:
-            raise Rejection(reason, message)
-        raise BoardError(f"{self._url}: {message}")
-
-    def _send(
-        self,
-        method: str,
-        path: str,
-        content: bytes | None = None,
-        sign: Callable[[], str] | None = None,
+        *,
+        allowed: Collection[int] = (),
     ) -> tuple[int, Any]:
-        """Status and answer of a request, repeated after failures of the network.
+        """Send a request, repeated after failures of the network.
 
         Every request is safe to repeat, because digests identify objects and documents.
+
+        Args:
+          method, path, content: of the request.
+          sign: returns its `Authorization`, a new one for each attempt: it is valid for minutes.
+          allowed: statuses other than 2xx that are not errors.
+
+        Returns:
+          The status, and the JSON of the board's answer; None if it is not JSON.
         """
         for wait in (*_WAITS, None):
+            headers = {"Accept": "application/json"}
+            if sign is not None:
+                headers["Authorization"] = sign()
             try:
-                code, answer = self._once(method, path, content, sign)
+                with self._client.stream(
+                    method, self._url + path, content=content, headers=headers
+                ) as response:
+                    code, answer = response.status_code, self._read(response)
             except self._httpx.TransportError as error:
                 reason = str(error) or type(error).__name__
                 code, answer = 503, {"message": f"cannot be reached: {reason}"}
             if code not in _TRANSIENT or wait is None:
                 break
             time.sleep(wait)
-        return code, answer
-
-    def _once(
-        self,
-        method: str,
-        path: str,
-        content: bytes | None,
-        sign: Callable[[], str] | None,
-    ) -> tuple[int, Any]:
-        headers = {"Accept": "application/json"}
-        if sign is not None:
-            headers["Authorization"] = sign()  # for each attempt, because it is valid for minutes
-        with self._client.stream(
-            method, self._url + path, content=content, headers=headers
-        ) as answer:
-            return answer.status_code, self._read(answer)
+        if 200 <= code < 300 or code in allowed:
+            return code, answer
+        fields = answer if isinstance(answer, dict) else {}
+        message = _printable(fields.get("message") or f"answered with HTTP status {code}")
+        if (rejection := str(fields.get("code"))) in CODES:
+            raise Rejection(rejection, message)
+        raise BoardError(f"{self._url}: {message}")
 
     def _read(self, answer: httpx.Response) -> Any:
         text = bytearray()
@@ -213,6 +188,13 @@ class _Client:
         with contextlib.suppress(MalformedDocumentError):
             return parse_json(bytes(text), self._url)
         return None
+
+
+def _answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
+    """The answer, checked to be of the submission that was asked for."""
+    if not isinstance(answer, dict) or answer.get("id") != id:
+        raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
+    return answer
 
 
 def _checked(parse: Callable[[str], httpx.URL], url: str, *, insecure: bool) -> tuple[str, bool]:

@@ -105,9 +105,3 @@ async def drain(request: Request, limit: int, seconds: float) -> None:
     with contextlib.suppress(Rejection, RequestError, RuntimeError):  # already read to its end
         async for _ in body_chunks(request, limit, seconds):
             pass
-
-
-def declared_length(request: Request, limit: int) -> int:
-    """The body's length from the header, or the largest allowed."""
-    # The HTTP parser accepts digits only, and holds the body to them.
-    return int(request.headers.get("Content-Length", limit))

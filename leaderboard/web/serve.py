@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import signal
 import socket
 from collections.abc import Callable
 
 from leaderboard.errors import BoardError
-from sme_registry.errors import MissingDependencyError
+from sme_registry.io import require_packages
 
 _CONNECTIONS = 1000
 
@@ -37,12 +36,7 @@ def serve(
       BoardError: the folder holds no board, or the address cannot be used.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
-    for name in ("fastapi", "uvicorn"):
-        if importlib.util.find_spec(name) is None:
-            raise MissingDependencyError(
-                f"{name}: is not installed and is required to serve a board. "
-                "Run `pip install 'sme-registry[leaderboard]'`."
-            )
+    require_packages("serving a board", {"fastapi": "FastAPI", "uvicorn": "uvicorn"}, "leaderboard")
     import uvicorn
 
     from leaderboard.web.app import create_app

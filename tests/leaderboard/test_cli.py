@@ -267,9 +267,9 @@ def test_a_board_without_its_key_accepts_nothing() -> None:
     make_bundle()
     Path("board/board.key").unlink()
     before = sorted(Path("board/objects").rglob("*"))
-    said = fails(2, "submit", "bundle", "board")
-    assert "without the board's key" in " ".join(said.split())
-    assert "keygen" not in said
+    message = fails(2, "submit", "bundle", "board")
+    assert "without the board's key" in " ".join(message.split())
+    assert "keygen" not in message
     assert sorted(Path("board/objects").rglob("*")) == before
 
 
@@ -342,7 +342,7 @@ def test_a_demonstration_replaces_an_earlier_one_and_nothing_else(trained: Path)
         ("board", "linked"),
     ):
         before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
-        said = fails(2, "demo", trained, "--out", folder)
-        assert f"{Path(folder) / name}: already exists" in " ".join(said.split())
-        assert "Nothing was removed" in said
+        message = fails(2, "demo", trained, "--out", folder)
+        assert f"{Path(folder) / name}: already exists" in " ".join(message.split())
+        assert "Nothing was removed" in message
         assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before

@@ -17,7 +17,7 @@ from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorers
 from leaderboard.store import Store, collect_garbage
 from tests.leaderboard.conftest import put_submission, tiny_board
-from tests.leaderboard.store.made_up import made_up_result
+from tests.leaderboard.store.synthetic import synthetic_result
 
 SUBMISSIONS, SCORERS, KILLS = 300, 4, 20
 REAL = 10  # one in so many has a policy, whose sandbox takes a moment to start; in the others the
@@ -88,10 +88,10 @@ def test_killed_scorers_lose_nothing_and_score_nothing_twice(tmp_path, key, caps
         assert len(set(subjects)) == SUBMISSIONS
         assert {row.status for row in store.entries()} == {"scored"}
         with store.transaction() as index:
-            lived_through = list(index.derived_rows())
+            before = list(index.derived_rows())
         store.reindex()
         with store.transaction() as index:
-            assert list(index.derived_rows()) == lived_through
+            assert list(index.derived_rows()) == before
             assert index.one("SELECT count(*) FROM lease") == (0,)
         leftovers = collect_garbage(store, temporary_older_than=0).temporary
         assert leftovers <= KILLS
@@ -147,7 +147,7 @@ def fill(board: Path, key: SigningKey, *, entries: int, instances: int) -> None:
     ):
         patch.setattr(os, "fsync", lambda handle: None)
         first = put_submission(store, key).submission
-        result = made_up_result(store, first.digest)
+        result = synthetic_result(store, first.digest)
         for number in range(entries):
             method = first.method.model_copy(update={"name": f"Method {number}"})
             if number > 0:

@@ -249,8 +249,8 @@ def test_the_name_of_a_reference_row_does_not_make_one(store: Store, key: Signin
 def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
     withdrawal = SignedWithdrawal.create(signed.id, key, "a bug")
-    for _ in range(2):
-        assert intake.withdraw(store, withdrawal) == signed.id
+    assert store.withdraw(withdrawal)
+    assert not store.withdraw(withdrawal)
     entry = store.entry(signed.id)
     assert entry is not None
     assert entry.status == "withdrawn"
@@ -260,9 +260,9 @@ def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
 def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
     forged = SignedWithdrawal.create(signed.id, SigningKey.generate())
-    assert code_of(lambda: intake.withdraw(store, forged)) == "bad_signature"
+    assert code_of(lambda: store.withdraw(forged)) == "bad_signature"
     board = SignedWithdrawal.create(signed.id, store.folder.signing_key())
-    assert code_of(lambda: intake.withdraw(store, board)) == "bad_signature"
+    assert code_of(lambda: store.withdraw(board)) == "bad_signature"
 
 
 @pytest.mark.parametrize("letter", ["\x1b", "\x00", "\r", "\u202e", "\u2028"])
@@ -271,14 +271,14 @@ def test_a_reason_may_not_contain_control_characters(
 ) -> None:
     signed = put_submission(store, key)
     unsafe = SignedWithdrawal.create(signed.id, key, f"a bug{letter}[2J")
-    assert code_of(lambda: intake.withdraw(store, unsafe)) == "unsafe_name"
+    assert code_of(lambda: store.withdraw(unsafe)) == "unsafe_name"
     assert store.withdrawal(signed.id) is None
-    intake.withdraw(store, SignedWithdrawal.create(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+    store.withdraw(SignedWithdrawal.create(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
 
 
 def test_an_unknown_submission_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
     withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key)
-    assert code_of(lambda: intake.withdraw(store, withdrawal)) == "unknown_submission"
+    assert code_of(lambda: store.withdraw(withdrawal)) == "unknown_submission"
 
 
 def test_a_withdrawal_is_read_back(key: SigningKey) -> None:

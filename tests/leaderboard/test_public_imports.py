@@ -36,8 +36,8 @@ def private_imports(source: str) -> list[str]:
 def test_the_leaderboard_imports_only_public_names_of_the_registry() -> None:
     files = sorted(Path(leaderboard.__file__).parent.rglob("*.py"))
     assert len(files) > 30
-    found = {str(path): private_imports(path.read_text()) for path in files}
-    assert {path: names for path, names in found.items() if names} == {}
+    imports = {str(path): private_imports(path.read_text()) for path in files}
+    assert {path: names for path, names in imports.items() if names} == {}
 
 
 def test_a_private_import_would_be_found() -> None:

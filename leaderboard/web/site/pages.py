@@ -22,7 +22,7 @@ from typing import Any
 
 from leaderboard import exports
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import METRICS, Estimate, Result
+from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES
 from leaderboard.scoring import ranking
@@ -79,7 +79,7 @@ class Pages:
         ranking.refuse_unpublishable(entries)
         return entries
 
-    def board(self, metric: ranking.Metric = "wd_regret") -> str:
+    def board(self, metric: Metric = "wd_regret") -> str:
         """The board by a metric.
 
         Raises:

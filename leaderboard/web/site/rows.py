@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from leaderboard.documents.board import hex_of
-from leaderboard.documents.result import Estimate, Result, RunScore
+from leaderboard.documents.result import Estimate, Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
-from leaderboard.scoring.ranking import REFERENCES, Metric, RankedRow
+from leaderboard.scoring.ranking import REFERENCES, RankedRow
 from leaderboard.store import EntryRow
 from leaderboard.web.site import charts
 
@@ -95,7 +95,7 @@ def board_rows(ranked: Sequence[RankedRow], tab: MetricTab) -> tuple[list[BoardR
             hex=hex_of(row.entry.id),
             short=hex_of(row.entry.id)[:SHORT],
             first=row.first if row.first is not None else "",
-            rank=rank_text(row.first, row.last),
+            rank=row.ranks,
             reason=row.reason,
             estimate=estimate,
             bar=charts.interval_bar(estimate, scale, lines),
@@ -144,13 +144,6 @@ def run_rows(
 def https_only(link: str | None) -> str | None:
     """The link if it is https: no other scheme reaches an attribute."""
     return link if link is not None and link.startswith("https://") else None
-
-
-def rank_text(first: int | None, last: int | None) -> str:
-    """`3`, or `2–5` if the intervals allow several ranks; empty without one."""
-    if first is None:
-        return ""
-    return str(first) if last in (None, first) else f"{first}–{last}"
 
 
 def steps_text(steps: int) -> str:

@@ -27,15 +27,15 @@ def runs_of(classes: int, runs: int, metrics: int = 1, seed: int = 0) -> dict[st
 
 
 def test_metrics_of_a_run_match_a_calculation_by_hand() -> None:
-    found = run_metrics(
+    actual = run_metrics(
         (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), (0.95, 0.9, 0.85, 0.8, 0.75, 0.7), levels=LEVELS
     )
 
-    assert found["wd_regret"] == 0.1
-    assert found["ood_regret"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
-    assert found["ood_decay"] == pytest.approx(0.4 - 0.1)
-    assert found["regret_slope"] == pytest.approx(0.1 / 0.2)
-    assert found["similarity_loss"] == pytest.approx(100 * (0.95 - 0.8))
+    assert actual["wd_regret"] == 0.1
+    assert actual["ood_regret"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 0.6) / 5)
+    assert actual["ood_decay"] == pytest.approx(0.4 - 0.1)
+    assert actual["regret_slope"] == pytest.approx(0.1 / 0.2)
+    assert actual["similarity_loss"] == pytest.approx(100 * (0.95 - 0.8))
 
 
 def test_slope_is_that_of_the_least_squares_line() -> None:
@@ -50,9 +50,9 @@ def test_slope_is_that_of_the_least_squares_line() -> None:
 def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
     levels: tuple[float, ...],
 ) -> None:
-    found = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
+    actual = run_metrics((1.0,) * len(levels), (0.75,) * len(levels), levels)
 
-    assert found == {
+    assert actual == {
         "wd_regret": 1.0,
         "ood_regret": 1.0,
         "ood_decay": 0.0,
@@ -62,9 +62,9 @@ def test_the_constant_policy_has_no_decay_slope_or_points_at_all(
 
 
 def test_a_run_without_a_policy_scores_one_in_every_metric() -> None:
-    found = run_metrics((1.0,) * 6, None, LEVELS)
+    actual = run_metrics((1.0,) * 6, None, LEVELS)
 
-    assert found == {
+    assert actual == {
         "wd_regret": 1.0,
         "ood_regret": 1.0,
         "ood_decay": 1.0,
@@ -180,14 +180,14 @@ def test_an_interval_contains_its_score() -> None:
 def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000)
+    actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000)
 
     with capsys.disabled():
-        print(f"\n{name}, {RUNS} runs in {CLASSES} classes: {found}")
+        print(f"\n{name}, {RUNS} runs in {CLASSES} classes: {actual}")
     # Three standard errors of what 400 methods, or 200 pairs of them, can show.
     slack = 3 * math.sqrt(0.93 * 0.07 / 400)
-    assert min(found.coverage, found.coverage_of_mean) >= 0.93 - slack
-    assert found.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
+    assert min(actual.coverage, actual.coverage_of_mean) >= 0.93 - slack
+    assert actual.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
 
 
 def test_the_bootstrap_of_a_board_takes_well_under_a_second(
@@ -226,10 +226,10 @@ def test_ranks_match_counting_every_pair() -> None:
         first = [1 + sum(other < own for other in high) for own in low]
         last = [len(low) - sum(other > own for other in low) for own in high]
 
-        found = rank_ranges(low, high)
+        actual = rank_ranges(low, high)
 
-        assert (found[0].tolist(), found[1].tolist()) == (first, last)
-        assert (found[0] <= found[1]).all()
+        assert (actual[0].tolist(), actual[1].tolist()) == (first, last)
+        assert (actual[0] <= actual[1]).all()
 
 
 def test_intervals_that_touch_share_a_rank() -> None:

@@ -51,7 +51,7 @@ def scores(wd: float, ood: float, arm: float = 0.05) -> Scores:
     )
 
 
-def entry(sequence: int, found: Scores | None = None, **fields: Any) -> EntryRow:
+def entry(sequence: int, values: Scores | None = None, **fields: Any) -> EntryRow:
     return replace(
         EntryRow(
             id=f"sha256:{sequence:064x}",
@@ -71,15 +71,15 @@ def entry(sequence: int, found: Scores | None = None, **fields: Any) -> EntryRow
             enough_runs=True,
             oracle_like=False,
             reference=False,
-            scores=found,
+            scores=values,
         ),
         **fields,
     )
 
 
 def reference(sequence: int, name: str, regret: float, **fields: Any) -> EntryRow:
-    found = scores(regret, regret, arm=0.0)
-    return entry(sequence, found, method=name, reference=True, enough_runs=False, **fields)
+    values = scores(regret, regret, arm=0.0)
+    return entry(sequence, values, method=name, reference=True, enough_runs=False, **fields)
 
 
 REFERENCES = [reference(1, "optimal", 0.0), reference(2, "constant", 1.0)]
@@ -222,14 +222,14 @@ def test_a_wrong_reference_row_blocks_publication_in_any_region_or_metric(
     which: int, name: str | int, off: float
 ) -> None:
     rows = list(REFERENCES)
-    found = rows[which].scores
-    assert found is not None
+    values = rows[which].scores
+    assert values is not None
     if isinstance(name, int):
-        profile = list(found.normalised_regret)
+        profile = list(values.normalised_regret)
         profile[name] = moved(profile[name], off)
-        changed = found.model_copy(update={"normalised_regret": tuple(profile)})
+        changed = values.model_copy(update={"normalised_regret": tuple(profile)})
     else:
-        changed = found.model_copy(update={name: moved(getattr(found, name), off)})
+        changed = values.model_copy(update={name: moved(getattr(values, name), off)})
     rows[which] = replace(rows[which], scores=changed)
 
     with pytest.raises(NotPublishable, match=f"{rows[which].method}.*{name}="):
@@ -241,10 +241,10 @@ def moved(estimate: Estimate, off: float) -> Estimate:
 
 
 def test_the_constant_policy_may_lose_points_outside() -> None:
-    found = REFERENCES[1].scores
-    assert found is not None
+    values = REFERENCES[1].scores
+    assert values is not None
     points = Estimate(value=2.2, low=2.0, high=2.4)
-    row = replace(REFERENCES[1], scores=found.model_copy(update={"similarity_loss": points}))
+    row = replace(REFERENCES[1], scores=values.model_copy(update={"similarity_loss": points}))
 
     refuse_unpublishable([REFERENCES[0], row])
 
@@ -301,12 +301,12 @@ def test_the_csv_has_every_score_with_its_interval() -> None:
     )
 
     assert [line["first"] for line in lines] == ["", "1", "2", ""]
-    found = lines[1]
+    row = lines[1]
     assert [
-        float(found[name]) for name in ("wd_regret", "wd_regret_low", "wd_regret_high")
+        float(row[name]) for name in ("wd_regret", "wd_regret_low", "wd_regret_high")
     ] == pytest.approx([0.3, 0.25, 0.35])
-    assert float(found["normalised_regret_0"]) == pytest.approx(0.3)
-    assert float(found["normalised_regret_5_high"]) == pytest.approx(0.25)
+    assert float(row["normalised_regret_0"]) == pytest.approx(0.3)
+    assert float(row["normalised_regret_5_high"]) == pytest.approx(0.25)
 
 
 def test_latex_commands_in_names_are_escaped() -> None:
@@ -342,7 +342,7 @@ def test_the_json_has_the_whole_scores() -> None:
 def test_every_export_names_its_suite_protocol_and_log(write: Any) -> None:
     text = write(hostile_rows(), "wd_regret", BOARD, HEAD, DATE).replace(r"\_", "_")
 
-    for said in (
+    for sentence in (
         "small_suite-v1",
         BOARD.suite.digest,
         "few-v1",
@@ -350,4 +350,4 @@ def test_every_export_names_its_suite_protocol_and_log(write: Any) -> None:
         HEAD[1],
         DATE,
     ):
-        assert said in text
+        assert sentence in text

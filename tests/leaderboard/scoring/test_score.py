@@ -78,11 +78,11 @@ def score(
     runs = []
     for index, policy in enumerate(policies):
         spec = instances[index % len(instances)]
-        found = policy(spec) if callable(policy) else policy
+        content = policy(spec) if callable(policy) else policy
         artefact = None
-        if found is not None:
-            data[digest_of(found)] = found
-            artefact = {"sha256": digest_of(found), "size": len(found)}
+        if content is not None:
+            data[digest_of(content)] = content
+            artefact = {"sha256": digest_of(content), "size": len(content)}
         digest = specs[index] if specs else spec.digest
         runs.append({"spec": digest, "seed": index, "steps": 10, "artefact": artefact})
     submission = Submission.from_dict(
@@ -332,11 +332,11 @@ def test_errors_of_the_scorer_do_not_reject_the_submission(error: type[BaseExcep
 
 
 def children() -> list[int]:
-    found = []
+    children = []
     for path in glob.glob(f"/proc/{os.getpid()}/task/*/children"):
         with open(path) as stream:
-            found += [int(child) for child in stream.read().split()]
-    return found
+            children += [int(child) for child in stream.read().split()]
+    return children
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds its children in /proc")
@@ -387,7 +387,7 @@ def test_versions_are_of_packages_that_the_numbers_depend_on(
     alone = score(LINEAR, None, None)
     monkeypatch.setitem(sys.modules, "torch", types.ModuleType("torch"))
 
-    beside_torch = score(LINEAR, None, None)
+    with_torch = score(LINEAR, None, None)
 
     assert {"sme_registry", "python", "numpy", "onnxruntime"} <= set(alone.versions)
-    assert beside_torch == alone
+    assert with_torch == alone

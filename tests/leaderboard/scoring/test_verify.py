@@ -67,7 +67,7 @@ def alter(path: Path, change: Callable[[Any], Any]) -> None:
     path.write_text(to_json(plain))
 
 
-def found(board: Path, **arguments: Any) -> str:
+def first_altered(board: Path, **arguments: Any) -> str:
     with pytest.raises(TamperedError) as tampered:
         verify(board, **arguments)
     assert tampered.value.where in str(tampered.value)
@@ -141,8 +141,8 @@ def test_a_kept_digest_reveals_a_log_cut_at_its_end(board):
     folder.submission(last.subject).unlink()
     folder.index.unlink()
     cut = verify(board)
-    assert (cut.log_sequence, cut.results) == (7, 3)  # which nobody can tell from the rest
-    assert found(board, contains=kept) == "log"
+    assert (cut.log_sequence, cut.results) == (7, 3)  # the rest is a valid log
+    assert first_altered(board, contains=kept) == "log"
     assert verify(board, contains=first.digest) == cut
 
 
@@ -152,7 +152,7 @@ def test_a_kept_digest_reveals_a_rewritten_log(board):
     alter(folder.log_entry(8), lambda plain: plain.update({"time": "2126-11-21T09:30:00Z"}))
     resign(board, folder.signing_key())
     assert verify(board).entries == 9
-    assert found(board, contains=kept) == "log"
+    assert first_altered(board, contains=kept) == "log"
 
 
 def test_an_invalid_digest_is_rejected(board):
@@ -174,13 +174,13 @@ def test_a_missing_board_is_not_tampering(tmp_path):
 )
 def test_an_altered_board_document_is_named(board, field, value):
     alter(board / "board.json", lambda plain: plain.update({field: value}))
-    assert found(board) == "board.json"
+    assert first_altered(board) == "board.json"
 
 
 def test_another_private_key_is_named(board):
     (board / "board.key").unlink()
     SigningKey.generate().write(board / "board.key")
-    assert found(board) == "board.key"
+    assert first_altered(board) == "board.key"
 
 
 @pytest.mark.parametrize("sequence", range(9))
@@ -197,7 +197,7 @@ def test_an_altered_log_entry_is_named(board, sequence, field):
         value = "withdrawn"
     alter(path, lambda plain: plain.update({field: value}))
     expected = "board.json" if (sequence, field) == (0, "document") else where(board, path)
-    assert found(board) == expected
+    assert first_altered(board) == expected
 
 
 @pytest.mark.parametrize("sequence", range(9))
@@ -210,7 +210,7 @@ def test_a_missing_or_reformatted_log_entry_is_named(board, sequence, harm):
         path.unlink()
     else:
         path.write_bytes(changed[harm])
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 @pytest.mark.parametrize("sequence", range(1, 9))
@@ -219,7 +219,7 @@ def test_a_deleted_log_entry_is_named_without_the_index_too(board, sequence):
     path = Folder(board).log_entry(sequence)
     path.unlink()
     if sequence < 8:
-        assert found(board) == where(board, path)
+        assert first_altered(board) == where(board, path)
     else:  # a submission whose entry is cut off looks like one that was being received
         assert verify(board).unlogged == 1
 
@@ -229,24 +229,24 @@ def test_swapped_log_entries_are_named(board):
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(data)
-    assert found(board) == where(board, one)
+    assert first_altered(board) == where(board, one)
 
 
 def test_an_inserted_log_entry_is_named(board):
     last = Folder(board).log_entry(8)
     Folder(board).log_entry(9).write_bytes(last.read_bytes())
-    assert found(board) == "log/00000009.json"
+    assert first_altered(board) == "log/00000009.json"
     Folder(board).log_entry(9).unlink()
     Folder(board).log_entry(11).write_bytes(last.read_bytes())
-    assert found(board) == "log/00000009.json"
+    assert first_altered(board) == "log/00000009.json"
     Folder(board).log_entry(11).unlink()
     (board / "log" / "notes.txt").write_text("mine")
-    assert found(board) == "log/notes.txt"
+    assert first_altered(board) == "log/notes.txt"
 
 
 def test_a_log_signed_again_with_another_key_is_named(board):
     resign(board, SigningKey.generate(), 3)
-    assert found(board) == "log/00000003.json"
+    assert first_altered(board) == "log/00000003.json"
 
 
 @pytest.mark.parametrize("number", range(4))
@@ -261,7 +261,7 @@ def test_an_altered_submission_is_named(board, number, harm):
         alter(path, lambda plain: plain.update(signature="0" * 128))
     else:
         alter(path, lambda plain: plain["submission"]["method"].update(name="Better"))
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 def test_swapped_submissions_are_named(board):
@@ -269,7 +269,7 @@ def test_swapped_submissions_are_named(board):
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(data)
-    assert found(board) == where(board, one)
+    assert first_altered(board) == where(board, one)
 
 
 def test_a_submission_that_the_board_signed_for_another_is_named(board):
@@ -277,15 +277,15 @@ def test_a_submission_that_the_board_signed_for_another_is_named(board):
     path = Folder(board).submission(ids(board)[3])
     alter(path, lambda plain: plain.update(signature="0" * 128))
     resign(board, Folder(board).signing_key(), 8)
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 def test_an_altered_withdrawal_is_named(board):
     path = Folder(board).withdrawal(ids(board)[2])
     alter(path, lambda plain: plain["withdrawal"].update(reason="another"))
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
     path.unlink()
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 @pytest.mark.parametrize("number", [0, 2])
@@ -300,7 +300,7 @@ def test_an_altered_result_is_named(board, number, harm):
         alter(path, lambda plain: plain["runs"][0].update(wd_regret=0.0))
     else:
         alter(path, lambda plain: plain.update(status="rejected", code="onnx_op", scores=None))
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 def test_swapped_results_are_named(board):
@@ -308,19 +308,19 @@ def test_swapped_results_are_named(board):
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
     other.write_bytes(data)
-    assert found(board) == where(board, one)
+    assert first_altered(board) == where(board, one)
 
 
 def test_an_unlogged_result_is_named(board):
     scored, waiting = ids(board)[0], ids(board)[3]
     path = Folder(board).result(waiting)
     path.write_bytes(Folder(board).result(scored).read_bytes())
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 def test_a_foreign_file_is_named(board):
     (board / "results" / "note.json").write_text("{}")
-    assert found(board) == "results/note.json"
+    assert first_altered(board) == "results/note.json"
 
 
 def test_a_submission_not_yet_logged_is_counted(board, tmp_path):
@@ -331,7 +331,7 @@ def test_a_submission_not_yet_logged_is_counted(board, tmp_path):
     assert verify(board).unlogged == 1
     path = Folder(board).submission(signed.id)
     alter(path, lambda plain: plain["submission"]["method"].update(name="Better"))
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 @pytest.mark.parametrize("harm", ["deleted", "altered", "extra"])
@@ -344,7 +344,7 @@ def test_an_altered_artefact_is_named(board, harm):
     else:
         path = path.with_name("0" * 62)
         path.write_bytes(b"no such hash")
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 @pytest.mark.parametrize(
@@ -370,22 +370,22 @@ def test_an_edited_index_is_named_with_its_first_altered_row(board, change, row)
     if "lease" in change or "status" in change:
         verify(board)  # nothing that is derived has changed
     elif "sequence" in change:
-        assert found(board) == "log/00000003.json"
+        assert first_altered(board) == "log/00000003.json"
     else:
         key = {"entry": one, "object": first, "head": "0"}[row]
-        assert found(board) == f"index.sqlite: {row} {key}"
+        assert first_altered(board) == f"index.sqlite: {row} {key}"
 
 
 def test_an_inserted_index_row_is_named(board):
     with contextlib.closing(sqlite3.connect(Folder(board).index)) as connection:
         connection.execute("INSERT INTO object VALUES ('sha256:0', 1, '', '')")
         connection.commit()
-    assert found(board) == "index.sqlite: object sha256:0"
+    assert first_altered(board) == "index.sqlite: object sha256:0"
 
 
 def test_a_broken_index_is_named_and_reindexing_repairs_it(board):
     Folder(board).index.write_bytes(b"SQLite format 3\0" + bytes(5000))
-    assert found(board) == "index.sqlite"
+    assert first_altered(board) == "index.sqlite"
     with Store.open(board) as store:
         store.reindex()
     assert verify(board).rows == 9
@@ -408,10 +408,10 @@ def test_a_forged_and_signed_result_is_detected(board, lie):
             "run's metrics": {"wd_regret": 0.0},
         }[lie]
         runs = (run.model_copy(update=better), *result.runs[1:])
-        anew = result_of(folder.read(), id, runs, result.versions)
-        path.write_text(to_json(anew.to_dict()))
+        recomputed = result_of(folder.read(), id, runs, result.versions)
+        path.write_text(to_json(recomputed.to_dict()))
     resign(board, folder.signing_key())
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 @pytest.mark.parametrize("lie", ["leaves it out", "scores it 0", "gives it the constant's decay"])
@@ -435,10 +435,10 @@ def test_a_failed_run_left_out_of_a_result_is_detected(tmp_path, kind, lie):
         "scores it 0": [without.model_copy(update={"normalised_regret": (0.0,) * 6})],
         "gives it the constant's decay": [without.model_copy(update={"ood_decay": 0.0})],
     }[lie]
-    anew = result_of(folder.read(), signed.id, [first, *spared], result.versions)
-    path.write_text(to_json(anew.to_dict()))
+    recomputed = result_of(folder.read(), signed.id, [first, *spared], result.versions)
+    path.write_text(to_json(recomputed.to_dict()))
     resign(board, folder.signing_key())
-    assert found(board) == where(board, path)
+    assert first_altered(board) == where(board, path)
 
 
 def test_rescoring_detects_forged_runs(board):
@@ -448,13 +448,15 @@ def test_rescoring_detects_forged_runs(board):
     result = Result.from_dict(json.loads(path.read_text()))
     levels = [high for _, high in folder.read().protocol.edges]
 
-    def lied(run):
+    def falsified(run):
         regret = tuple(0.999 * value for value in run.normalised_regret)
         metrics = run_metrics(regret, run.similarity, levels)
         return run.model_copy(update={"normalised_regret": regret, **metrics})
 
-    anew = result_of(folder.read(), id, [lied(run) for run in result.runs], result.versions)
-    path.write_text(to_json(anew.to_dict()))
+    recomputed = result_of(
+        folder.read(), id, [falsified(run) for run in result.runs], result.versions
+    )
+    path.write_text(to_json(recomputed.to_dict()))
     resign(board, folder.signing_key())
     assert verify(board).rescored == 0
-    assert found(board, rescore=2) == where(board, path)
+    assert first_altered(board, rescore=2) == where(board, path)

@@ -43,8 +43,8 @@ def test_a_scorer_empties_the_queue_and_returns(store, board):
     assert seen[-1] == (states, states)
     first = store.entries()[0]
     submission = store.submission(first.id).submission
-    anew = score_submission(store.document, submission, store.objects.read)
-    assert store.result(first.id) == anew
+    again = score_submission(store.document, submission, store.objects.read)
+    assert store.result(first.id) == again
 
 
 def test_an_invalid_policy_is_rejected_with_its_code(store, key):
@@ -103,19 +103,19 @@ def _raise(error: Exception) -> None:
 
 def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monkeypatch):
     submit()
-    real, held = score_submission, []
+    real, claims = score_submission, []
 
     def slow(*arguments):
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
-            held.append(store.queue.claim("thief"))
+            claims.append(store.queue.claim("other"))
             threading.Event().wait(0.05)
         return real(*arguments)
 
     monkeypatch.setattr(scorer, "score_submission", slow)
     assert run_scorer(store.folder.path, lease_seconds=0.8) == 1
-    assert set(held) == {None}
-    assert len(held) > 5
+    assert set(claims) == {None}
+    assert len(claims) > 5
 
 
 def test_a_scorer_stops_on_request(store, submit):
@@ -229,9 +229,9 @@ def test_ctrl_c_stops_all_processes_and_gives_their_claims_back(tmp_path, key, t
             os.killpg(process.pid, signal.SIGINT)
         else:
             os.kill(process.pid, signal.SIGINT)
-        _, complaints = process.communicate(timeout=30)
-        assert process.returncode == 130, complaints
-        assert "Traceback" not in complaints
+        _, stderr = process.communicate(timeout=30)
+        assert process.returncode == 130, stderr
+        assert "Traceback" not in stderr
         for pid in pids:
             with pytest.raises(ProcessLookupError):
                 os.kill(pid, 0)

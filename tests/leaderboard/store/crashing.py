@@ -1,4 +1,4 @@
-"""Processes that die, and disks that fill, at a point of one's choice."""
+"""Kill a process, or fill a disk, at a chosen point."""
 
 from __future__ import annotations
 
@@ -60,16 +60,18 @@ def small_disk(path: Path, size: str = "1m") -> Iterator[Path | None]:
     """A file system of its own, in memory; None where none may be mounted."""
     path.mkdir()
     mount = shutil.which("mount")
-    made = mount is not None and _succeeds(mount, "-t", "tmpfs", "-o", f"size={size}", "none", path)
+    mounted = mount is not None and _succeeds(
+        mount, "-t", "tmpfs", "-o", f"size={size}", "none", path
+    )
     try:
-        yield path if made else None
+        yield path if mounted else None
     finally:
-        if made:
+        if mounted:
             subprocess.run(["umount", "-l", path], check=True)
 
 
 def make_read_only(path: Path) -> None:
-    """Of a `small_disk`: nobody writes to it from now on, root included."""
+    """Remount a `small_disk` read-only, also for root."""
     subprocess.run(["mount", "-o", "remount,ro", path], check=True)
 
 

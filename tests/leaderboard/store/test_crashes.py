@@ -1,4 +1,4 @@
-"""A process that dies before any one call that matters leaves a state the next one goes on from."""
+"""A process killed before any system call leaves a state from which the next one continues."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.leaderboard.conftest import (
     tiny_submission,
 )
 from tests.leaderboard.store.crashing import crashes_before, small_disk
-from tests.leaderboard.store.made_up import made_up_result
+from tests.leaderboard.store.synthetic import synthetic_result
 
 Work = Callable[[Path, SigningKey], object]
 
@@ -44,7 +44,7 @@ def receive(board: Path, key: SigningKey) -> object:
 def finish(board: Path, key: SigningKey) -> object:
     with Store.open(board) as store:
         while (claim := store.queue.claim("worker", seconds=0)) is not None:
-            store.queue.finish(claim, made_up_result(store, claim.id))
+            store.queue.finish(claim, synthetic_result(store, claim.id))
         return True
 
 
@@ -88,9 +88,9 @@ def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work: 
     for call in range(100):
         shutil.copytree(tmp_path / "start", board)
         crashed = crashes_before(call, lambda: work(board, key))
-        found = state(board)
-        assert found in (before, after), call
-        seen.add(found)
+        actual = state(board)
+        assert actual in (before, after), call
+        seen.add(actual)
         verify(board)
         work(board, key)
         assert state(board) == after, call
@@ -107,10 +107,10 @@ def test_a_write_is_complete_or_absent_and_can_be_repeated(tmp_path, key, work: 
 
 
 def test_a_board_is_created_completely_or_not_at_all(tmp_path):
-    board, made = tmp_path / "board", []
+    board, exists = tmp_path / "board", []
     for call in range(100):
         crashed = crashes_before(call, lambda: tiny_board(board).close())
-        made.append(board.exists())
+        exists.append(board.exists())
         if board.exists():
             verify(board)
             Store.open(board).close()
@@ -118,15 +118,15 @@ def test_a_board_is_created_completely_or_not_at_all(tmp_path):
         if not crashed:
             break
     assert not crashed
-    assert made == sorted(made)
-    assert {False, True} == set(made)
+    assert exists == sorted(exists)
+    assert {False, True} == set(exists)
 
 
 def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
     with small_disk(tmp_path / "disk", "1500k") as disk:
         if disk is None:
             pytest.skip("no file system may be mounted here")
-        complaints = []
+        messages = []
         with tiny_board(disk / "board") as store:
             for number in range(28):
                 _, _, before = state(disk / "board")
@@ -134,7 +134,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
                 try:
                     put_submission(store, key, number)
                 except BoardError as error:
-                    complaints.append(str(error))
+                    messages.append(str(error))
                 (disk / "filler").unlink()
                 # An entry of the log that the index had no room for counts all the same.
                 _, statuses, after = state(disk / "board")
@@ -142,8 +142,8 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
                 assert after - before in (0, 1)
                 assert [path.name for path in (disk / "board").rglob(".*")] == []
                 verify(disk / "board")
-        assert 0 < len(complaints) < 28
-        assert all("No space left" in line or "is full" in line for line in complaints), complaints
+        assert 0 < len(messages) < 28
+        assert all("No space left" in line or "is full" in line for line in messages), messages
         with Store.open(disk / "board") as store:
             put_submission(store, key, 999)
         verify(disk / "board")

@@ -25,7 +25,7 @@ def age(path, seconds: float) -> None:
 @pytest.fixture
 def litter(store, key, submit):
     """Old and young files of each kind; the objects of a submission are old."""
-    old, young = put(store, key, b"old, and of nobody"), put(store, key, b"young")
+    old, young = put(store, key, b"old and not submitted"), put(store, key, b"young")
     named = submit().submission.runs[0].artefact.sha256
     for digest in (old, named):
         age(store.folder.object(digest), DAY + 60)
@@ -42,12 +42,12 @@ def test_garbage_is_temporary_files_and_unnamed_artefacts(store, litter):
     garbage = collect_garbage(store)
     assert (garbage.temporary, garbage.objects) == (3, 1)
     assert garbage.files == 4
-    assert garbage.bytes == 3 * len(b"half") + len(b"old, and of nobody")
+    assert garbage.bytes == 3 * len(b"half") + len(b"old and not submitted")
     assert not store.objects.has(old)
     assert store.objects.has(young)
     assert store.objects.has(named)
     assert [path.name for path in store.folder.path.rglob(".*.tmp")] == [".alive.12345678.tmp"]
-    assert store.total_bytes() == before - len(b"old, and of nobody")
+    assert store.total_bytes() == before - len(b"old and not submitted")
     assert collect_garbage(store).files == 0
 
 
@@ -60,7 +60,7 @@ def test_a_dry_run_counts_the_same_and_removes_nothing(store, litter):
 
 def test_uploading_an_object_again_resets_its_age(store, key, litter):
     old, _, _ = litter
-    assert put(store, key, b"old, and of nobody") == old
+    assert put(store, key, b"old and not submitted") == old
     assert collect_garbage(store).objects == 0
     assert store.objects.has(old)
 

@@ -17,7 +17,6 @@ from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.score import result_of
 from leaderboard.store import Index, Store, collect_garbage
-from sme_registry.errors import UnknownNameError
 from tests.leaderboard.conftest import (
     put_submission,
     signed_withdrawal,
@@ -25,7 +24,7 @@ from tests.leaderboard.conftest import (
     tiny_submission,
 )
 from tests.leaderboard.store.crashing import make_read_only, small_disk
-from tests.leaderboard.store.made_up import made_up_result
+from tests.leaderboard.store.synthetic import synthetic_result
 
 
 def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
@@ -36,7 +35,7 @@ def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
         assert claim is not None
         assert claim.id == signed[number].id
         code = "onnx_op" if number == 1 else ""
-        assert store.queue.finish(claim, made_up_result(store, claim.id, code=code))
+        assert store.queue.finish(claim, synthetic_result(store, claim.id, code=code))
     store.withdraw(signed_withdrawal(signed[2].id, key))
     if not waiting:
         store.withdraw(signed_withdrawal(signed[3].id, key))
@@ -117,9 +116,9 @@ def test_an_entry_row_has_the_fields_of_pages_and_ranking(store, key):
 
 def test_rows_signed_by_the_boards_key_are_reference_rows(store, key):
     method = {"name": "constant", "version": "1", "family": "reference", "knowledge": "family"}
-    own = put_submission(store, store.folder.signing_key(), 1, method=method)
+    reference = put_submission(store, store.folder.signing_key(), 1, method=method)
     pretender = put_submission(store, key, 2, method=method)
-    assert store.entry(own.id).reference
+    assert store.entry(reference.id).reference
     assert not store.entry(pretender.id).reference
 
 
@@ -144,9 +143,9 @@ def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, sub
 
 def test_an_unknown_id_is_reported(store, key):
     unknown = "sha256:" + "0" * 64
-    with pytest.raises(UnknownNameError, match="no submission"):
+    with pytest.raises(Rejection, match="unknown_submission"):
         store.submission(unknown)
-    with pytest.raises(UnknownNameError, match="no submission"):
+    with pytest.raises(Rejection, match="unknown_submission"):
         store.withdraw(signed_withdrawal(unknown, key))
     assert store.result(unknown) is None
     assert store.entry(unknown) is None
@@ -269,7 +268,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
             disk = tmp_path / "disk"
         store = tiny_board(disk / "board")
         fill(store, key, waiting=True)
-        if killed:  # SQLite's log of writes is then left beside the database, and not in it
+        if killed:  # the last writes are then only in the write-ahead log
             child = os.fork()
             if child == 0:
                 other = Store.open(disk / "board")
@@ -298,7 +297,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
 
 
 def insist(call):
-    """Until it goes well: whose index is deleted in the midst of something is told so."""
+    """Repeat an operation that fails if the index is deleted meanwhile, until it succeeds."""
     while True:
         with contextlib.suppress(BoardError):
             return call()
@@ -394,7 +393,7 @@ def test_a_result_of_a_killed_scorer_is_removed_on_opening(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         signed = put_submission(store, key)
         path = store.folder.result(signed.id)
-        runs = made_up_result(store, signed.id).runs
+        runs = synthetic_result(store, signed.id).runs
     path.write_text(str(result_of(store.document, signed.id, runs, {})))
     with Store.open(tmp_path / "board", read_only=True) as store:
         assert store.result(signed.id) is None

@@ -94,7 +94,7 @@ def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, 
     assert store.uploaded_bytes(key.public, since) == store.total_bytes() == size
     assert store.uploaded_bytes(key.public, "2999-01-01T00:00:00Z") == 0
     assert store.uploaded_bytes(KEY, since) == 0
-    store.reindex()  # who brought what nobody submitted is forgotten, but not its size
+    store.reindex()  # forgets who uploaded what was not submitted, but not its size
     assert store.total_bytes() == size
 
 
@@ -102,10 +102,10 @@ def test_many_threads_upload_the_same_object_once(store):
     data = os.urandom(50_000)
     new: list[bool] = []
 
-    def bring() -> None:
+    def upload() -> None:
         new.append(store.put_object(digest(data), [data], by=KEY))
 
-    threads = [threading.Thread(target=bring) for _ in range(8)]
+    threads = [threading.Thread(target=upload) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:

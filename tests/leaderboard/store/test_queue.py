@@ -7,7 +7,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.store import ATTEMPTS, Store
 from tests.leaderboard.conftest import signed_withdrawal
-from tests.leaderboard.store.made_up import made_up_result
+from tests.leaderboard.store.synthetic import synthetic_result
 
 
 def test_the_oldest_is_claimed_first_and_by_one_worker_only(store, submit):
@@ -25,19 +25,19 @@ def test_an_expired_claim_is_claimed_again_and_the_late_result_rejected(store, s
     second = store.queue.claim("second")
     assert (late.attempt, second.attempt) == (1, 2)
     assert not store.queue.heartbeat(late)
-    assert not store.queue.finish(late, made_up_result(store, late.id, level=0.1))
+    assert not store.queue.finish(late, synthetic_result(store, late.id, level=0.1))
     assert store.result(late.id) is None
-    assert store.queue.finish(second, made_up_result(store, second.id, level=0.2))
+    assert store.queue.finish(second, synthetic_result(store, second.id, level=0.2))
     assert store.entry(second.id).scores.wd_regret.value == pytest.approx(0.2)
-    assert not store.queue.finish(second, made_up_result(store, second.id, level=0.3))
-    assert not store.queue.finish(late, made_up_result(store, late.id, level=0.3))
+    assert not store.queue.finish(second, synthetic_result(store, second.id, level=0.3))
+    assert not store.queue.finish(late, synthetic_result(store, late.id, level=0.3))
     assert [entry.event for entry in store.log()] == ["opened", "received", "result"]
 
 
-def test_a_worker_with_an_expired_claim_may_finish_if_nobody_claimed_since(store, submit):
+def test_a_worker_with_an_expired_claim_may_finish_if_no_other_has_claimed_since(store, submit):
     submit()
     claim = store.queue.claim("slow", seconds=0)
-    assert store.queue.finish(claim, made_up_result(store, claim.id))
+    assert store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
 def test_the_same_worker_claiming_again_is_another_attempt(store, submit):
@@ -45,8 +45,8 @@ def test_the_same_worker_claiming_again_is_another_attempt(store, submit):
     first = store.queue.claim("worker", seconds=0)
     second = store.queue.claim("worker")
     assert first.worker == second.worker
-    assert not store.queue.finish(first, made_up_result(store, first.id))
-    assert store.queue.finish(second, made_up_result(store, second.id))
+    assert not store.queue.finish(first, synthetic_result(store, first.id))
+    assert store.queue.finish(second, synthetic_result(store, second.id))
 
 
 def test_a_heartbeat_renews_a_claim(store, submit, monkeypatch):
@@ -76,14 +76,14 @@ def test_a_claim_does_not_survive_a_reboot(store, submit, monkeypatch):
 def test_setting_the_clock_changes_no_claim(store, submit, monkeypatch, days):
     submit(0)
     submit(1)
-    held = store.queue.claim("worker", seconds=60)
+    claim = store.queue.claim("worker", seconds=60)
     shifted = time.time() + days * 86400
     monkeypatch.setattr(time, "time", lambda: shifted)
     monkeypatch.setattr("leaderboard.store.log.now", lambda: "2020-01-01T00:00:00Z")
-    assert store.queue.claim("other").id != held.id
+    assert store.queue.claim("other").id != claim.id
     assert store.queue.claim("third") is None
-    assert store.queue.heartbeat(held)
-    assert store.queue.finish(held, made_up_result(store, held.id))
+    assert store.queue.heartbeat(claim)
+    assert store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
 def test_a_released_claim_does_not_count_as_lost(store, submit):
@@ -117,7 +117,7 @@ def test_a_reference_row_is_retried_indefinitely(store, submit):
     for id in (*references, other.id):
         claim = store.queue.claim("whole")
         assert claim.id == id
-        assert store.queue.finish(claim, made_up_result(store, id))
+        assert store.queue.finish(claim, synthetic_result(store, id))
 
 
 def test_a_reference_row_rejected_by_an_earlier_version_stays_rejected(store):
@@ -135,7 +135,7 @@ def test_a_submission_withdrawn_during_scoring_gets_no_result(store, key, submit
     claim = store.queue.claim("worker")
     store.withdraw(signed_withdrawal(signed.id, key))
     assert not store.queue.heartbeat(claim)
-    assert not store.queue.finish(claim, made_up_result(store, claim.id))
+    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     assert store.result(signed.id) is None
     assert store.queue.claim("worker") is None
 
@@ -144,10 +144,10 @@ def test_a_claim_made_before_reindexing_is_no_longer_current(store, submit):
     submit()
     claim = store.queue.claim("worker")
     store.reindex()
-    assert not store.queue.finish(claim, made_up_result(store, claim.id))
+    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     again = store.queue.claim("another")
-    assert not store.queue.finish(claim, made_up_result(store, claim.id))
-    assert store.queue.finish(again, made_up_result(store, again.id))
+    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
+    assert store.queue.finish(again, synthetic_result(store, again.id))
 
 
 def test_a_result_of_another_submission_or_protocol_is_refused(store, submit):
@@ -155,8 +155,8 @@ def test_a_result_of_another_submission_or_protocol_is_refused(store, submit):
     claim = store.queue.claim("worker")
     assert claim.id == one.id
     with pytest.raises(ValueError, match="result of"):
-        store.queue.finish(claim, made_up_result(store, other.id))
-    foreign = made_up_result(store, one.id, code="onnx_op").model_copy(
+        store.queue.finish(claim, synthetic_result(store, other.id))
+    foreign = synthetic_result(store, one.id, code="onnx_op").model_copy(
         update={"protocol": "sha256:" + "0" * 64}
     )
     with pytest.raises(ValueError, match="result of"):
@@ -168,5 +168,5 @@ def test_claims_are_seen_by_every_store_of_the_board(store, submit):
     with Store.open(store.folder.path) as other:
         claim = store.queue.claim("worker")
         assert other.queue.claim("other") is None
-        assert other.queue.finish(claim, made_up_result(other, claim.id))
+        assert other.queue.finish(claim, synthetic_result(other, claim.id))
         assert store.entries()[0].status == "scored"

@@ -274,8 +274,8 @@ def test_scores_are_withheld_until_the_references_are_right(url: str, store: Sto
     assert (view["status"], view["result"]["code"]) == ("rejected", "onnx_op")
 
     for name, level in (("optimal", 0.0), ("constant", 1.0)):
-        own = store.folder.signing_key()
-        boards.submit(store, own, name, [level] * 6, family="reference", spread=0.0)
+        board_key = store.folder.signing_key()
+        boards.submit(store, board_key, name, [level] * 6, family="reference", spread=0.0)
     view = HTTP.get(f"{url}/api/submissions/{hex_of(scored)}").json()
     assert view["result"]["scores"]["normalised_regret"][0]["value"] > 0
     assert view["withheld"] == ""
@@ -698,18 +698,18 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
     signed = uploaded(url, store, key)
     post(url, signed.to_bytes())
     path = f"{url}/api/withdrawals"
-    stranger = SignedWithdrawal.create(signed.id, SigningKey.generate())
-    answer = HTTP.post(path, json=stranger.to_dict())
+    by_another_key = SignedWithdrawal.create(signed.id, SigningKey.generate())
+    answer = HTTP.post(path, json=by_another_key.to_dict())
     assert refusal(answer) == (403, "bad_signature")
     unknown = SignedWithdrawal.create("sha256:" + "0" * 64, key)
     assert refusal(HTTP.post(path, json=unknown.to_dict())) == (404, "unknown_submission")
-    own = SignedWithdrawal.create(signed.id, key, "a bug")
+    valid = SignedWithdrawal.create(signed.id, key, "a bug")
     for _ in range(2):
-        answer = HTTP.post(path, json=own.to_dict())
+        answer = HTTP.post(path, json=valid.to_dict())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")
     assert refusal(post(url, signed.to_bytes())) == (410, "withdrawn")
     view = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}").json()
-    assert view["withdrawal"] == own.to_dict()
+    assert view["withdrawal"] == valid.to_dict()
 
 
 @pytest.mark.parametrize(
@@ -782,11 +782,11 @@ def test_serve_runs_scorers_and_stops_cleanly(
 
 def _children(pid: int) -> list[int]:
     """All processes under this one."""
-    found = []
+    descendants = []
     for task in Path(f"/proc/{pid}/task").iterdir():
         for child in map(int, (task / "children").read_text().split()):
-            found += [child, *_children(child)]
-    return found
+            descendants += [child, *_children(child)]
+    return descendants
 
 
 def _is_alive(pid: int) -> bool:

@@ -75,27 +75,27 @@ def origin(request, written, served):
 @pytest.fixture
 def opened(chromium):
     """Opens pages, and fails where one complained."""
-    contexts, complaints = [], []
+    contexts, problems = [], []
 
     def failed(request):
         if request.failure != "net::ERR_ABORTED":  # the page was left before its icon had come
-            complaints.append(f"{request.url}: {request.failure}")
+            problems.append(f"{request.url}: {request.failure}")
 
     def open_(address, width="desktop", **options):
         context = chromium.new_context(viewport={"width": WIDTHS[width], "height": 800}, **options)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda message: complaints.append(f"{page.url}: {message.text}"))
-        page.on("pageerror", lambda error: complaints.append(f"{page.url}: {error}"))
+        page.on("console", lambda message: problems.append(f"{page.url}: {message.text}"))
+        page.on("pageerror", lambda error: problems.append(f"{page.url}: {error}"))
         page.on("requestfailed", failed)
-        page.on("dialog", lambda dialog: (complaints.append("a dialog"), dialog.dismiss()))
+        page.on("dialog", lambda dialog: (problems.append("a dialog"), dialog.dismiss()))
         page.goto(address)
         return page
 
     yield open_
     for context in contexts:
         context.close()
-    assert complaints == []
+    assert problems == []
 
 
 def all_pages(ids):

@@ -49,7 +49,7 @@ Script = Callable[[str, str], tuple[int, bytes] | None]
 
 @contextmanager
 def scripted(script: Script) -> Iterator[tuple[str, list[str]]]:
-    """A server that answers as told (None: it hangs up); yields its URL and what it was asked."""
+    """A server with scripted answers (None: it hangs up); yields its URL and its requests."""
     asked: list[str] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -133,8 +133,11 @@ def test_existing_artefacts_are_not_sent_again(
     tmp_path: Path, store: Store, key: SigningKey
 ) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    told = json.dumps({"id": signed.id}).encode()
-    with scripted(lambda method, _: (200, b"" if method == "HEAD" else told)) as (url, asked):
+    confirmation = json.dumps({"id": signed.id}).encode()
+    with scripted(lambda method, _: (200, b"" if method == "HEAD" else confirmation)) as (
+        url,
+        asked,
+    ):
         client.submit(url, folder, key)
     assert [line.split()[0] for line in asked] == ["HEAD", "POST"]
 

@@ -34,9 +34,9 @@ def percentile_95(seconds: list[float]) -> float:
 
 
 def peak_bytes(pid: int) -> int:
-    found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-    assert found is not None
-    return int(found[1]) * 1024
+    match = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert match is not None
+    return int(match[1]) * 1024
 
 
 def processor_seconds(pid: int) -> float:
@@ -92,7 +92,7 @@ def test_a_hundred_large_uploads_at_once_take_little_memory(store: Store, key: S
     stored = [store.folder.object(digest).stat().st_size for digest in digests]
     assert stored == [UPLOAD_BYTES] * UPLOADS
     assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == UPLOADS * UPLOAD_BYTES
-    assert len(store.objects.read(digests[0])) == UPLOAD_BYTES  # which hashes it anew
+    assert len(store.objects.read(digests[0])) == UPLOAD_BYTES  # which verifies its digest
     shutil.rmtree(store.folder.objects)
 
 
@@ -142,5 +142,5 @@ def test_a_board_of_a_thousand_entries_is_served_quickly(large: Store) -> None:
     )
     assert unchanged.status_code == 304
     assert percentile_95(warm) < 0.2
-    # Processor time, and the middle one: what the machine does besides must not decide.
+    # The median of processor times: other load on the machine must not decide.
     assert sorted(worked)[REQUESTS // 2] < 0.2

@@ -1,4 +1,4 @@
-"""Results of made-up runs, for tests of how results are kept and not of how they come about."""
+"""Synthetic results, for tests of storage that need no scoring."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from leaderboard.scoring.score import evaluation_seed, result_of
 from leaderboard.store import Store
 
 
-def made_up_result(store: Store, id: str, *, code: str = "", level: float = 0.5) -> Result:
+def synthetic_result(store: Store, id: str, *, code: str = "", level: float = 0.5) -> Result:
     """A result that fits a submission: rejected with `code`, or of regret `level` or so.
 
     Args:
@@ -25,7 +25,7 @@ def made_up_result(store: Store, id: str, *, code: str = "", level: float = 0.5)
             protocol=document.protocol.digest,
             status="rejected",
             code=code,
-            message="made up",
+            message="synthetic",
         )
     levels = [high for _, high in document.protocol.edges]
     instances = document.instances
@@ -47,4 +47,4 @@ def made_up_result(store: Store, id: str, *, code: str = "", level: float = 0.5)
                 **run_metrics(regret, similarity, levels),
             )
         )
-    return result_of(document, id, runs, {"made": "up"})
+    return result_of(document, id, runs, {"synthetic": "1"})
