@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sme_registry.spec import SuiteFile, catalogue
-from sme_registry.spec.resolve import is_path
 
 BoardFolder = Annotated[
     Path, typer.Argument(metavar="BOARD", help="The board's folder.", show_default=True)
@@ -30,7 +30,8 @@ KeyFile = Annotated[
 
 def find_suite(name: str) -> SuiteFile:
     """A suite by its name in the catalogue or its file's path."""
-    return SuiteFile.read(name) if is_path(name) else catalogue.find(SuiteFile, name)
+    is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
+    return SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
 
 
 def is_url(board: str) -> bool:
