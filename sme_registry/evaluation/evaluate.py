@@ -7,6 +7,7 @@ fitted, regardless of the protocol's number of states.
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -17,10 +18,14 @@ import numpy.typing as npt
 from sme_registry.compiled import Engine, engine
 from sme_registry.errors import SpecError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.accumulator import ErrorAccumulator
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.regions import Observations, Uniform, observations
-from sme_registry.evaluation.report import AgentReport, EvaluationReport, RegionReport
+from sme_registry.evaluation.regions import Observations, Uniform, observations, region_name
+from sme_registry.evaluation.report import (
+    AgentReport,
+    ChannelReport,
+    EvaluationReport,
+    RegionReport,
+)
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, ProtocolFile, ProtocolLike, SpecLike, catalogue
 from sme_registry.task import Task, load_spec, materialize
@@ -75,8 +80,8 @@ def evaluate(
         channels |= zip(task.names, task.owned, strict=True)
 
     measured = list(_errors_by_region(prepared, task, oracle, protocol, channels, progress))
-    whole, *agents = (_reports(measured, protocol, scope) for scope in channels)
-    names = [scope for scope in channels if scope != _WHOLE]
+    reports = {scope: _report(measured, protocol, scope) for scope in channels}
+    whole = reports.pop(_WHOLE)
     return EvaluationReport(
         policy=prepared.name,
         action_range=prepared.action_range,
@@ -84,12 +89,9 @@ def evaluate(
         spec_digest=spec.digest,
         protocol=protocol,
         protocol_digest=protocol.digest,
-        regions=whole.pop(_POLICY),
-        references=whole,
-        agents={
-            agent: AgentReport(regions=reports.pop(_POLICY), references=reports)
-            for agent, reports in zip(names, agents, strict=True)
-        },
+        regions=whole.regions,
+        references=whole.references,
+        agents=reports,
         versions=versions(
             ["numpy", "scipy", "gymnasium", *(["numba"] if oracle.backend == "numba" else [])],
             if_imported=_POLICY_LIBRARIES,
@@ -121,12 +123,71 @@ _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 _WHOLE = ""  # the key of all action channels among the agents' names
 
 
-class _Errors(dict[str, ErrorAccumulator]):
-    """A policy's errors in one region: over all action channels, and over each agent's own."""
+class _Accumulator:
+    """Mean and spread of |a − a*| over states, and its sum for each action channel, in float64."""
+
+    def __init__(self, action_dim: int) -> None:
+        self._states = 0
+        self._mean = 0.0
+        # Σ (‖a − a*‖₁/A − mean)², which is exactly 0 for the optimum, unlike Σ x² − n m².
+        self._squares = 0.0
+        self._sums = np.zeros(action_dim)
+        self._clipped = 0
+
+    def add(self, errors: Array, sums: Array, clipped: int) -> None:
+        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped.
+
+        `sums` `[A]` over states are computed over all channels of a task at once, so that an
+        agent's channels have the same bits in its own report and in its team's.
+        """
+        deviations = errors.mean(axis=1)
+        count, mean = len(deviations), float(deviations.mean())
+        deviations -= mean
+        states = self._states + count
+        shift = mean - self._mean
+        self._squares += float(deviations @ deviations) + shift**2 * self._states * count / states
+        self._mean += shift * count / states
+        self._states = states
+        self._sums += sums
+        self._clipped += clipped
+
+    def report(
+        self,
+        region: int,
+        edges: tuple[float, float],
+        constant_half: _Accumulator,
+        wd: _Accumulator,
+    ) -> RegionReport:
+        """The report of this region; `constant_half` is of the policy ½, `wd` of this one in WD."""
+        similarity, wd_similarity = 1.0 - self._mean, 1.0 - wd._mean
+        channels = zip(self._sums, constant_half._sums, strict=True)
+        return RegionReport(
+            name=region_name(region),
+            epsilon_low=edges[0],
+            epsilon_high=edges[1],
+            states=self._states,
+            similarity=similarity,
+            similarity_sd=math.sqrt(self._squares / (self._states - 1)),
+            mae=self._mean,
+            normalised_regret=self._mean / constant_half._mean,
+            similarity_decay=(wd_similarity - similarity) / wd_similarity,
+            similarity_loss=100.0 * (wd_similarity - similarity),
+            clipped_share=self._clipped / (self._states * len(self._sums)),
+            channels=tuple(
+                ChannelReport(
+                    mae=float(total) / self._states, normalised_regret=float(total / half)
+                )
+                for total, half in channels
+            ),
+        )
+
+
+class _Errors(dict[str, _Accumulator]):
+    """A policy's errors in one region: over all action channels, and over each agent's."""
 
     def __init__(self, channels: dict[str, slice]) -> None:
         super().__init__(
-            {scope: ErrorAccumulator(own.stop - own.start) for scope, own in channels.items()}
+            {scope: _Accumulator(owned.stop - owned.start) for scope, owned in channels.items()}
         )
         self._channels = channels
 
@@ -177,11 +238,11 @@ def _errors_by_region(
         yield errors
 
 
-def _reports(
+def _report(
     measured: list[dict[str, _Errors]], protocol: EvaluationProtocol, scope: str
-) -> dict[str, tuple[RegionReport, ...]]:
+) -> AgentReport:
     """The regions of the policy and of each reference, over the channels of a scope."""
-    return {
+    by_name = {
         name: tuple(
             errors[name][scope].report(
                 region, edges, errors["constant_half"][scope], measured[0][name][scope]
@@ -190,6 +251,7 @@ def _reports(
         )
         for name in measured[0]
     }
+    return AgentReport(regions=by_name.pop(_POLICY), references=by_name)
 
 
 def _batches(

@@ -5,12 +5,11 @@ linear_least_squares   the affine map of the state fitted to π*, clipped to [0,
                        agent has its own map of the channels that it observes
 best_constant          the constant action with the smallest mean |a − a*|: the medians of a*
 constant_half          a = ½: normalised regret 1
-uniform_random         a ~ U([0, 1]^A), drawn anew in each state
+uniform_random         a ~ U([0, 1]^A), a new draw in each state
 
 The two fitted ones are fitted on the states of WD, at most `FIT_STATES` of them (all of them under
-paper-v1), and used unchanged in every other region: outside they lose as much as an agent would
-that learned no more. In WD they are evaluated on the states they were fitted on, which flatters
-them unless there are many times more states than state_dim.
+paper-v1), and used unchanged in every other region. In WD they are evaluated on the states they
+were fitted on, which flatters them unless there are many times more states than state_dim.
 
 An agent's reference uses only what the agent observes: a linear map of the whole state is another
 policy, which no agent that observes a part of the state could execute.
@@ -31,15 +30,8 @@ from sme_registry.task import materialize
 from sme_registry.task.draw import Array
 
 Act = Callable[[Observation], Any]
-Joint = Callable[[Array], Array]  # states [B, S] to joint actions [B, A]
 
-NAMES = (
-    "optimal",
-    "linear_least_squares",
-    "best_constant",
-    "constant_half",
-    "uniform_random",
-)
+NAMES = ("optimal", "linear_least_squares", "best_constant", "constant_half", "uniform_random")
 FIT_STATES = 2**16
 _FIT_NUMBERS = 2**24  # of the states and actions kept for the fit, 128 MiB as float64
 
@@ -64,6 +56,10 @@ class References:
     slope: Array
     intercept: Array
 
+    def linear(self, s: Array) -> Array:
+        """The linear policy's actions `[B, A]` in states `[B, S]`, not clipped."""
+        return (s - 0.5) @ self.slope + self.intercept
+
     def actions(self, s: Array, optimal: Array, random: Array) -> dict[str, Array]:
         """The actions of every reference policy, by name.
 
@@ -75,11 +71,9 @@ class References:
         Returns:
           `[B, A]` each, or `[A]` for a constant action; all in [0, 1].
         """
-        linear = (s - 0.5) @ self.slope
-        linear += self.intercept
         return {
             "optimal": optimal,
-            "linear_least_squares": np.clip(linear, 0.0, 1.0, out=linear),
+            "linear_least_squares": np.clip(self.linear(s), 0.0, 1.0),
             "best_constant": self.constant,
             "constant_half": np.full_like(self.constant, 0.5),
             "uniform_random": random,
@@ -110,44 +104,6 @@ def fit(
     return References(np.median(optimal, axis=0), slope, intercept)
 
 
-def _optimal(spec: SMESpec) -> Joint:
-    return engine(materialize(spec)).optimal_action
-
-
-def _linear(spec: SMESpec) -> Joint:
-    fitted = _fit_uniform(spec)
-    return lambda s: (s - 0.5) @ fitted.slope + fitted.intercept
-
-
-def _best_constant(spec: SMESpec) -> Joint:
-    constant = _fit_uniform(spec).constant
-    return lambda s: np.tile(constant, (len(s), 1))
-
-
-def _constant_half(spec: SMESpec) -> Joint:
-    return lambda s: np.full((len(s), spec.action_dim), 0.5)
-
-
-def _random(spec: SMESpec) -> Joint:
-    generator = np.random.default_rng(0)
-    return lambda s: generator.random((len(s), spec.action_dim))
-
-
-def _fit_uniform(spec: SMESpec) -> References:
-    """The references fitted on states of their own, uniform in the training cube."""
-    task = materialize(spec)
-    s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
-    agents = zip(task.observed, task.owned, strict=True)
-    return fit(s, engine(task).optimal_action(s), agents)
-
-
-_BY_NAME: dict[str, Callable[[SMESpec], Joint]] = {
-    "optimal": _optimal,
-    "linear_least_squares": _linear,
-    "best_constant": _best_constant,
-    "constant_half": _constant_half,
-    "uniform_random": _random,
-}
 SHORT_NAMES = {
     "linear": "linear_least_squares",
     "constant": "constant_half",
@@ -170,17 +126,9 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
       A function from observations `[B, S + 2]` to actions `[B, A]` of the unit range; for a team,
       one for each agent.
     """
-    joint, S = _BY_NAME[SHORT_NAMES.get(name, name)](spec), spec.state_dim
-    if spec.team is None:
+    joint, S = _joint_policy(SHORT_NAMES.get(name, name), spec), spec.state_dim
 
-        def act_alone(observations: Observation) -> Array:
-            return joint(observations[:, :S].astype(np.float64))
-
-        act_alone.__name__ = name
-        return act_alone
-    task = materialize(spec)
-
-    def of_agent(observed: tuple[int, ...], owned: slice) -> Act:
+    def of_agent(observed: Sequence[int], owned: slice) -> Act:
         def act(observations: Observation) -> Array:
             # The agent's channels of the joint action do not depend on what it does not observe.
             s = np.zeros((len(observations), S))
@@ -190,5 +138,26 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
         act.__name__ = name
         return act
 
+    if spec.team is None:
+        return of_agent(range(S), slice(spec.action_dim))
+    task = materialize(spec)
     agents = zip(task.names, task.observed, task.owned, strict=True)
     return {agent: of_agent(observed, owned) for agent, observed, owned in agents}
+
+
+def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
+    """A reference policy from states `[B, S]` to joint actions `[B, A]`, which are not clipped."""
+    if name == "optimal":
+        return engine(materialize(spec)).optimal_action
+    if name == "constant_half":
+        return lambda s: np.full((len(s), spec.action_dim), 0.5)
+    if name == "uniform_random":
+        generator = np.random.default_rng(0)
+        return lambda s: generator.random((len(s), spec.action_dim))
+    task = materialize(spec)
+    s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
+    agents = zip(task.observed, task.owned, strict=True)
+    fitted = fit(s, engine(task).optimal_action(s), agents)
+    if name == "best_constant":
+        return lambda s: np.tile(fitted.constant, (len(s), 1))
+    return fitted.linear

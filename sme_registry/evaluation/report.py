@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.errors import DigestMismatchError, MissingDependencyError
-from sme_registry.io import read_json, to_json, write_atomically
+from sme_registry.errors import DigestMismatchError
+from sme_registry.io import read_json, require_packages, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
 from sme_registry.spec.document import Integer, Real, StrictModel
 
@@ -105,8 +105,7 @@ class EvaluationReport(StrictModel):
     """A policy in every region of a protocol, and the references on the same states.
 
     `print(report)` shows it as a table. For a team, `regions` and `references` are over all action
-    channels, and `agents` has the same for each agent over its own. A single agent's report has no
-    agents, and its JSON omits the field.
+    channels. A single agent's report has no `agents`, and its JSON omits the field.
 
     Attributes:
       policy: the policy's name.
@@ -118,7 +117,7 @@ class EvaluationReport(StrictModel):
       protocol_digest: its digest.
       regions: WD, then OOD 1, 2, …
       references: the same regions for each reference policy; `evaluation.references` defines them.
-      agents: each agent of a team by its name, in the order of the channels that they own.
+      agents: each agent of a team by its name, over the channels that it owns, in their order.
       versions: of Python and the packages that the numbers depend on.
     """
 
@@ -196,23 +195,18 @@ class EvaluationReport(StrictModel):
         Raises:
           MissingDependencyError: pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise MissingDependencyError(
-                "EvaluationReport.to_frame: pandas is not installed. "
-                "Run `pip install 'sme-registry[studies]'`."
-            ) from None
+        require_packages("EvaluationReport.to_frame", {"pandas": "pandas"}, "studies")
+        import pandas
+
         scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
         return pandas.DataFrame(
             {"policy": policy, "reference": is_reference, "agent": agent, "region": region.name}
             | region.model_dump(exclude={"name", "channels"})
             for agent, scope in scopes.items()
-            for is_reference, policies in (
-                (False, {self.policy: scope.regions}),
-                (True, scope.references),
+            for policy, is_reference, regions in (
+                (self.policy, False, scope.regions),
+                *((name, True, regions) for name, regions in scope.references.items()),
             )
-            for policy, regions in policies.items()
             for region in regions
         )
 
@@ -231,27 +225,23 @@ class EvaluationReport(StrictModel):
         For a team, it shows the whole team, then three rows for each agent.
         """
         from rich.markup import escape
-        from rich.table import Table
+
+        from sme_registry.terminal.output import table as empty_table
 
         spec, policy = self.spec, escape(self.policy)
         team = f", {len(self.agents)} agents" if self.agents else ""
-        table = Table(
-            title=f"{policy} on {catalogue.title(spec)} (S={spec.state_dim}, "
+        table = empty_table(
+            f"{policy} on {catalogue.title(spec)} (S={spec.state_dim}, "
             f"A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{spec.digest}\n{self.regions[0].states:,} states per region; "
             f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
             f"OOD decay {self.ood_decay:.3f}",
+            {"": "name"}
+            | {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in self.regions},
             caption=NOT_COMPARABLE,
-            title_justify="left",
-            caption_justify="left",
         )
-        table.add_column("", no_wrap=True)
-        for region in self.regions:
-            table.add_column(
-                f"{region.name}\nε ≤ {region.epsilon_high:g}", justify="right", no_wrap=True
-            )
 
-        def row(label: str, regions: _Regions, field: str, pattern: str) -> None:
+        def row(label: str, field: str, pattern: str, regions: _Regions = self.regions) -> None:
             values = [format(getattr(region, field), pattern) for region in regions]
             table.add_row(label, *values, style="bold" if regions is self.regions else None)
 
@@ -261,17 +251,16 @@ class EvaluationReport(StrictModel):
         ):
             table.add_row(heading, style="italic")
             for name, regions in {policy: self.regions, **self.references}.items():
-                row(f"  {LABELS.get(name, name)}", regions, field, ".3f")
+                row(f"  {LABELS.get(name, name)}", field, ".3f", regions)
             table.add_section()
-        row("SD of r̃ over states", self.regions, "similarity_sd", ".3f")
-        row("similarity decay", self.regions, "similarity_decay", ".1%")
-        row("similarity loss, pts", self.regions, "similarity_loss", ".1f")
-        row("actions clipped", self.regions, "clipped_share", ".1%")
+        row("SD of r̃ over states", "similarity_sd", ".3f")
+        row("similarity decay", "similarity_decay", ".1%")
+        row("similarity loss, pts", "similarity_loss", ".1f")
+        row("actions clipped", "clipped_share", ".1%")
         for agent, report in self.agents.items():
             table.add_section()
-            row(f"{agent}  r̃", report.regions, "similarity", ".3f")
-            row("  normalised regret", report.regions, "normalised_regret", ".3f")
-            linear = report.references.get("linear_least_squares")
-            if linear is not None:
-                row(f"  of {LABELS['linear_least_squares']}", linear, "normalised_regret", ".3f")
+            row(f"{agent}  r̃", "similarity", ".3f", report.regions)
+            row("  normalised regret", "normalised_regret", ".3f", report.regions)
+            if linear := report.references.get("linear_least_squares"):
+                row(f"  of {LABELS['linear_least_squares']}", "normalised_regret", ".3f", linear)
         return table

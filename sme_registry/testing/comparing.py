@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import warnings
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -27,6 +31,20 @@ def expect_near(what: str, got: Any, expected: Any, tolerance: float = TOLERANCE
         raise ConformanceError(
             f"{what}: expected {expected!r:.200} to {tolerance:.0e}, got {got!r:.200}."
         )
+
+
+def expect_passes(what: str, test: Callable[[], Any], ignored: Collection[str] = ()) -> None:
+    """Check that another library's test passes, with no warnings but those ignored."""
+    silence = contextlib.redirect_stdout(io.StringIO())
+    with warnings.catch_warnings(record=True) as caught, silence:
+        warnings.simplefilter("always")
+        try:
+            test()
+        except Exception as error:
+            raise ConformanceError(f"{what}: {error}") from error
+    for message in (str(warning.message) for warning in caught):
+        if message not in ignored:
+            raise ConformanceError(f"{what}, warns: {message}")
 
 
 def expect_same(what: str, got: Any, expected: Any) -> None:

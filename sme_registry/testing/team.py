@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
-import copy
 import functools
-import io
-import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper, parallel_to_aec
 from scipy.special import ndtr
 
@@ -20,16 +15,15 @@ from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.spec import ACTION_RANGES, SpecLike
 from sme_registry.task import Task, load_spec, materialize, observe, step
+from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
     TOLERANCE,
-    ConformanceError,
     expect_equal,
     expect_near,
+    expect_passes,
     expect_same,
 )
-from sme_registry.testing.episodes import INFO_KEYS, LONGEST_HORIZON, MAX_STEPS, mixed_actions
-
-MakeParallel = Callable[..., Any]
+from sme_registry.testing.episodes import INFO_KEYS, LONGEST_HORIZON, MAX_STEPS, Make, next_action
 
 _UNEQUAL_AGENTS_WARNINGS = {
     "Agents have different observation space sizes",
@@ -38,7 +32,7 @@ _UNEQUAL_AGENTS_WARNINGS = {
 }
 
 
-def check_team(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0) -> None:
+def check_team(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """Run every check of a team.
 
     Args:
@@ -50,14 +44,17 @@ def check_team(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int
       ConformanceError: the first check that fails.
     """
     check_pettingzoo(task, parallel=parallel)
-    check_team_definition(task, parallel=parallel, seed=seed)
-    check_team_optimum(task, parallel=parallel, seed=seed)
-    check_team_determinism(task, parallel=parallel, seed=seed)
-    check_team_pickling(task, parallel=parallel, seed=seed)
-    check_turns(task, parallel=parallel, seed=seed)
+    for check in (
+        check_team_definition,
+        check_team_optimum,
+        check_team_determinism,
+        check_team_pickling,
+        check_turns,
+    ):
+        check(task, parallel=parallel, seed=seed)
 
 
-def check_pettingzoo(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv) -> None:
+def check_pettingzoo(task: SpecLike, *, parallel: Make = SMETeamEnv) -> None:
     """PettingZoo's tests of API, seed and state pass without warnings, parallel and AEC.
 
     Its warnings that agents' spaces differ in size are ignored if they do differ.
@@ -73,7 +70,10 @@ def check_pettingzoo(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv) -> 
         from pettingzoo.test.state_test import state_test
     for action_range in ACTION_RANGES:
         make = functools.partial(parallel, spec, action_range=action_range)
-        make_aec: Callable[[], Any] = functools.partial(_as_aec, make)
+
+        def make_aec(make: Make = make) -> Any:
+            return parallel_to_aec(make())
+
         tests: dict[str, Callable[[], Any]] = {
             "parallel_api_test": functools.partial(parallel_api_test, make(), num_cycles=MAX_STEPS),
             "api_test": functools.partial(api_test, make_aec(), num_cycles=MAX_STEPS),
@@ -81,24 +81,11 @@ def check_pettingzoo(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv) -> 
             "seed_test": functools.partial(seed_test, make_aec),
             "state_test": functools.partial(state_test, make_aec(), make()),
         }
-        for name, run in tests.items():
-            silence = contextlib.redirect_stdout(io.StringIO())
-            with warnings.catch_warnings(record=True) as caught, silence:
-                warnings.simplefilter("always")
-                try:
-                    run()
-                except Exception as error:
-                    raise ConformanceError(
-                        f"PettingZoo's {name}, {action_range}: {error}"
-                    ) from error
-            for message in (str(warning.message) for warning in caught):
-                if message not in ignored:
-                    raise ConformanceError(f"PettingZoo's {name}, {action_range}, warns: {message}")
+        for name, test in tests.items():
+            expect_passes(f"PettingZoo's {name}, {action_range}", test, ignored)
 
 
-def check_team_definition(
-    task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
-) -> None:
+def check_team_definition(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """Each step equals `sme_registry.task.step` for each agent, which observes only its channels.
 
     States and ends are compared bit for bit, optimal actions and rewards to 1e-12.
@@ -114,7 +101,7 @@ def check_team_definition(
         s, r_cum = env.state()[None], np.zeros((1, len(definition.names)))
         _check_observations(definition, observations, s, 0, r_cum)
         for t in range(min(spec.horizon, MAX_STEPS)):
-            actions = _team_actions(env, rng)
+            actions = next_action(env, rng)
             joint = np.concatenate([actions[name] for name in definition.names]).astype(np.float64)
             joint = (joint + 1.0) / 2.0 if symmetric else joint
             done = step(definition, s, np.array([t]), r_cum, joint[None])
@@ -148,135 +135,67 @@ def _check_agent(
         expect_near(f"{name}: {key}", got, getattr(done, key)[0, agent], k * TOLERANCE)
 
 
-def check_team_optimum(
-    task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
-) -> None:
+def check_team_optimum(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """An agent that acts by its own layers on only what it observes has return T."""
     spec = load_spec(task)
     definition = materialize(spec)
+
+    def act(s: Any) -> Any:
+        joint = []
+        for channels, layers in zip(definition.observed, definition.policies, strict=True):
+            x = s[list(channels)]
+            for W, b in layers:
+                x = ndtr(W @ x + b)
+            joint.append(x)
+        return np.concatenate(joint)
+
     spec = spec.derive(horizon=min(spec.horizon, LONGEST_HORIZON))
     for action_range in ACTION_RANGES:
         env = parallel(spec, action_range=action_range)
-        env.reset(seed=seed)
-        returned, steps = dict.fromkeys(definition.names, 0.0), 0
-        while env.agents:
-            actions = {}
-            s = env.state()
-            for name, channels, layers in zip(
-                definition.names, definition.observed, definition.policies, strict=True
-            ):
-                x = s[list(channels)]
-                for W, b in layers:
-                    x = ndtr(W @ x + b)
-                actions[name] = from_unit(x, action_range == "symmetric")
-            _, rewards, _, _, infos = env.step(actions)
-            steps += 1
-            for name, reward in rewards.items():
-                expect_near(f"{name}: the optimum's regret", infos[name]["regret"], 0.0, 1e-9)
-                returned[name] += reward
-        expect_equal("the optimum's steps", steps, spec.horizon)
-        for name, total in returned.items():
-            expect_near(f"{name}: the optimum's return", total, spec.horizon, 1e-9 * spec.horizon)
+        episodes.expect_optimum(env, act, spec.horizon, seed)
 
 
-def check_team_determinism(
-    task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
-) -> None:
+def check_team_determinism(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """A seed fixes whole consecutive episodes; PettingZoo's own tests compare only one step."""
-    spec = load_spec(task)
-    first, second, other = (
-        _play_team(parallel(spec), reset_seed, seed) for reset_seed in (seed, seed, seed + 1)
-    )
-    expect_same("two runs of one seed", first, second)
-    name = next(iter(first[0]))
-    if np.array_equal(first[0][name], other[0][name]):
-        raise ConformanceError(f"Seeds {seed} and {seed + 1} start at the same observation.")
+    episodes.expect_determinism(functools.partial(parallel, load_spec(task)), seed)
 
 
-def check_team_pickling(
-    task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0
-) -> None:
+def check_team_pickling(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """Pickled and deep copies taken in mid-episode continue as the original does."""
     spec = load_spec(task)
-    env = parallel(spec)
-    env.reset(seed=seed)
-    if spec.horizon > 1:
-        optimal = env.task.optimal_action(env.state())
-        env.step({
-            name: optimal[owned]
-            for name, owned in zip(env.task.names, env.task.owned, strict=True)
-        })  # fmt: skip
-    before = env.state()
-    copies = {"a pickled copy": pickle.loads(pickle.dumps(env)), "a deep copy": copy.deepcopy(env)}
-    played = {how: _play_team(twin, None, seed, begun=True) for how, twin in copies.items()}
-    expect_equal("the state, after stepping a copy", env.state(), before)
-    original = _play_team(env, None, seed, begun=True)
-    for how, record in played.items():
-        expect_same(how, record, original)
+    episodes.expect_same_copies("team", parallel(spec), spec.horizon, seed)
 
 
-def check_turns(task: SpecLike, *, parallel: MakeParallel = SMETeamEnv, seed: int = 0) -> None:
+def check_turns(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
     """PettingZoo's conversions to AEC and back keep every number of a whole episode."""
     spec = load_spec(task)
     make = functools.partial(parallel, spec)
-    direct = _play_team(make(), seed, seed)
+    direct = episodes.play(make(), seed, seed)
     # Not `aec_to_parallel`, which would return the original environment.
     converted: Any = aec_to_parallel_wrapper(parallel_to_aec(make()))
     converted.task = materialize(spec)
-    expect_same("parallel, AEC and back", _play_team(converted, seed, seed), direct)
+    expect_same("parallel, AEC and back", episodes.play(converted, seed, seed), direct)
 
     env, aec = make(), parallel_to_aec(make())
-    observations, _ = env.reset(seed=seed)
+    observations, infos = env.reset(seed=seed)
     aec.reset(seed=seed)
     rng = np.random.default_rng(seed)
     rewards = dict.fromkeys(env.agents, 0.0)
     terminated = truncated = dict.fromkeys(env.agents, False)
-    infos: dict[str, Any] = {name: {} for name in env.agents}
-    while env.agents:
-        actions = _team_actions(env, rng)
-        for name in env.agents:
-            expect_equal("the agent to act", aec.agent_selection, name)
+    playing = True
+    while playing:
+        playing = bool(env.agents)
+        actions = next_action(env, rng) if playing else dict.fromkeys(env.possible_agents)
+        for agent in actions:
+            name = aec.agent_selection
+            if playing:  # after the end, they follow in the order of their names
+                expect_equal("the agent to act", name, agent)
             expect_same(f"{name} in an AEC environment", list(aec.last()), [
                 observations[name], rewards[name], terminated[name], truncated[name], infos[name]
             ])  # fmt: skip
             aec.step(actions[name])
-        observations, rewards, terminated, truncated, infos = env.step(actions)
-    for _ in env.possible_agents:
-        name = aec.agent_selection  # after the end, in the order of their names
-        expect_same(f"{name} in an AEC environment, at the end", list(aec.last()), [
-            observations[name], rewards[name], terminated[name], truncated[name], infos[name]
-        ])  # fmt: skip
-        aec.step(None)
-
-
-def _as_aec(make: MakeParallel) -> Any:
-    return parallel_to_aec(make())
-
-
-def _team_actions(env: Any, rng: np.random.Generator) -> dict[str, npt.NDArray[np.float32]]:
-    """`mixed_actions` by agent, in the environment's range."""
-    joint = mixed_actions(env.task.optimal_action(env.state()), rng)
-    symmetric = env.action_space(env.task.names[0]).low[0] < 0.0
-    joint = from_unit(joint, bool(symmetric)).astype(np.float32)
-    return {name: joint[owned] for name, owned in zip(env.task.names, env.task.owned, strict=True)}
-
-
-def _play_team(env: Any, reset_seed: int | None, seed: int, begun: bool = False) -> list[Any]:
-    """Everything that two whole episodes return; the second continues the environment's stream.
-
-    With `begun`, the first is the episode in progress, played to its end.
-    """
-    rng = np.random.default_rng(seed)
-    returns: list[Any] = []
-    for episode_seed in (reset_seed, None):
-        if not begun:
-            returns += env.reset(seed=episode_seed)
-        begun = False
-        for _ in range(MAX_STEPS):
-            if not env.agents:
-                break
-            returns += [*env.step(_team_actions(env, rng)), env.state()]
-    return returns
+        if playing:
+            observations, rewards, terminated, truncated, infos = env.step(actions)
 
 
 def _check_observations(definition: Task, got: dict[str, Any], s: Any, t: int, r_cum: Any) -> None:

@@ -123,7 +123,7 @@ class RewardsInTurn(SMETeamEnv):
         (testing.check_team_definition, EndsOneByOne, "agent_1: truncated"),
         (testing.check_team_optimum, NeedsToSeeMore, "agent_0: the optimum's regret"),
         (testing.check_team_pickling, Forgets, "a pickled copy"),
-        (testing.check_team_pickling, Shares, "after stepping a copy"),
+        (testing.check_team_pickling, Shares, "the state, after stepping a deep copy of the team"),
         (testing.check_pettingzoo, NewSpaces, "PettingZoo's .*api_test"),
         (testing.check_turns, RewardsInTurn, "AEC"),
     ],

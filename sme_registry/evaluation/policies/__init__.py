@@ -6,9 +6,8 @@ callable · Stable-Baselines3 model or .zip · .onnx file · .npz file of an off
 
 from sme_registry.evaluation.policies.forms import as_policy
 from sme_registry.evaluation.policies.npz import OfflinePolicy
-from sme_registry.evaluation.policies.policy import Policy
+from sme_registry.evaluation.policies.policy import Member, Policy, TeamPolicy
 from sme_registry.evaluation.policies.sb3 import load_sb3
-from sme_registry.evaluation.policies.team import Member, TeamPolicy
 
 __all__ = [
     "Member",

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from sme_registry.envs.shared import shared_observation_of
+from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.policies.interface import Interface
-from sme_registry.evaluation.policies.policy import Policy, prepare
-from sme_registry.evaluation.policies.team import TeamPolicy, separate_policies, shared_policy
+from sme_registry.evaluation.policies import sb3
+from sme_registry.evaluation.policies.npz import OfflinePolicy
+from sme_registry.evaluation.policies.onnx import load_onnx
+from sme_registry.evaluation.policies.policy import (
+    Interface,
+    Member,
+    Policy,
+    TeamPolicy,
+    prefixed_errors,
+)
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
-from sme_registry.spec import ACTION_RANGES, SMESpec
+from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec
+from sme_registry.task import draw
 
 _SUFFIXES = (".zip", ".onnx", ".npz")
 
@@ -50,22 +61,18 @@ def as_policy(
     """
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
+    range_ = cast("ActionRange | None", action_range)
     if isinstance(policy, str):
         policy, name = _named(policy, spec), name or _display_name(policy)
-    options = {"action_range": action_range, "name": name}
     if isinstance(policy, TeamPolicy):
         policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
     if spec.team is None:
         S, A = spec.state_dim, spec.action_dim
-        return prepare(policy, Interface(S + 2, A, f"state_dim={S}, action_dim={A}"), **options)
+        return _prepare(policy, Interface(S + 2, A, f"state_dim={S}, action_dim={A}"), range_, name)
     if isinstance(policy, Mapping):
-        return separate_policies(
-            {agent: _of_agent(member, agent, spec) for agent, member in policy.items()},
-            spec,
-            **options,
-        )
-    return shared_policy(policy, spec, **options)
+        return _separate_policies(policy, spec, range_, name)
+    return _shared_policy(policy, spec, range_, name)
 
 
 def _named(text: str, spec: SMESpec) -> Any:
@@ -90,13 +97,141 @@ def _named(text: str, spec: SMESpec) -> Any:
     return function
 
 
-def _of_agent(policy: Any, agent: Any, spec: SMESpec) -> Any:
-    """An agent's policy; of a reference policy's name the agent's part."""
-    if isinstance(policy, str):
-        policy = _named(policy, spec)
-    return policy.get(agent) if isinstance(policy, Mapping) else policy
-
-
 def _display_name(text: str) -> str:
     is_path = text not in POLICIES and (text.endswith(_SUFFIXES) or ":" not in text)
     return Path(text).stem if is_path else text
+
+
+def _prepare(
+    policy: Any, interface: Interface, action_range: ActionRange | None, name: str | None = None
+) -> Policy:
+    """One policy of this interface, from a callable, a model or the path of a file."""
+    if isinstance(policy, Policy):
+        interface.check(f"policy {policy.name!r}", actions=(policy.action_dim,))
+        return replace(
+            policy, name=name or policy.name, action_range=action_range or policy.action_range
+        )
+    if isinstance(policy, str | os.PathLike):
+        name = Path(policy).stem if name is None else name
+        policy = _load(Path(policy), interface)
+    act = policy
+    if hasattr(policy, "predict"):
+        interface.check(
+            "policy",
+            observations=getattr(getattr(policy, "observation_space", None), "shape", None),
+            actions=getattr(getattr(policy, "action_space", None), "shape", None),
+        )
+        sb3.check_not_normalised(policy)
+        act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
+    elif not callable(policy):
+        raise PolicyError(
+            f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
+            f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}], a "
+            "Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, module:function, or "
+            "the name of a reference policy."
+        )
+    return Policy(
+        name or _name_of(policy),
+        action_range or "unit",
+        act,
+        interface.action_dim,
+        interface.hint,
+    )
+
+
+def _load(path: Path, interface: Interface) -> Any:
+    if path.suffix == ".onnx":
+        return load_onnx(path, interface)
+    if path.suffix == ".npz":
+        policy = OfflinePolicy.load(path)
+        interface.check(
+            str(path), observations=(policy.observation_dim,), actions=(policy.action_dim,)
+        )
+        return policy
+    return sb3.load_sb3(path)
+
+
+def _name_of(policy: Any) -> str:
+    name = getattr(policy, "__name__", type(policy).__name__)
+    return "policy" if name in ("<lambda>", "function") else str(name)
+
+
+def _separate_policies(
+    policies: Mapping[str, Any],
+    spec: SMESpec,
+    action_range: ActionRange | None,
+    name: str | None,
+) -> TeamPolicy:
+    """A team policy from a policy for each agent, by name."""
+    agents = draw.agents(spec)
+    _check_names(policies, [agent.name for agent in agents])
+    members = []
+    for agent, observed in zip(agents, draw.observed_channels(spec), strict=True):
+        interface = Interface(
+            len(observed) + 2,
+            agent.action_dim,
+            f"{len(observed)} observed and {agent.action_dim} owned channels",
+        )
+        with prefixed_errors(agent.name):
+            policy = policies[agent.name]
+            if isinstance(policy, str):
+                policy = _named(policy, spec)
+            if isinstance(policy, Mapping):  # a reference policy, of all agents
+                policy = policy.get(agent.name)
+            prepared = _prepare(policy, interface, action_range)
+        columns = [*observed, spec.state_dim, spec.state_dim + 1]
+        observe = functools.partial(_columns, columns)
+        members.append(Member(agent.name, prepared, observe, agent.action_dim))
+    names = {member.policy.name for member in members}
+    ranges = {member.policy.action_range for member in members}
+    return TeamPolicy(
+        name or (names.pop() if len(names) == 1 else f"{len(members)} policies"),
+        ranges.pop() if len(ranges) == 1 else "mixed",
+        tuple(members),
+    )
+
+
+def _columns(columns: list[int], observations: Observation) -> Observation:
+    return observations[:, columns]
+
+
+def _check_names(policies: Mapping[str, Any], names: list[str]) -> None:
+    missing = [name for name in names if name not in policies]
+    unknown = [name for name in policies if name not in names]
+    problems = [f"{', '.join(missing)}: policy missing."] if missing else []
+    if unknown:
+        hint = did_you_mean(str(unknown[0]), missing or names)
+        problems.append(f"{', '.join(map(repr, unknown))}: no such agent.{hint}")
+    if problems:
+        raise PolicyError(f"policy: {' '.join(problems)} Give one for each of {', '.join(names)}.")
+
+
+def _shared_policy(
+    policy: Any, spec: SMESpec, action_range: ActionRange | None, name: str | None
+) -> TeamPolicy:
+    """A team policy from one policy that all agents share."""
+    agents = draw.agents(spec)
+    observation_dim = spec.state_dim + 2 + len(agents)
+    action_dim = max(agent.action_dim for agent in agents)
+    interface = Interface(
+        observation_dim,
+        action_dim,
+        f"a policy that all {len(agents)} agents share",
+        alternatives="a dict from each agent's name to its policy; or for all agents ",
+        hint=f"A policy that a team shares is called for each agent in turn, from its shared "
+        f"observation [B, {observation_dim}] to [B, {action_dim}]; for separate policies pass a "
+        "dict by agent.",
+    )
+    prepared = _prepare(policy, interface, action_range, name)
+    members = tuple(
+        Member(
+            agent.name,
+            prepared,
+            functools.partial(shared_observation_of, index, len(agents), observed),
+            agent.action_dim,
+        )
+        for index, (agent, observed) in enumerate(
+            zip(agents, draw.observed_channels(spec), strict=True)
+        )
+    )
+    return TeamPolicy(prepared.name, prepared.action_range, members)

@@ -10,21 +10,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sme_registry.envs.types import Observation as Observations
-from sme_registry.errors import MissingDependencyError, PolicyError
-from sme_registry.evaluation.policies.interface import Interface
+from sme_registry.envs.types import Observation
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation.policies.policy import Interface
+from sme_registry.io import require_packages
 
 
-def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[Observations], Any]:
-    """Load an ONNX file's network, on one thread of the CPU.
+def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[Observation], Any]:
+    """Load an ONNX file's network, on one thread of the CPU: a function of observations.
 
     Args:
-      path: an .onnx file with one float32 input `[B, O]` and one output `[B, A]`. It runs in this
-        process without limits.
+      path: an .onnx file with one float32 input `[B, O]` and one output `[B, A]`.
       interface: O, A, and what they belong to.
-
-    Returns:
-      Its actions, as a function of observations.
 
     Raises:
       PolicyError: it does not exist, onnxruntime rejects it, or its interface differs.
@@ -33,15 +30,11 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[O
     path = Path(path)
     if not path.is_file():
         raise PolicyError(f"{path} does not exist. Give the path of an .onnx file.")
+    require_packages(f"running {path}", {"onnxruntime": "onnxruntime"}, "onnx")
     # From version 1.31 on its telemetry is on by default; an evaluation must not send any.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    try:
-        import onnxruntime
-    except ImportError:
-        raise MissingDependencyError(
-            f"{path}: running it requires onnxruntime, which is not installed. "
-            "Run `pip install 'sme-registry[onnx]'`."
-        ) from None
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # errors are raised instead
@@ -54,19 +47,14 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[O
             f"{path}: not a network that onnxruntime can load: {error}. Export it again "
             "with an opset from 13 to 23, or pass a callable."
         ) from error
-    for what, ends, width in zip(
-        ("input", "output"),
-        (session.get_inputs(), session.get_outputs()),
-        interface[:2],
-        strict=True,
-    ):
-        actual = ", ".join(f"{end.name} {end.type} {end.shape}" for end in ends)
+    ends = {"input": session.get_inputs(), "output": session.get_outputs()}
+    for (what, tensors), width in zip(ends.items(), interface[:2], strict=True):
+        shape = tensors[0].shape if len(tensors) == 1 else []
         # A length that is not a number is dynamic, and known only when the network runs.
-        fits = len(ends) == 1 and ends[0].type == "tensor(float)" and len(ends[0].shape) == 2
-        if not fits or any(
-            isinstance(length, int) and length != wanted
-            for length, wanted in zip(ends[0].shape, (None, width), strict=True)
-        ):
+        fits = len(shape) == 2 and not isinstance(shape[0], int)
+        fits = fits and (not isinstance(shape[1], int) or shape[1] == width)
+        if not fits or tensors[0].type != "tensor(float)":
+            actual = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in tensors)
             raise PolicyError(
                 f"{path}: its {what}s are {actual or 'none'}: must be one tensor(float) "
                 f"[batch, {width}] for {interface.description}, the batch of any size. Evaluate it "

@@ -1,24 +1,58 @@
-"""`Policy`: one policy as a checked function, from a callable, a model or a file."""
+"""`Policy` and `TeamPolicy`: checked functions from observations to actions of the unit range.
+
+In a team, either each agent has its own policy of what it observes and owns,
+`[B, |O_i| + 2] → [B, a_i]`, or all share one, which is called for each agent in turn with its
+shared observation (`envs.shared`), `[B, S + 2 + n] → [B, max a_i]`. A function of the whole state
+is no team policy: under partial observation no agent could execute it.
+"""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, cast
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sme_registry.envs import arguments
-from sme_registry.envs.types import Observation as Observations
+from sme_registry.envs.types import Array, Observation
 from sme_registry.errors import ActionError, PolicyError
-from sme_registry.evaluation.policies import sb3
-from sme_registry.evaluation.policies.interface import Interface
-from sme_registry.evaluation.policies.npz import OfflinePolicy
-from sme_registry.evaluation.policies.onnx import load_onnx
-from sme_registry.spec import ActionRange
-from sme_registry.task.draw import Array
+from sme_registry.spec import ActionRange, SMESpec
+from sme_registry.task import draw
+
+
+class Interface(NamedTuple):
+    """What a policy must map from and to.
+
+    Attributes:
+      observation_dim: entries of an observation.
+      action_dim: entries of an action.
+      description: what these widths belong to, such as "state_dim=3, action_dim=2".
+      alternatives: other forms that are allowed, for the error message.
+      hint: see `Policy`.
+    """
+
+    observation_dim: int
+    action_dim: int
+    description: str
+    alternatives: str = ""
+    hint: str = ""
+
+    def check(self, policy: str, **shapes: tuple[int, ...] | None) -> None:
+        """Check the shapes of one observation and one action, those that are known.
+
+        Raises:
+          PolicyError: they differ from the task's.
+        """
+        widths = {"observations": self.observation_dim, "actions": self.action_dim}
+        for what, shape in shapes.items():
+            if shape not in (None, (widths[what],)):
+                raise PolicyError(
+                    f"{policy}: its {what} have shape {shape}: must be {(widths[what],)} for "
+                    f"{self.description}. Evaluate it on the task that it was trained or prepared "
+                    "for."
+                )
 
 
 @dataclass(frozen=True)
@@ -35,11 +69,11 @@ class Policy:
 
     name: str
     action_range: ActionRange
-    act: Callable[[Observations], Any]
+    act: Callable[[Observation], Any]
     action_dim: int
     hint: str = ""
 
-    def __call__(self, observations: Observations) -> Array:
+    def __call__(self, observations: Observation) -> Array:
         """Actions `[B, A]`, converted to the unit range but not clipped to it.
 
         Raises:
@@ -67,72 +101,72 @@ class Policy:
             ) from error
 
 
-def prepare(
-    policy: Any, interface: Interface, *, action_range: str | None = None, name: str | None = None
-) -> Policy:
-    """A policy from a callable, a model or the path of a file.
+class Member(NamedTuple):
+    """One agent of a team policy.
 
-    Args:
-      policy: the policy.
-      interface: what it must map from and to.
-      action_range: as in `as_policy`.
-      name: as in `as_policy`.
-
-    Raises:
-      PolicyError: it is none of these, cannot be loaded, or has another interface.
-      MissingDependencyError: the library that loads the file is not installed.
+    Attributes:
+      agent: its name.
+      policy: its own policy, or the one that all agents share.
+      observe: from observations `[B, S + 2]` to the policy's input, a fresh array.
+      action_dim: a_i, how many entries of the policy's action belong to this agent.
     """
-    if isinstance(policy, Policy):
-        if policy.action_dim != interface.action_dim:
+
+    agent: str
+    policy: Policy
+    observe: Callable[[Observation], Observation]
+    action_dim: int
+
+
+@dataclass(frozen=True)
+class TeamPolicy:
+    """A team's policies, ready to be called.
+
+    Attributes:
+      name: what reports call it.
+      action_range: "unit" or "symmetric"; "mixed" if the agents' policies differ.
+      members: the agents, in the order of the channels that they own.
+    """
+
+    name: str
+    action_range: ActionRange | Literal["mixed"]
+    members: tuple[Member, ...]
+
+    def __call__(self, observations: Observation) -> Array:
+        """Joint actions `[B, A]`, converted to the unit range but not clipped to it.
+
+        Args:
+          observations: `[B, S + 2]`: s, t/T and r_cum/k, the same for each agent.
+
+        Raises:
+          PolicyError: an agent's policy fails or returns invalid actions; names the agent.
+        """
+        joint = []
+        for member in self.members:
+            with prefixed_errors(member.agent):
+                a = member.policy(member.observe(observations))
+            joint.append(a[:, : member.action_dim])
+        return np.concatenate(joint, axis=1)
+
+    def check_team(self, spec: SMESpec) -> None:
+        """Check that a task has the agents that this policy was prepared for.
+
+        Raises:
+          PolicyError: it has other agents, or none.
+        """
+        prepared = [(member.agent, member.action_dim) for member in self.members]
+        agents = [] if spec.team is None else draw.agents(spec)
+        if prepared != [(agent.name, agent.action_dim) for agent in agents]:
             raise PolicyError(
-                f"policy {policy.name!r}: its actions have {policy.action_dim} entries: must be "
-                f"{interface.action_dim} for {interface.description}. Prepare it for this task."
+                f"policy {self.name!r}: it acts for the agents "
+                f"{', '.join(f'{agent} ({dim} channels)' for agent, dim in prepared)}, and this "
+                "task has others. Prepare it for this task."
             )
-        return replace(
-            policy,
-            name=name or policy.name,
-            action_range=cast(ActionRange, action_range or policy.action_range),
-        )
-    if isinstance(policy, str | os.PathLike):
-        name = Path(policy).stem if name is None else name
-        policy = _load(Path(policy), interface)
-    if hasattr(policy, "predict"):
-        sb3.check_spaces(policy, interface)
-        act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
-    elif callable(policy):
-        act, action_range = policy, action_range or "unit"
-    else:
-        raise PolicyError(
-            f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
-            f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}], a "
-            "Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, module:function, or "
-            "the name of a reference policy."
-        )
-    return Policy(
-        name or _name_of(policy),
-        cast(ActionRange, action_range),
-        act,
-        interface.action_dim,
-        interface.hint,
-    )
 
 
-def _load(path: Path, interface: Interface) -> Any:
-    if path.suffix == ".onnx":
-        return load_onnx(path, interface)
-    if path.suffix == ".npz":
-        policy = OfflinePolicy.load(path)
-        if (policy.observation_dim, policy.action_dim) != interface[:2]:
-            raise PolicyError(
-                f"{path}: maps observations [B, {policy.observation_dim}] to actions "
-                f"[B, {policy.action_dim}]: must be [B, {interface.observation_dim}] and "
-                f"[B, {interface.action_dim}] for {interface.description}. "
-                "Evaluate it on the task it was trained for."
-            )
-        return policy
-    return sb3.load_sb3(path)
-
-
-def _name_of(policy: Any) -> str:
-    name = getattr(policy, "__name__", type(policy).__name__)
-    return "policy" if name in ("<lambda>", "function") else str(name)
+@contextlib.contextmanager
+def prefixed_errors(agent: str) -> Iterator[None]:
+    """Errors of an agent's policy begin with its name."""
+    try:
+        yield
+    except PolicyError as error:
+        raise PolicyError(f"{agent}: {error}") from error.__cause__

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.envs.types import Observation as Observations
-from sme_registry.errors import MissingDependencyError, PolicyError
-from sme_registry.evaluation.policies.interface import Interface
+from sme_registry.envs.types import Observation
+from sme_registry.errors import PolicyError
+from sme_registry.io import require_packages
+from sme_registry.spec import ActionRange
 
-_LOW = {"unit": 0.0, "symmetric": -1.0}
+_LOW: dict[ActionRange, float] = {"unit": 0.0, "symmetric": -1.0}
 
 # A saved model does not name its algorithm, but its fields identify it: the first match decides.
 _ALGORITHM_MARKS = {
@@ -50,13 +51,10 @@ def load_sb3(path: str | os.PathLike[str]) -> Any:
             f"{path}: a model of an unknown algorithm; known: PPO, SAC, TD3, A2C, DDPG. Load it "
             "yourself and pass the model, or a callable that wraps it."
         )
-    try:
-        import stable_baselines3
-    except ImportError:
-        raise MissingDependencyError(
-            f"{path}: loading it requires Stable-Baselines3, which is not installed. "
-            "Run `pip install 'sme-registry[train]'`."
-        ) from None
+    packages = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
+    require_packages(f"loading {path}", packages, "train")
+    import stable_baselines3
+
     try:
         # Otherwise the replay buffer is allocated at its full size, though acting never uses it.
         return getattr(stable_baselines3, algorithm).load(
@@ -70,13 +68,13 @@ def load_sb3(path: str | os.PathLike[str]) -> Any:
         ) from error
 
 
-def predictor(model: Any) -> Callable[[Observations], Any]:
+def predictor(model: Any) -> Callable[[Observation], Any]:
     """A model's deterministic actions; those of an SB3 model before they are clipped."""
     sb3 = sys.modules.get("stable_baselines3.common.policies")
     network = getattr(model, "policy", model)
     if sb3 is None or not isinstance(network, sb3.BasePolicy):
 
-        def predict(observations: Observations) -> Any:
+        def predict(observations: Observation) -> Any:
             predicted = model.predict(observations, deterministic=True)
             return predicted[0] if isinstance(predicted, tuple) else predicted
 
@@ -84,7 +82,7 @@ def predictor(model: Any) -> Callable[[Observations], Any]:
 
     import torch
 
-    def act(observations: Observations) -> Any:
+    def act(observations: Observation) -> Any:
         was_training = network.training
         network.set_training_mode(False)
         try:
@@ -99,19 +97,12 @@ def predictor(model: Any) -> Callable[[Observations], Any]:
     return act
 
 
-def check_spaces(model: Any, interface: Interface) -> None:
-    """Check that a model has these widths of observations and actions and no normaliser.
+def check_not_normalised(model: Any) -> None:
+    """Check that a model takes observations as they are.
 
     Raises:
-      PolicyError: it does not.
+      PolicyError: it was trained on normalised observations.
     """
-    for what, width in zip(("observation", "action"), interface[:2], strict=True):
-        shape = getattr(getattr(model, f"{what}_space", None), "shape", (width,))
-        if shape != (width,):
-            raise PolicyError(
-                f"policy: its {what}s have shape {shape}: must be {(width,)} for "
-                f"{interface.description}. Evaluate it on the task it was trained for."
-            )
     normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
     if getattr(normaliser, "norm_obs", False):
         raise PolicyError(
@@ -121,7 +112,7 @@ def check_spaces(model: Any, interface: Interface) -> None:
         )
 
 
-def action_range_of(model: Any) -> str:
+def action_range_of(model: Any) -> ActionRange:
     """The action range of a model's action space; "unit" if it has no space.
 
     Raises:
