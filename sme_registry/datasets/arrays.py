@@ -17,11 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.spec import SMESpec
-from sme_registry.task.draw import Array
+from sme_registry.envs.types import Array, Mask, Observation
 
-Observations = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.int64]
 
 
@@ -51,10 +48,10 @@ class Transitions:
       agent_rewards: `[N, n]` float64, R of each agent of a team; None for a single agent.
     """
 
-    observations: Observations
-    actions: Observations
+    observations: Observation
+    actions: npt.NDArray[np.float32]
     rewards: Array
-    next_observations: Observations
+    next_observations: Observation
     terminations: Mask
     timeouts: Mask
     optimal_actions: Array
@@ -132,8 +129,3 @@ def to_d3rlpy(
         name: np.insert(array, stopped + 1, added.get(name, 0.0), axis=0)
         for name, array in arrays.items()
     }
-
-
-def num_agents(spec: SMESpec) -> int:
-    """n, the number of agents of a task; 1 without a team."""
-    return 1 if spec.team is None else len(spec.team.agents)

@@ -15,14 +15,14 @@ called in blocks of one size, so that its network always multiplies matrices of 
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.recipe import Behaviour, DatasetRecipe
+from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
@@ -38,7 +38,7 @@ _BLOCK = 64  # observations in one call of a user's policy
 def noise_task(task: Task, seed: int) -> Task:
     """The task whose optimal policy is ã: of the same shape, drawn from the data's seed."""
     policies = draw.optimal_policies(task.spec.derive(seed=seed), NOISE_STREAM)
-    return dataclasses.replace(task, policies=policies)
+    return replace(task, policies=policies)
 
 
 class OptimalPolicy:
@@ -60,14 +60,7 @@ class EpisodeStream:
     """Uniform numbers of a named stream, a separate part of it for each episode.
 
     Episode e reads from word 4 · 2¹²⁸ e onwards, so its numbers do not depend on its lane or on the
-    other episodes.
-
-    Args:
-      seed: of the data.
-      name: of the stream.
-      lanes: B.
-      width: numbers for each step.
-      ahead: steps whose numbers are read at once.
+    other episodes. Each lane uses `width` numbers a step, and reads those of `ahead` steps at once.
     """
 
     def __init__(self, seed: int, name: str, lanes: int, width: int, ahead: int = _AHEAD) -> None:
@@ -98,98 +91,22 @@ class EpisodeStream:
         return numbers
 
 
-class BehaviourPolicy(Protocol):
-    """A policy that acts in all lanes."""
+@dataclass(frozen=True)
+class BehaviourPolicy:
+    """A policy that acts in all lanes.
+
+    Attributes:
+      act: actions `[B, A]` for states `[B, S]` and joint observations `[B, S + 1 + n]`.
+      stream: the random numbers that it uses; None if it is deterministic.
+    """
+
+    act: Callable[[Array, Observation], Array]
+    stream: EpisodeStream | None = None
 
     def begin(self, lane: int, episode: int) -> None:
         """Begin an episode in a lane."""
-
-    def act(self, s: Array, observation: Observation) -> Array:
-        """Actions `[B, A]` for states `[B, S]` and joint observations `[B, S + 1 + n]`."""
-
-
-class _Mixture:
-    def __init__(self, task: Task, seed: int, nu: float, stream: str, lanes: int) -> None:
-        self._nu = nu
-        self._optimal = OptimalPolicy(task, lanes)
-        self._noise = OptimalPolicy(noise_task(task, seed), lanes) if nu > 0.0 else None
-        self._alpha = EpisodeStream(seed, f"{stream}/alpha", lanes, 1)
-
-    def begin(self, lane: int, episode: int) -> None:
-        self._alpha.begin(lane, episode)
-
-    def act(self, s: Array, observation: Observation) -> Array:
-        optimal = self._optimal(s)
-        if self._noise is None:
-            return optimal
-        alpha = self._nu * self._alpha.next()
-        return (1.0 - alpha) * optimal + alpha * self._noise(s)
-
-
-class _Random:
-    def __init__(self, task: Task, seed: int, stream: str, lanes: int) -> None:
-        self._actions = EpisodeStream(seed, f"{stream}/action", lanes, task.spec.action_dim)
-
-    def begin(self, lane: int, episode: int) -> None:
-        self._actions.begin(lane, episode)
-
-    def act(self, s: Array, observation: Observation) -> Array:
-        return self._actions.next()
-
-
-class ConstantPolicy:
-    """a = ½ in every channel."""
-
-    def __init__(self, task: Task, lanes: int) -> None:
-        self._half = np.full((lanes, task.spec.action_dim), 0.5)
-
-    def begin(self, lane: int, episode: int) -> None:
-        """No effect."""
-
-    def act(self, s: Array, observation: Observation) -> Array:
-        """½ in all entries."""
-        return self._half
-
-
-class UserPolicy:
-    """A user's deterministic policy, clipped as the environment clips it.
-
-    Args:
-      policy: as returned by `as_policy`.
-      state_dim: S.
-    """
-
-    def __init__(self, policy: Policy | TeamPolicy, state_dim: int) -> None:
-        self._policy, self._state_dim = policy, state_dim
-
-    def begin(self, lane: int, episode: int) -> None:
-        """No effect: its actions depend on the observation only."""
-
-    def act(self, s: Array, observation: Observation) -> Array:
-        """Its actions `[B, A]` for joint observations `[B, S + 1 + n]`.
-
-        Raises:
-          PolicyError: the policy fails, or its actions are invalid.
-        """
-        if isinstance(self._policy, Policy):
-            return np.clip(_in_blocks(self._policy, observation), 0.0, 1.0)
-        S = self._state_dim
-        joint = []
-        for agent, member in enumerate(self._policy.members):
-            # s, t/T and this agent's r_cum/k, of which it observes a part.
-            single = observation[:, [*range(S + 1), S + 1 + agent]]
-            acted = _in_blocks(member.policy, member.observe(single))
-            joint.append(acted[:, : member.action_dim])
-        return np.clip(np.concatenate(joint, axis=1), 0.0, 1.0)
-
-
-def _in_blocks(policy: Callable[[Observation], Array], observation: Observation) -> Array:
-    """The policy's actions, in calls of one size; the last row pads the last block."""
-    rows = len(observation)
-    missing = -rows % _BLOCK
-    filled = np.concatenate([observation, np.repeat(observation[-1:], missing, axis=0)])
-    blocks = [policy(filled[first : first + _BLOCK]) for first in range(0, len(filled), _BLOCK)]
-    return np.concatenate(blocks)[:rows]
+        if self.stream is not None:
+            self.stream.begin(lane, episode)
 
 
 def behaviour_policy(
@@ -200,26 +117,64 @@ def behaviour_policy(
     policy: Any = None,
     stream: str = "dataset",
 ) -> BehaviourPolicy:
-    """The policy of one of a recipe's behaviours.
+    """The policy of a recipe's behaviour with this index, in B lanes.
 
     Args:
-      recipe: the recipe.
-      index: of the behaviour.
-      task: the recipe's task.
-      lanes: B.
+      recipe, index, task, lanes: the recipe, the behaviour in it, the recipe's task, and B.
       policy: for a behaviour of kind "policy": anything that `evaluate` accepts.
       stream: prefix of the names of its random streams.
 
     Raises:
       PolicyError, MissingDependencyError: the policy cannot be used.
     """
-    behaviour: Behaviour = recipe.behaviours[index]
-    stream = f"{stream}/{index}"
+    behaviour, name = recipe.behaviours[index], f"{stream}/{index}"
     if behaviour.nu is not None:
-        return _Mixture(task, recipe.seed, behaviour.nu, stream, lanes)
+        return _mixture(task, recipe.seed, behaviour.nu, name, lanes)
     if behaviour.kind == "random":
-        return _Random(task, recipe.seed, stream, lanes)
+        actions = EpisodeStream(recipe.seed, f"{name}/action", lanes, task.spec.action_dim)
+        return BehaviourPolicy(lambda s, observation: actions.next(), actions)
     prepared = as_policy(
         policy, recipe.spec, action_range=behaviour.action_range, name=behaviour.policy
     )
-    return UserPolicy(prepared, recipe.spec.state_dim)
+    return BehaviourPolicy(lambda s, observation: _actions(prepared, observation))
+
+
+def constant_policy(task: Task) -> BehaviourPolicy:
+    """a = ½ in every channel."""
+    return BehaviourPolicy(lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5))
+
+
+def _mixture(task: Task, seed: int, nu: float, name: str, lanes: int) -> BehaviourPolicy:
+    optimal = OptimalPolicy(task, lanes)
+    noise = OptimalPolicy(noise_task(task, seed), lanes) if nu > 0.0 else None
+    stream = EpisodeStream(seed, f"{name}/alpha", lanes, 1)
+
+    def act(s: Array, observation: Observation) -> Array:
+        if noise is None:
+            return optimal(s)
+        alpha = nu * stream.next()
+        return (1.0 - alpha) * optimal(s) + alpha * noise(s)
+
+    return BehaviourPolicy(act, stream)
+
+
+def _actions(policy: Policy | TeamPolicy, observation: Observation) -> Array:
+    """A user's actions `[B, A]` for joint observations, clipped as the environment clips them."""
+    if isinstance(policy, Policy):
+        return np.clip(_in_blocks(policy, observation), 0.0, 1.0)
+    shared = observation.shape[1] - len(policy.members)  # s and t/T; then each agent's r_cum/k
+    joint = []
+    for agent, member in enumerate(policy.members):
+        single = observation[:, [*range(shared), shared + agent]]
+        acted = _in_blocks(member.policy, member.observe(single))
+        joint.append(acted[:, : member.action_dim])
+    return np.clip(np.concatenate(joint, axis=1), 0.0, 1.0)
+
+
+def _in_blocks(policy: Callable[[Observation], Array], observation: Observation) -> Array:
+    """The policy's actions, in calls of one size; the last row pads the last block."""
+    rows = len(observation)
+    missing = -rows % _BLOCK
+    filled = np.concatenate([observation, np.repeat(observation[-1:], missing, axis=0)])
+    blocks = [policy(filled[first : first + _BLOCK]) for first in range(0, len(filled), _BLOCK)]
+    return np.concatenate(blocks)[:rows]

@@ -9,13 +9,14 @@ number of lanes changes the time and not the numbers. A data set is the first N 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.arrays import Transitions, num_agents
+from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import BehaviourPolicy, EpisodeStream, behaviour_policy
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
@@ -57,17 +58,6 @@ class Rows(NamedTuple):
     truncated: npt.NDArray[np.bool_]
 
 
-def default_lanes(recipe: DatasetRecipe, rows: int) -> int:
-    """The number of episodes to run at once: about as many as `rows` need, at most 512."""
-    per_episode = recipe.spec.horizon * _kept_share(recipe)
-    return int(max(1, min(_LANES, -(-rows // max(per_episode, 1e-6)))))
-
-
-def _kept_share(recipe: DatasetRecipe) -> float:
-    """The fraction of uniform states that lies in the recipe's sub-cube."""
-    return float((1.0 + (recipe.coverage or 0.0)) ** recipe.spec.state_dim)
-
-
 def collect(
     recipe: DatasetRecipe,
     task: Task,
@@ -82,7 +72,7 @@ def collect(
       recipe: the recipe.
       task: its materialised task.
       policies: the user's policies, by the index of their behaviour.
-      lanes: episodes at once; None takes `default_lanes`. The numbers do not depend on it.
+      lanes: episodes at once; None takes at most 512. The numbers do not depend on it.
       progress: called after each step with the transitions collected and their total.
 
     Returns:
@@ -94,114 +84,94 @@ def collect(
       PolicyError, MissingDependencyError: a policy cannot be used.
     """
     spec = recipe.spec
-    S, A, n = spec.state_dim, spec.action_dim, num_agents(spec)
+    S, A, n = spec.state_dim, spec.action_dim, len(task.policies)
     refuse_above_limit(
         3 * recipe.transitions * (24 * S + 12 * A + 48 * n + 64),
         f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}",
         "Collect fewer, or several data sets with different seeds.",
     )
+    kept_share = (1.0 + (recipe.coverage or 0.0)) ** S  # of uniform states
     done = 0
     parts = []
     for index, share in enumerate(recipe.shares):
-        num_lanes = lanes or default_lanes(recipe, share)
+        expected = share / kept_share
+        if expected > _MAX_STEPS and recipe.coverage:
+            raise _too_small(recipe, f"{share:,} transitions need about {expected:.1g} steps")
+        num_lanes = lanes or min(_LANES, math.ceil(expected / spec.horizon))
         policy = behaviour_policy(recipe, index, task, num_lanes, (policies or {}).get(index))
 
         def report(count: int, before: int = done) -> None:
             if progress is not None:
                 progress(before + count, recipe.transitions)
 
-        rows = rollout(
-            task,
-            policy,
-            EpisodeStream(recipe.seed, f"dataset/{index}/start", num_lanes, S, ahead=1),
-            num_lanes,
-            rows=share,
-            coverage=recipe.coverage,
-            progress=report,
-        )
-        parts.append(rows)
+        starts = EpisodeStream(recipe.seed, f"dataset/{index}/start", num_lanes, S, ahead=1)
+        steps = play(task, policy, starts, num_lanes)
+        parts.append(_first_rows(steps, recipe, share, max(10**6, 20 * expected), report))
         done += share
     return _concatenate(parts, spec.team is not None)
 
 
-def rollout(
-    task: Task,
-    policy: BehaviourPolicy,
-    starts: EpisodeStream,
-    lanes: int,
-    *,
-    rows: int,
-    coverage: float | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> Rows:
-    """The first `rows` transitions of episodes 0, 1, 2, … whose states are in the sub-cube.
+def play(task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int) -> Iterator[Rows]:
+    """Play episodes 0, 1, 2, … without end, each in the first lane that is free.
 
-    Args:
-      task: the task.
-      policy: the policy that acts.
-      starts: the first numbers of each episode are its initial state.
-      lanes: B, episodes at once.
-      rows: transitions to keep.
-      coverage: ε of the sub-cube; None keeps all.
-      progress: called after each step with the rows collected.
+    The first numbers of an episode in `starts` are its initial state.
+
+    Yields:
+      A step of all lanes; the arrays are valid until the next one.
 
     Raises:
-      OptionError: the sub-cube is too small.
       PolicyError: the policy fails.
     """
-    expected = rows / (1.0 + (coverage or 0.0)) ** task.spec.state_dim
-    if expected > _MAX_STEPS and expected > rows:
-        raise _too_small(coverage, f"{rows:,} transitions need about {expected:.1g} steps")
-    patience = max(10**6, 20 * expected)
-
     batch = Batch(task, lanes)
-    every = np.arange(lanes)
-    episode = np.zeros(lanes, np.int64)
-    t = np.zeros(lanes, np.int64)
+    episode, t = np.zeros((2, lanes), np.int64)
     observation = batch.observe()
-    collected, numbers = _Collected(rows), itertools.count()
-
-    def begin(ended: npt.NDArray[np.int64]) -> None:
+    numbers, ended = itertools.count(), np.arange(lanes)
+    while True:
         for lane in ended.tolist():
             number = episode[lane] = next(numbers)
             starts.begin(lane, number)
             policy.begin(lane, number)
         t[ended] = 0
         batch.begin(ended, observation, starts.next(ended))
-
-    begin(every)
-    s = batch.state
-    steps = 0
-    while not collected.complete(int(episode.min())):
+        s = batch.state
         # The environment executes exactly what the data set stores: float32 in the unit range.
         action = np.clip(policy.act(s, observation), 0.0, 1.0).astype(np.float32)
         step = batch.advance(action.astype(np.float64))
-        next_s = batch.state
-        inside = every if coverage is None else np.flatnonzero(expansion(s) <= coverage)
-        columns = (
-            episode, t, s, next_s, observation, step.observation, action, step.optimal,
+        yield Rows(
+            episode, t, s, batch.state, observation, step.observation, action, step.optimal,
             step.values[:4].transpose(2, 0, 1), step.terminated, step.truncated,
         )  # fmt: skip
-        collected.add(Rows._make(column[inside] for column in columns))
         t += 1
-        steps += lanes
         observation = step.observation
         ended = np.flatnonzero(step.terminated | step.truncated)
-        if len(ended):
-            begin(ended)
-            s = batch.state
-        else:
-            s = next_s
-        if progress is not None:
-            progress(min(rows, collected.count))
-        if steps > patience and collected.count < rows:
-            raise _too_small(coverage, f"{steps:,} steps gave {collected.count:,} transitions")
+
+
+def _first_rows(
+    steps: Iterator[Rows],
+    recipe: DatasetRecipe,
+    rows: int,
+    patience: float,
+    progress: Callable[[int], None],
+) -> Rows:
+    """The first `rows` transitions by episode and step whose states are in the sub-cube."""
+    collected, taken, coverage = _Collected(rows), 0, recipe.coverage
+    for step in steps:
+        lanes = len(step.t)
+        kept = np.ones(lanes, bool) if coverage is None else expansion(step.state) <= coverage
+        collected.add(Rows._make(column[kept] for column in step))
+        taken += lanes
+        progress(min(rows, collected.count))
+        running = step.episode[~(step.terminated | step.truncated)]
+        if collected.complete(int(running.min(initial=step.episode.max() + 1))):
+            break
+        if taken > patience and collected.count < rows:
+            raise _too_small(recipe, f"{taken:,} steps gave {collected.count:,} transitions")
     return collected.rows()
 
 
-def _too_small(coverage: float | None, reason: str) -> OptionError:
+def _too_small(recipe: DatasetRecipe, reason: str) -> OptionError:
     return OptionError(
-        f"coverage={coverage}: {reason}: must be closer to 0 for this state_dim (it keeps a "
+        f"coverage={recipe.coverage}: {reason}: must be closer to 0 for this state_dim (it keeps a "
         "fraction (1 + ε)^S of uniform states). Give a larger value, or fewer transitions."
     )
 

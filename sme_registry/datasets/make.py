@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from typing import Any
 
 from sme_registry.datasets.collect import ReportProgress, collect
 from sme_registry.datasets.minari_format import require_minari
-from sme_registry.datasets.recipe import Behaviour, DatasetRecipe, parse_behaviour
+from sme_registry.datasets.recipe import DatasetRecipe, parse_behaviour
 from sme_registry.datasets.record import DatasetRecord, Seeds
 from sme_registry.datasets.scores import reference_scores
 from sme_registry.datasets.storage import (
@@ -95,11 +96,7 @@ def make_dataset(
         },
         "data set",
     )
-    policies = {
-        index: policy
-        for index, (policy, _) in enumerate(pairs)
-        if behaviours[index].kind == "policy"
-    }
+    policies = dict(enumerate(policy for policy, _ in pairs))
     dataset_id = check_id(default_id(recipe) if name is None else name)
     root = datasets_folder(folder)
     check_target(root / dataset_id, root, recipe, force)  # before the work, too
@@ -124,20 +121,17 @@ def make_dataset(
 def default_id(recipe: DatasetRecipe) -> str:
     """`sme/Default-v1-nu50-side80-seed7-v0`: task, behaviour, the sub-cube's side, data seed."""
     title = catalogue.title(recipe.spec).rpartition("/")[2]
+    behaviour = recipe.behaviours[0]
     if len(recipe.behaviours) > 1:
-        behaviour = f"mix-{recipe.digest.removeprefix('sha256:')[:8]}"
+        acting = f"mix-{recipe.digest.removeprefix('sha256:')[:8]}"
+    elif behaviour.nu is not None:
+        acting = f"nu{_hundredths(behaviour.nu)}"
+    elif behaviour.kind == "random":
+        acting = "random"
     else:
-        behaviour = _id_part(recipe.behaviours[0])
+        acting = "policy-" + re.sub("[^A-Za-z0-9]", "_", behaviour.label)
     side = "" if not recipe.coverage else f"-side{_hundredths(1.0 + recipe.coverage)}"
-    return f"{NAMESPACE}/{title}-{behaviour}{side}-seed{recipe.seed}-v0"
-
-
-def _id_part(behaviour: Behaviour) -> str:
-    if behaviour.nu is not None:
-        return f"nu{_hundredths(behaviour.nu)}"
-    if behaviour.kind == "random":
-        return "random"
-    return "policy-" + "".join(c if c.isascii() and c.isalnum() else "_" for c in behaviour.label)
+    return f"{NAMESPACE}/{title}-{acting}{side}-seed{recipe.seed}-v0"
 
 
 def _hundredths(value: float) -> str:

@@ -17,10 +17,11 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.arrays import Transitions, num_agents
+from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.record import KEY, DatasetRecord
 from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
+from sme_registry.task.draw import agents
 
 DATA, METADATA, NAMESPACE_METADATA = "main_data.hdf5", "metadata.json", "namespace_metadata.json"
 _INFOS = {
@@ -33,34 +34,16 @@ _INFOS = {
 
 
 def require_minari() -> None:
-    """Check that Minari and h5py are installed; imports neither.
-
-    Raises:
-      MissingDependencyError: names the extra to install.
-    """
+    """Raise MissingDependencyError if Minari or h5py is not installed; imports neither."""
     require_packages("data sets", {"minari": "Minari", "h5py": "h5py"}, "offline")
 
 
 def minari_dataset(data_folder: Path) -> Any:
-    """The `minari.MinariDataset` of a folder.
-
-    Raises:
-      MissingDependencyError: Minari is not installed.
-    """
+    """The `minari.MinariDataset` of a folder; see `require_minari`."""
     require_minari()
     import minari
 
     return minari.MinariDataset(data_folder)
-
-
-def spaces(record: DatasetRecord) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """The observation and the action space of a data set; the joint ones of a team."""
-    spec = record.recipe.spec
-    width = spec.state_dim + 1 + num_agents(spec)
-    return (
-        gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32),
-        gymnasium.spaces.Box(0.0, 1.0, (spec.action_dim,), np.float32),
-    )
 
 
 def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> dict[str, Any]:
@@ -69,7 +52,11 @@ def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> 
     from minari.serialization import serialize_space
 
     recipe, scores = record.recipe, record.scores
-    observation_space, action_space = spaces(record)
+    observation_dim = recipe.spec.state_dim + 1 + len(agents(recipe.spec))
+    observation_space, action_space = (
+        gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
+        for width in (observation_dim, recipe.spec.action_dim)
+    )
     metadata: dict[str, Any] = {
         "total_episodes": record.trajectories,
         "total_steps": recipe.transitions,

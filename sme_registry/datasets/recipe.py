@@ -176,35 +176,28 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
       SpecError: ν or the weight is outside its range.
       PolicyError: the file does not exist.
     """
-    number = plain_number(policy)
-    fields: dict[str, Any] = {"weight": weight}
-    if isinstance(number, int | float) and not isinstance(number, bool):
-        fields |= {"kind": "mixture", "nu": float(number)}
+    fields: dict[str, Any]
+    if type(number := plain_number(policy)) in (int, float):
+        fields = {"kind": "mixture", "nu": float(number)}
     elif isinstance(policy, str) and policy == "random":
-        fields |= {"kind": "random"}
+        fields = {"kind": "random"}
     elif isinstance(policy, str | os.PathLike):
         path = Path(policy)
-        fields |= {"kind": "policy", "policy": path.stem, "sha256": sha256_of(path)}
+        fields = {"policy": path.stem, "sha256": sha256_of(path), "action_range": action_range}
     elif callable(policy) or hasattr(policy, "predict"):
         name = getattr(policy, "__name__", type(policy).__name__)
         name = "policy" if name == "<lambda>" else name
-        fields |= {"kind": "policy", "policy": name}
+        fields = {"policy": name, "action_range": action_range}
     else:
         raise SpecError(
             f"behaviour={short_repr(policy)}: must be ν in [0, 1], 'random', a callable, a "
             "Stable-Baselines3 model, or the path of a .zip or .onnx file."
         )
-    if fields["kind"] == "policy":
-        fields["action_range"] = action_range
-    return Behaviour.from_dict(fields, "behaviour")
+    return Behaviour.from_dict({"kind": "policy", "weight": weight, **fields}, "behaviour")
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 digest of a policy's file.
-
-    Raises:
-      PolicyError: the file cannot be read.
-    """
+    """The SHA-256 digest of a policy's file; raises PolicyError if it cannot be read."""
     try:
         with path.open("rb") as stream:
             return "sha256:" + hashlib.file_digest(stream, "sha256").hexdigest()

@@ -50,11 +50,7 @@ class DatasetRecord(StrictModel):
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:
-        """Validate a record and the digests of its documents.
-
-        Args:
-          data: plain data.
-          source: what to call it in an error, such as its path.
+        """Validate plain data, and the digests of its documents; errors call it `source`.
 
         Raises:
           SpecError: a field is invalid, or the schema version is not 1.

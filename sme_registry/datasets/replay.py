@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.datasets.arrays import Transitions, num_agents
+from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.errors import FingerprintMismatchError
 from sme_registry.evaluation.regions import expansion
@@ -24,17 +24,12 @@ _BLOCK = 4096
 
 
 def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
-    """Check a data set against its task.
-
-    Args:
-      transitions: the data set.
-      recipe: its recipe.
-      task: the recipe's task, materialised on this machine.
+    """Check a data set against its recipe's task, as materialised on this machine.
 
     Raises:
       FingerprintMismatchError: names the first array and row that differ from the task's.
     """
-    spec, n = recipe.spec, num_agents(recipe.spec)
+    spec, n = recipe.spec, len(task.policies)
     S, T, N = spec.state_dim, spec.horizon, len(transitions)
     a = transitions.actions.astype(np.float64)
     optimal = np.concatenate(
@@ -107,11 +102,7 @@ def _same(
     expected: npt.NDArray[Any],
     tolerance: float | Array = 0.0,
 ) -> None:
-    """Check that an array has the expected values.
-
-    Raises:
-      FingerprintMismatchError: names the first row that differs, and by how much.
-    """
+    """Raise with the first row that differs from the expected values, and by how much."""
     difference = np.abs(values.astype(np.float64) - expected.astype(np.float64))
     wrong = ~(difference <= tolerance)
     if wrong.any():

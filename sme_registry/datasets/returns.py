@@ -128,19 +128,18 @@ def exact_return(
     task = load_task(spec)
     if task.spec.team is not None:
         raise SpecError("team: must be null here. Give a single-agent task.")
-    gamma = _unit_number("gamma", gamma)
+    if type(plain_number(gamma)) not in (int, float) or not 0.0 <= gamma <= 1.0:
+        raise OptionError(f"gamma={gamma!r:.60}: must be a number in [0, 1].")
+    gamma = float(gamma)
     rollouts = integer_in("rollouts", rollouts, 1, 10**6)
     checked_policy = as_policy(policy, task.spec, action_range=action_range)
     states, t, r_cum = _starts(task.spec, states, t, r_cum)
-    first_actions = (
-        None if actions is None else _actions(actions, len(states), task.spec.action_dim)
-    )
+    if actions is not None:
+        actions = _first_actions(actions, len(states), task.spec.action_dim)
     if rollouts == 1:
         _check_deterministic(checked_policy, task, states, t, r_cum)
     results = [
-        run_rollouts(
-            checked_policy, task, states, t=t, r_cum=r_cum, actions=first_actions, gamma=gamma
-        )
+        run_rollouts(checked_policy, task, states, t=t, r_cum=r_cum, actions=actions, gamma=gamma)
         for _ in range(rollouts)
     ]
     lengths = np.stack([each.length for each in results])
@@ -201,7 +200,7 @@ def _starts(
     return s, steps.astype(np.int64), accumulated
 
 
-def _actions(actions: npt.ArrayLike, rows: int, action_dim: int) -> Array:
+def _first_actions(actions: npt.ArrayLike, rows: int, action_dim: int) -> Array:
     try:
         array = np.asarray(actions, dtype=np.float64)
     except (TypeError, ValueError):
@@ -215,22 +214,14 @@ def _actions(actions: npt.ArrayLike, rows: int, action_dim: int) -> Array:
 
 def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
     try:
-        column = np.asarray(value, dtype=np.float64)
+        column = np.broadcast_to(np.asarray(value, np.float64), (rows,))
     except (TypeError, ValueError):
-        raise StateError(f"{name}={value!r:.60}: must be a number or an array of them.") from None
-    if column.shape not in ((), (rows,)):
-        raise StateError(f"{name} of shape {column.shape}: must be ({rows},), or one number.")
+        raise StateError(
+            f"{name}={value!r:.60}: must be one number, or an array of shape ({rows},)."
+        ) from None
     if not np.isfinite(column).all():
         raise StateError(f"{name}: contains NaN or infinity. Give finite numbers.")
-    return np.broadcast_to(column, (rows,)).copy()
-
-
-def _unit_number(name: str, value: Any) -> float:
-    number = plain_number(value)
-    valid = isinstance(number, int | float) and not isinstance(number, bool) and 0 <= number <= 1
-    if not valid:
-        raise OptionError(f"{name}={value!r:.60}: must be a number in [0, 1].")
-    return float(number)
+    return column.copy()
 
 
 def _check_deterministic(

@@ -17,12 +17,12 @@ from sme_registry.compiled.values import REWARD, SIMILARITY
 from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import (
     BehaviourPolicy,
-    ConstantPolicy,
     EpisodeStream,
     behaviour_policy,
+    constant_policy,
 )
+from sme_registry.datasets.collect import play
 from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.envs.batch import Batch
 from sme_registry.spec import Integer, Real, StrictModel
 from sme_registry.task import Task
 from sme_registry.task.draw import Array
@@ -84,24 +84,16 @@ def reference_scores(
     transitions: Transitions,
     policies: dict[int, object] | None = None,
 ) -> ReferenceScores:
-    """The scores of the data set's behaviour, of a = ½ and of π*.
-
-    Args:
-      recipe: of the data set.
-      task: its task.
-      transitions: the data set.
-      policies: the user's policies, by the index of their behaviour.
-    """
+    """The scores of the data set's behaviour, of a = ½ and of π*; `policies` as in `collect`."""
     T = recipe.spec.horizon
     episodes = min(EPISODES, _MAX_STEPS // T)
 
     def rollouts(policy: BehaviourPolicy, index: int) -> Rollouts | None:
         if episodes == 0:
             return None
-        starts = EpisodeStream(
-            recipe.seed, f"dataset/reference/{index}/start", episodes, task.spec.state_dim, ahead=1
-        )
-        return _rollouts(*play(task, policy, starts, episodes))
+        stream = f"dataset/reference/{index}/start"
+        starts = EpisodeStream(recipe.seed, stream, episodes, recipe.spec.state_dim, ahead=1)
+        return _rollouts(*whole_episodes(task, policy, starts, episodes))
 
     behaviours = []
     for index in range(len(recipe.behaviours)):
@@ -110,25 +102,17 @@ def reference_scores(
             recipe, index, task, max(1, episodes), (policies or {}).get(index), "dataset/reference"
         )
         behaviours.append(
-            PolicyScore(
-                similarity=_mean(transitions.similarities[rows]),
-                step_reward=_mean(transitions.step_rewards[rows]),
-                rollouts=rollouts(policy, index),
+            _score(
+                transitions.similarities[rows],
+                transitions.step_rewards[rows],
+                rollouts(policy, index),
             )
         )
-    similarity, step_reward = _constant_similarity_and_reward(task, transitions)
     weights = [behaviour.weight for behaviour in recipe.behaviours]
+    weighted = _weighted(weights, [score.rollouts for score in behaviours])
     return ReferenceScores(
-        constant=PolicyScore(
-            similarity=similarity,
-            step_reward=step_reward,
-            rollouts=rollouts(ConstantPolicy(task, max(1, episodes)), 0),
-        ),
-        behaviour=PolicyScore(
-            similarity=_mean(transitions.similarities),
-            step_reward=_mean(transitions.step_rewards),
-            rollouts=_weighted(weights, [score.rollouts for score in behaviours]),
-        ),
+        constant=_score(*_constant_values(task, transitions), rollouts(constant_policy(task), 0)),
+        behaviour=_score(transitions.similarities, transitions.step_rewards, weighted),
         behaviours=tuple(behaviours),
         optimum=PolicyScore(
             similarity=1.0,
@@ -138,59 +122,48 @@ def reference_scores(
     )
 
 
-def _constant_similarity_and_reward(task: Task, transitions: Transitions) -> tuple[float, float]:
-    """Mean r̃ and r of a = ½ on the data set's states."""
+def _score(similarity: Array, step_reward: Array, rollouts: Rollouts | None) -> PolicyScore:
+    means = {"similarity": similarity.mean(), "step_reward": step_reward.mean()}
+    return PolicyScore(**means, rollouts=rollouts)
+
+
+def _constant_values(task: Task, transitions: Transitions) -> tuple[Array, Array]:
+    """r̃ and r of a = ½ on the data set's states."""
     optimal = transitions.optimal_actions
     similarity = task.similarities_of(np.full_like(optimal, 0.5), optimal)
     rewarded = similarity
     if task.pays_the_team:  # the mean over all channels, of which agents own unequal numbers
         channels = np.array([owned.stop - owned.start for owned in task.owned])
         rewarded = (similarity @ channels) / task.spec.action_dim
-    return _mean(similarity), _mean(task.reward_of(rewarded))
+    return similarity, task.reward_of(rewarded)
 
 
-def play(
-    task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int
+def whole_episodes(
+    task: Task, policy: BehaviourPolicy, starts: EpisodeStream, count: int
 ) -> tuple[Array, Array, Array]:
-    """Play one whole episode in each lane.
-
-    Args:
-      task: the task.
-      policy: the policy that acts.
-      starts: the first numbers of each episode are its initial state.
-      lanes: B, the number of episodes.
+    """Play the first `count` episodes of `collect.play`, all at once.
 
     Returns:
-      `[B]` each: return, sum of r̃, and number of steps; for a team the means over its agents.
+      `[count]` each: return, sum of r̃, and number of steps; for a team the means over its agents.
     """
-    batch, every = Batch(task, lanes), np.arange(lanes)
-    for lane in every.tolist():
-        starts.begin(lane, lane)
-        policy.begin(lane, lane)
-    observation = batch.observe()
-    batch.begin(every, observation, starts.next())
-    running = np.ones(lanes, bool)
-    sums = np.zeros((3, lanes))
-    while running.any():
-        action = np.clip(policy.act(batch.state, observation), 0.0, 1.0).astype(np.float32)
-        step = batch.advance(action.astype(np.float64))
-        similarity = step.values[SIMILARITY].mean(axis=0)
-        reward = step.values[REWARD].mean(axis=0)
-        sums += running * np.stack([reward, similarity, np.ones(lanes)])
+    running, sums = np.ones(count, bool), np.zeros((3, count))
+    for step in play(task, policy, starts, count):
+        similarity, reward = (step.values[:, row].mean(axis=1) for row in (SIMILARITY, REWARD))
+        sums += running * np.stack([reward, similarity, np.ones(count)])
         running &= ~(step.terminated | step.truncated)
-        observation = step.observation
+        if not running.any():
+            break
     returns, similarities, steps = sums
     return returns, similarities, steps
 
 
 def _rollouts(returns: Array, similarities: Array, steps: Array) -> Rollouts:
     count = len(returns)
-    error = float(returns.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
     return Rollouts(
         episodes=count,
-        mean_return=_mean(returns),
-        standard_error=error,
-        similarity=min(1.0, float(similarities.sum() / steps.sum())),
+        mean_return=returns.mean(),
+        standard_error=returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0,
+        similarity=min(1.0, similarities.sum() / steps.sum()),
     )
 
 
@@ -208,7 +181,3 @@ def _weighted(weights: list[float], scores: list[Rollouts | None]) -> Rollouts |
         standard_error=math.sqrt(math.fsum((w * s.standard_error) ** 2 for w, s in pairs)),
         similarity=min(1.0, math.fsum(w * score.similarity for w, score in pairs)),
     )
-
-
-def _mean(values: Array) -> float:
-    return float(np.mean(values))

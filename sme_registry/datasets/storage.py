@@ -41,7 +41,7 @@ from sme_registry.errors import (
 from sme_registry.io import build_folder, read_json, to_json, write_atomically
 
 NAMESPACE = "sme"
-_ID = re.compile(r"(?P<namespace>(?:[A-Za-z0-9_-]+/)*)(?P<name>[A-Za-z0-9_-]+)-v(?P<v>[0-9]+)")
+_ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 
 
 @dataclass(frozen=True)
@@ -105,23 +105,16 @@ class Dataset:
 
 def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
     """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets."""
-    if folder is not None:
-        return Path(folder)
-    configured = os.environ.get("MINARI_DATASETS_PATH")
-    return Path(configured) if configured is not None else Path.home() / ".minari" / "datasets"
+    default = os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari" / "datasets")
+    return Path(default if folder is None else folder)
 
 
 def check_id(dataset_id: str) -> str:
-    """Check that Minari accepts an id; it must be ASCII and have a version.
-
-    Raises:
-      OptionError: the id is invalid.
-    """
-    match = _ID.fullmatch(dataset_id)
-    namespace = match["namespace"] if match else ""
+    """Raise OptionError if Minari does not accept an id; it must be ASCII and have a version."""
+    *namespace, _ = dataset_id.split("/")
     # Minari's own pattern requires two characters; `data` is the folder inside a data set.
-    short = bool(namespace) and len(namespace) < 3
-    if match is None or "data" in namespace.split("/") or short:
+    short = len("/".join(namespace)) == 1
+    if not _ID.fullmatch(dataset_id) or "data" in namespace or short:
         raise OptionError(
             f"name={dataset_id!r}: must be [namespace/]name-v<number> of letters, digits, '_' and "
             "'-' (a namespace of two characters or more, and not 'data'), as in 'sme/mine-v0'."
@@ -130,13 +123,7 @@ def check_id(dataset_id: str) -> str:
 
 
 def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool) -> None:
-    """Check that a data set may be written to a path.
-
-    Args:
-      target: its folder.
-      folder: the root of all data sets.
-      recipe: of the new data set; the error compares it with an existing one's.
-      force: whether an existing data set of this package may be replaced.
+    """Check that a data set may be written to a path in the root of all data sets.
 
     Raises:
       NameTakenError: the target exists, and `force` is false or it is not a data set of this
@@ -190,23 +177,13 @@ def write_dataset(
     *,
     force: bool = False,
 ) -> Dataset:
-    """Write a data set completely or not at all.
-
-    Args:
-      dataset_id: Minari's id.
-      record: its metadata.
-      transitions: its arrays.
-      folder: the root of all data sets.
-      force: whether an existing data set of this package is replaced; it remains in place until
-        the new one is complete.
+    """Write a data set completely or not at all; with `force` an old one remains until then.
 
     Raises:
-      OptionError: the id is invalid, or the folder cannot be written to.
+      OptionError: the folder cannot be written to.
       NameTakenError: see `check_target`.
-      MissingDependencyError: Minari or h5py is not installed.
     """
-    require_minari()
-    target = folder / check_id(dataset_id)
+    target = folder / dataset_id
     check_target(target, folder, record.recipe, force)
     content = to_hdf5(transitions, record)
     metadata = minari_metadata(dataset_id, record, len(content))
@@ -288,12 +265,8 @@ def _dataset(path: Path, metadata: dict[str, Any]) -> Dataset:
 def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = None) -> None:
     """Check that the path of a data set agrees with its id.
 
-    Inside the root, the path relative to it must equal the id, as in Minari; elsewhere the path
-    must end with the id.
-
-    Args:
-      dataset: the data set.
-      folder: the root of all data sets; None for Minari's folder.
+    Inside the root of all data sets (None for Minari's folder), the path relative to it must equal
+    the id, as in Minari; elsewhere the path must end with the id.
 
     Raises:
       SpecError: they differ, so the id would open another data set or none.
@@ -313,13 +286,11 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
 def list_datasets(
     folder: str | os.PathLike[str] | None = None,
 ) -> tuple[list[Dataset], dict[Path, str]]:
-    """All data sets of this package in a folder, and those that are broken or misplaced.
-
-    Args:
-      folder: the root of all data sets; None for Minari's folder.
+    """All data sets of this package in a root (None for Minari's folder), and the invalid ones.
 
     Returns:
-      The valid data sets in order of their ids, and the error of each other one by its path.
+      The valid data sets in order of their ids, and by its path the error of each broken or
+      misplaced one.
     """
     root = datasets_folder(folder)
     datasets: list[Dataset] = []
@@ -336,16 +307,11 @@ def list_datasets(
     return datasets, errors
 
 
-def _folders(root: Path, namespace: str = "") -> Iterator[tuple[str, Path]]:
+def _folders(root: Path) -> Iterator[tuple[str, Path]]:
     """`(id, folder)` of everything that Minari considers a data set, in order."""
-    path = root / namespace
-    try:
-        children = sorted(child.name for child in path.iterdir() if child.is_dir())
-    except OSError:
-        return
-    if "data" in children and namespace:
-        yield namespace, path
-        return
-    for child in children:
-        if not child.startswith("."):
-            yield from _folders(root, f"{namespace}/{child}" if namespace else child)
+    for folder, children, _ in os.walk(root, followlinks=True):
+        path = Path(folder)
+        if "data" in children and path != root:
+            yield path.relative_to(root).as_posix(), path
+            children.clear()
+        children[:] = sorted(child for child in children if not child.startswith("."))

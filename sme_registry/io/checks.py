@@ -21,10 +21,8 @@ def integer_in(
     """Check an integer argument. NumPy's integers count, booleans and floats do not.
 
     Args:
-      name: of the argument, as the message calls it.
-      value: what was given.
-      low: the smallest allowed value.
-      high: the largest allowed value; None if there is no limit.
+      name, value: of the argument, as the message shows them.
+      low, high: the smallest and the largest allowed value; None if there is no limit.
       advice: a sentence that the message ends with, such as "Leave it out for 0."
       error: the type of error to raise.
 
@@ -45,25 +43,12 @@ def integer_in(
 
 
 def choice(
-    name: str,
-    value: Any,
-    allowed: Collection[str],
-    *,
-    error: type[SMEError] = OptionError,
+    name: str, value: Any, allowed: Collection[str], *, error: type[SMEError] = OptionError
 ) -> str:
-    """Check an argument that must be one of a few names, such as "unit" or "symmetric".
-
-    Args:
-      name: of the argument, as the message calls it.
-      value: what was given.
-      allowed: the names, in the order in which the message lists them.
-      error: the type of error to raise.
-
-    Returns:
-      The value.
+    """Check that an argument is one of a few allowed names, and return it.
 
     Raises:
-      SMEError: of that type: none of them; says which is near.
+      SMEError: of type `error`: it is none of them; lists them, and suggests a similar one.
     """
     if isinstance(value, str) and value in allowed:
         return value

@@ -54,14 +54,9 @@ def atomic_file(path: Path, *, new: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
-    """Write a file completely or not at all; its folder is created if it is missing.
+    """Write text as UTF-8, or bytes, completely or not at all; returns the path.
 
-    Args:
-      path: the target; an existing file is replaced.
-      content: text (written as UTF-8) or bytes.
-
-    Returns:
-      The path written.
+    The folder is created if it is missing.
 
     Raises:
       OptionError: the folder cannot be created or written to; an existing file is unchanged.
@@ -78,14 +73,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
 
 
 def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Check that a file or folder does not exist yet, or may be replaced.
-
-    Args:
-      path: what a command is about to write.
-      force: whether an existing one may be replaced.
-
-    Returns:
-      The path.
+    """Return a path that a command is about to write.
 
     Raises:
       OptionError: it exists and `force` is false.
@@ -107,16 +95,12 @@ def claim_folder(
 
     Args:
       folder: the folder.
-      files: names of the files and folders that the caller writes there. A folder that holds
-        anything else is refused, even with `force`.
-      force: whether these may be replaced.
-
-    Returns:
-      The folder, which exists.
+      files: names of the files and folders that the caller writes there.
+      force: whether these may be replaced; other files are refused even then.
 
     Raises:
-      OptionError: it is a file, holds other files, holds `files` and `force` is false, or cannot
-        be created.
+      OptionError: the folder is a file, holds other files, holds `files` and `force` is false, or
+        cannot be created.
     """
     folder = Path(folder)
     if os.path.lexists(folder) and not folder.is_dir():

@@ -13,14 +13,7 @@ MAX_DOCUMENT_BYTES = 64 * 2**20
 
 
 def parse_json(text: str | bytes, source: str = "document") -> Any:
-    """Parse strict JSON: UTF-8, no NaN or infinity, no duplicate keys.
-
-    Args:
-      text: the JSON text.
-      source: what an error message calls it, such as its path.
-
-    Returns:
-      The parsed value.
+    """Parse strict JSON text; error messages call it `source`, such as its path.
 
     Raises:
       MalformedDocumentError: it is not strict JSON; with line and column if they are known.

@@ -39,15 +39,11 @@ def is_installed(package: str) -> bool:
 
 
 def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> None:
-    """Check that optional packages are installed; imports none of them.
-
-    Args:
-      purpose: what needs them, which the message begins with.
-      packages: their full names by the name to import.
-      extra: of this package, which installs them.
+    """Check that optional packages, full names by the name to import, are installed.
 
     Raises:
-      MissingDependencyError: names the missing packages and the command that installs them.
+      MissingDependencyError: names the purpose, the missing packages, and the command that installs
+        them, with this extra of our package.
     """
     missing = [name for package, name in packages.items() if not is_installed(package)]
     if missing:
@@ -59,15 +55,13 @@ def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> N
 
 
 def import_object(name: str, field: str, error: type[SMEError]) -> Any:
-    """Import an object by name. The working directory is searched first.
+    """Import an object by the name `module:attribute`. The working directory is searched first.
 
-    Args:
-      name: `module:attribute`. Importing a module runs its code.
-      field: the argument that holds the name, for error messages.
-      error: the type of error to raise.
+    Importing a module runs its code.
 
     Raises:
-      SMEError: of that type: the module or attribute does not exist, or importing it fails.
+      SMEError: of type `error`: the module or attribute does not exist, or importing it fails;
+        names the field that holds the name.
     """
     module_name, _, attribute = name.partition(":")
     folder, near = os.getcwd(), ""

@@ -11,40 +11,19 @@ import torch
 from torch import Tensor, nn
 
 from sme_registry.offline.hyperparameters import BCHyperparameters
-from sme_registry.offline.networks import Batch, mlp
+from sme_registry.offline.networks import Batch, Learner, mlp
 
 
-class BC:
-    """A policy and its optimiser.
-
-    Args:
-      observation_dim: O.
-      action_dim: A.
-      hyperparameters: see `BCHyperparameters`.
-    """
+class BC(Learner):
+    """A policy from observations `[B, O]` to actions `[B, A]`, and its optimiser."""
 
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: BCHyperparameters
     ) -> None:
-        self._actor = mlp(observation_dim, hyperparameters.hidden, action_dim)
-        self._adam = torch.optim.Adam(
-            self._actor.parameters(), lr=hyperparameters.learning_rate, fused=True
-        )
-
-    @property
-    def actor(self) -> nn.Sequential:
-        """The network from observations to the argument of tanh, whose value is the policy's u."""
-        return self._actor
+        self.actor = mlp(observation_dim, hyperparameters.hidden, action_dim)
+        self._optimise(self.actor.parameters(), hyperparameters.learning_rate)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """The loss, `actor`: mean squared error in u, four times that in a."""
-        u = torch.tanh(self._actor(batch.observations))
+        u = torch.tanh(self.actor(batch.observations))
         return {"actor": nn.functional.mse_loss(u, batch.actions)}
-
-    def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step; returns the loss before it."""
-        losses = self.losses(batch)
-        self._adam.zero_grad(set_to_none=False)
-        losses["actor"].backward()  # type: ignore[no-untyped-call]
-        self._adam.step()
-        return losses

@@ -22,7 +22,6 @@ from pydantic import Field
 
 from sme_registry.errors import OptionError
 from sme_registry.spec import Integer, Real, StrictModel
-from sme_registry.training import algorithms
 
 _Width = Annotated[Integer, Field(ge=1, le=4096)]
 _Widths = Annotated[tuple[_Width, ...], Field(strict=False, min_length=1, max_length=8)]
@@ -70,21 +69,16 @@ ALGORITHMS: dict[str, str] = {
     "bc": "behaviour cloning: regression to the actions of the data set",
     "iql": "implicit Q-learning: cloning weighted by the advantage of each action",
 }
-_FIELDS: dict[str, type[BCHyperparameters] | type[IQLHyperparameters]] = {
-    "bc": BCHyperparameters,
-    "iql": IQLHyperparameters,
-}
+_FIELDS: dict[str, type[Hyperparameters]] = {"bc": BCHyperparameters, "iql": IQLHyperparameters}
 
 
 def resolve_hyperparameters(algorithm: str, changes: Mapping[str, Any] | None) -> Hyperparameters:
-    """The hyperparameters of an algorithm: its defaults, with changes.
+    """The hyperparameters of an algorithm of `ALGORITHMS`: its defaults, with changes.
 
     Raises:
-      UnknownNameError: no such algorithm.
       OptionError: `changes` is not a mapping.
       SpecError: a field is unknown, or its value is out of range.
     """
-    kind = _FIELDS[algorithms.known_algorithm(algorithm, ALGORITHMS)]
     if changes is not None and not isinstance(changes, Mapping):
         raise OptionError(f"hyperparameters={changes!r:.60}: must be a mapping of names to values.")
-    return kind.from_dict(dict(changes or {}), "hyperparameters")
+    return _FIELDS[algorithm].from_dict(dict(changes or {}), "hyperparameters")

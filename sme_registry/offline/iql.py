@@ -23,25 +23,20 @@ import torch
 from torch import Tensor, nn
 
 from sme_registry.offline.hyperparameters import IQLHyperparameters
-from sme_registry.offline.networks import Batch, mlp
+from sme_registry.offline.networks import Batch, Learner, mlp
 
 CRITICS = 2
 _LOW, _HIGH = -5.0, 2.0  # of log σ
 _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
-class IQL:
+class IQL(Learner):
     """A policy, two critics with their targets, a value function, and their optimiser.
 
     Attributes:
       critics, targets: from `[B, O + A]` to `[B, 1]` each.
       value: from `[B, O]` to `[B, 1]`.
       spread: `[A]`; its sigmoid is the position of log σ between −5 and 2.
-
-    Args:
-      observation_dim: O.
-      action_dim: A.
-      hyperparameters: see `IQLHyperparameters`.
     """
 
     def __init__(
@@ -49,29 +44,20 @@ class IQL:
     ) -> None:
         self._hyperparameters = hyperparameters
         hidden = hyperparameters.hidden
-        self._actor = mlp(observation_dim, hidden, action_dim)
+        self.actor = mlp(observation_dim, hidden, action_dim)
         self.spread = nn.Parameter(torch.zeros(action_dim))
-        self.critics = nn.ModuleList(
-            mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS)
-        )
-        self.targets = nn.ModuleList(
-            mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS)
+        self.critics, self.targets = (
+            nn.ModuleList(mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS))
+            for _ in range(2)
         )
         self.targets.load_state_dict(self.critics.state_dict())
         self.targets.requires_grad_(False)
         self.value = mlp(observation_dim, hidden, 1)
-        trained = [self._actor, self.critics, self.value]
+        trained = [self.actor, self.critics, self.value]
         parameters = [parameter for network in trained for parameter in network.parameters()]
-        self._adam = torch.optim.Adam(
-            [*parameters, self.spread], lr=hyperparameters.learning_rate, fused=True
-        )
+        self._optimise([*parameters, self.spread], hyperparameters.learning_rate)
         self._critic_parameters: list[Tensor] = list(self.critics.parameters())
         self._target_parameters: list[Tensor] = list(self.targets.parameters())
-
-    @property
-    def actor(self) -> nn.Sequential:
-        """The network from observations to the argument of tanh, whose value is the mean u."""
-        return self._actor
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """The terms of the loss: `value`, `critic` and `actor`."""
@@ -85,7 +71,7 @@ class IQL:
             asymmetry = (self._hyperparameters.expectile - (advantage < 0.0).float()).abs()
             weight = (self._hyperparameters.inverse_temperature * advantage).exp()
             weight.clamp_(max=self._hyperparameters.max_weight)
-        mean = torch.tanh(self._actor(batch.observations))
+        mean = torch.tanh(self.actor(batch.observations))
         log_sigma = _LOW + (_HIGH - _LOW) * torch.sigmoid(self.spread)
         standardised = (batch.actions - mean) * torch.exp(-log_sigma)
         log_density = -0.5 * standardised.square() - log_sigma - _HALF_LOG_2_PI
@@ -96,11 +82,8 @@ class IQL:
         }
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step of all networks; returns the terms of the loss before it."""
-        losses = self.losses(batch)
-        self._adam.zero_grad(set_to_none=False)
-        (losses["value"] + losses["critic"] + losses["actor"]).backward()  # type: ignore[no-untyped-call]
-        self._adam.step()
+        """One gradient step; see `Learner.step`. The targets then follow the critics."""
+        losses = super().step(batch)
         with torch.no_grad():  # the targets must not track gradients
             torch._foreach_lerp_(
                 self._target_parameters, self._critic_parameters, self._hyperparameters.target_rate

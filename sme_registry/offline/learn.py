@@ -1,22 +1,26 @@
-"""`learn`: the gradient steps of BC or IQL, in sections that end where an evaluation is due."""
+"""`learn`: the gradient steps of BC or IQL, in sections that end where an evaluation is due.
+
+Imports PyTorch; import it inside functions only.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from sme_registry.datasets import Transitions
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.policies.npz import Layer
+from sme_registry.offline.bc import BC
 from sme_registry.offline.hyperparameters import BCHyperparameters, Hyperparameters
+from sme_registry.offline.iql import IQL
+from sme_registry.offline.networks import Batches, Learner, weights
 from sme_registry.task import streams
 from sme_registry.training.algorithms import one_thread
-
-if TYPE_CHECKING:
-    from sme_registry.offline.networks import Learner
 
 _STEPS_PER_REPORT = 50
 
@@ -45,29 +49,24 @@ def learn(
     evaluate_at: Sequence[int],
     report: Callable[[int], None],
 ) -> Iterator[Section]:
-    """Train up to each of some steps, in order.
+    """Train up to each of the increasing steps in `evaluate_at`.
 
+    The type of the hyperparameters determines the learner. The seed is that of initial weights and
+    shuffles. `report` is called with the steps done, every 50 steps and after each section.
     PyTorch's number of threads and global generator are unchanged whenever this is suspended.
-
-    Args:
-      hyperparameters: of the learner, whose type they determine.
-      transitions: the data set.
-      batch_size: transitions in each step.
-      seed: of initial weights and shuffles.
-      evaluate_at: steps, increasing.
-      report: called every 50 steps and after each section with the steps done.
 
     Raises:
       PolicyError: weights or losses are no longer finite.
     """
-    import torch
-
-    from sme_registry.offline.networks import Batches, weights
-
     initial, shuffles = (streams.raw_bits(seed, "offline/learner", 2) >> np.uint64(1)).tolist()
+    dims = transitions.observations.shape[1], transitions.actions.shape[1]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(initial)
-        learner = _learner(hyperparameters, transitions)
+        learner: Learner = (
+            BC(*dims, hyperparameters)
+            if isinstance(hyperparameters, BCHyperparameters)
+            else IQL(*dims, hyperparameters)
+        )
     batches = iter(Batches(transitions, batch_size, torch.Generator().manual_seed(shuffles)))
     done = 0
     for until in evaluate_at:
@@ -89,13 +88,3 @@ def learn(
             )
         yield Section(done, values, layers, seconds)
         report(done)
-
-
-def _learner(hyperparameters: Hyperparameters, transitions: Transitions) -> Learner:
-    from sme_registry.offline.bc import BC
-    from sme_registry.offline.iql import IQL
-
-    dims = transitions.observations.shape[1], transitions.actions.shape[1]
-    if isinstance(hyperparameters, BCHyperparameters):
-        return BC(*dims, hyperparameters)
-    return IQL(*dims, hyperparameters)

@@ -11,8 +11,9 @@ of exactly 0 and 1 occur in data, and their squashed density has no finite logar
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -40,15 +41,29 @@ class Batch(NamedTuple):
     continues: Tensor
 
 
-class Learner(Protocol):
-    """An offline learner."""
+class Learner(ABC):
+    """An offline learner: networks, and one optimiser of all their losses.
+
+    Attributes:
+      actor: from observations to the argument of tanh, whose value is the policy's u.
+    """
+
+    actor: nn.Sequential
+
+    def _optimise(self, parameters: Iterable[Tensor], learning_rate: float) -> None:
+        self._adam = torch.optim.Adam(parameters, lr=learning_rate, fused=True)
+
+    @abstractmethod
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The terms of the loss, by name."""
 
     def step(self, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step; returns the terms of the loss before it, by name."""
-
-    @property
-    def actor(self) -> nn.Sequential:
-        """The network from observations to the argument of tanh, whose value is the mean u."""
+        """One gradient step of all networks; returns the terms of the loss before it."""
+        losses = self.losses(batch)
+        self._adam.zero_grad(set_to_none=False)
+        sum(losses.values(), torch.zeros(())).backward()  # type: ignore[no-untyped-call]
+        self._adam.step()
+        return losses
 
 
 def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
@@ -73,12 +88,8 @@ class Batches:
     """An endless iterator over batches of shuffled rows of a data set.
 
     Every row is used once before any repeats. The data set is one float32 matrix, so that one
-    gather gets all columns of a batch; one for each column would take as long as a network.
-
-    Args:
-      transitions: the data set.
-      batch_size: B, at most the rows of the data set.
-      generator: of the shuffles.
+    gather gets all columns of a batch; one for each column would take as long as a network. The
+    batch size is at most the rows of the data set; the generator is that of the shuffles.
     """
 
     def __init__(

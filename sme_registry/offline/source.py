@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,94 +12,85 @@ from sme_registry.errors import OptionError, SpecError
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.offline.record import BehaviourQuality
 from sme_registry.spec import EvaluationProtocol, ProtocolLike, SMESpec, SpecLike
-from sme_registry.task import Task, load_spec
+from sme_registry.task import Task, load_spec, materialize
 
 _CHECKED_ROWS = 64
 _TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
 
 
-@dataclass(frozen=True)
-class DataSource:
+class DataSource(NamedTuple):
     """The data of a training, and the task and protocol for its evaluation.
 
     Attributes:
       transitions: the arrays.
-      spec: their task, of a single agent.
+      task: their task, of a single agent.
       protocol: of the final evaluation.
-      dataset_id: None for arrays without a data set.
-      recipe_digest: None for arrays without a data set.
+      ids: the fields `dataset` and `recipe_digest` of an `OfflineRecord`.
     """
 
     transitions: Transitions
-    spec: SMESpec
+    task: Task
     protocol: EvaluationProtocol
-    dataset_id: str | None
-    recipe_digest: str | None
+    ids: dict[str, str | None]
 
     def record_fields(self) -> dict[str, Any]:
         """The fields of an `OfflineRecord` that describe the data and the task."""
-        similarities, step_rewards = self.transitions.similarities, self.transitions.step_rewards
+        similarities = self.transitions.similarities
         return {
-            "dataset": self.dataset_id,
+            **self.ids,
             "dataset_digest": self.transitions.digest,
-            "recipe_digest": self.recipe_digest,
             "transitions": len(self.transitions),
-            "spec": self.spec,
-            "spec_digest": self.spec.digest,
+            "spec": self.task.spec,
+            "spec_digest": self.task.spec.digest,
             "behaviour": BehaviourQuality(
-                similarity=float(similarities.mean()),
-                similarity_sd=float(similarities.std()),
-                step_reward=float(step_rewards.mean()),
+                similarity=similarities.mean(),
+                similarity_sd=similarities.std(),
+                step_reward=self.transitions.step_rewards.mean(),
             ),
         }
 
 
 def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None) -> DataSource:
-    """Load the data of a training; see `train_offline` for the arguments.
-
-    Raises:
-      OptionError: `data` has the wrong type, or `spec` is missing or not the data set's.
-      SpecError: the task is a team's.
-      UnknownNameError: no such data set, task or protocol.
-      MalformedDocumentError, DigestMismatchError: the data set cannot be read, or was changed.
-    """
+    """Load and check the data of a training; see `train_offline` for arguments and errors."""
     if isinstance(data, Transitions):
         if spec is None:
             raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
-        task = _single_agent(load_spec(spec))
         chosen = resolve_protocol("paper-v1" if protocol is None else protocol)
-        return DataSource(data, task, chosen, None, None)
-    if not isinstance(data, Dataset | str | os.PathLike):
+        ids: dict[str, str | None] = {"dataset": None, "recipe_digest": None}
+        source = DataSource(data, _single_agent(load_spec(spec)), chosen, ids)
+    elif isinstance(data, Dataset | str | os.PathLike):
+        dataset = data if isinstance(data, Dataset) else open_dataset(data)
+        record, recipe = dataset.record, dataset.recipe
+        if spec is not None and (digest := load_spec(spec).digest) != record.spec_digest:
+            raise OptionError(
+                f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it "
+                "out."
+            )
+        task = _single_agent(recipe.spec)
+        chosen = recipe.protocol if protocol is None else resolve_protocol(protocol)
+        ids = {"dataset": dataset.id, "recipe_digest": record.recipe_digest}
+        source = DataSource(dataset.transitions(), task, chosen, ids)
+    else:
         raise OptionError(
             f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."
         )
-    dataset = data if isinstance(data, Dataset) else open_dataset(data)
-    record, recipe = dataset.record, dataset.recipe
-    if spec is not None and (digest := load_spec(spec).digest) != record.spec_digest:
-        raise OptionError(
-            f"spec={digest[:19]}…: the data set's task is {record.spec_digest[:19]}…. Leave it out."
-        )
-    task = _single_agent(recipe.spec)
-    chosen = recipe.protocol if protocol is None else resolve_protocol(protocol)
-    return DataSource(dataset.transitions(), task, chosen, dataset.id, record.recipe_digest)
+    _check_task(source.transitions, source.task)
+    return source
 
 
-def _single_agent(spec: SMESpec) -> SMESpec:
+def _single_agent(spec: SMESpec) -> Task:
+    """The task of a spec; raises SpecError if it is a team's."""
     if spec.team is not None:
         raise SpecError(
             f"team: the data set has {len(spec.team.agents)} agents, and a policy that sees all "
             "observations cannot be executed by the individual agents. Train on a single-agent "
             "data set."
         )
-    return spec
+    return materialize(spec)
 
 
-def check_task(transitions: Transitions, task: Task) -> None:
-    """Check that arrays are finite, and that they are of a task.
-
-    Raises:
-      OptionError: they are not.
-    """
+def _check_task(transitions: Transitions, task: Task) -> None:
+    """Raise OptionError unless arrays are finite and of this task."""
     S, A = task.spec.state_dim, task.spec.action_dim
     if len(transitions) == 0:
         raise OptionError("transitions=0: must be at least 1. Give a data set with rows.")

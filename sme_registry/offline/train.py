@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sme_registry.datasets import Dataset, Transitions
 from sme_registry.evaluation import EvaluationReport, evaluate
 from sme_registry.evaluation.policies.npz import OfflinePolicy
@@ -33,11 +31,9 @@ from sme_registry.io import (
     write_atomically,
 )
 from sme_registry.offline.hyperparameters import ALGORITHMS, resolve_hyperparameters
-from sme_registry.offline.learn import Section, learn
 from sme_registry.offline.record import Evaluation, OfflineRecord
-from sme_registry.offline.source import check_task, data_source
+from sme_registry.offline.source import data_source
 from sme_registry.spec import ProtocolLike, SpecLike
-from sme_registry.task import Task, materialize
 from sme_registry.training import known_algorithm
 from sme_registry.training.record import PACKAGES
 from sme_registry.training.run import DECAY_CURVE, EVALUATION, write_evaluation
@@ -45,6 +41,7 @@ from sme_registry.training.run import DECAY_CURVE, EVALUATION, write_evaluation
 RECORD = "offline.json"
 POLICY = "policy.npz"
 _FILES = (RECORD, POLICY, EVALUATION, DECAY_CURVE)
+_ABOUT = ("algorithm", "seed", "steps", "dataset_digest", "spec_digest")  # in the policy's file
 
 EPISODES = 10  # METHOD, section 4
 MAX_STEPS = 10**9
@@ -124,26 +121,24 @@ def train_offline(
     seed = integer_in("seed", seed, 0, 2**53 - 1)
     evaluations = integer_in("evaluations", evaluations, 1, steps)
     episodes = integer_in("episodes", episodes, 1, 4096)
-    source = data_source(data, spec, protocol)
     require_packages("offline training", {"torch": "PyTorch"}, "offline")
-    transitions, task = source.transitions, materialize(source.spec)
-    check_task(transitions, task)
+    source = data_source(data, spec, protocol)
+    transitions, task = source.transitions, source.task
     batch_size = integer_in(
         "batch_size", batch_size, 1, len(transitions), advice="The data set has no more rows."
     )
     target = None if folder is None else claim_folder(folder, _FILES, force=force)
 
-    arguments: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "algorithm": algorithm,
         "hyperparameters": settings.to_dict(),
         "seed": seed,
         "steps": steps,
         "batch_size": batch_size,
         "episodes": episodes,
+        **source.record_fields(),
     }
-    data_fields = source.record_fields()
-    about = {name: arguments[name] for name in ("algorithm", "seed", "steps")}
-    about |= {name: data_fields[name] for name in ("dataset_digest", "spec_digest")}
+    about = {name: fields[name] for name in _ABOUT}
     start, start_cpu, learning = time.perf_counter(), time.process_time(), 0.0
     done: list[Evaluation] = []
 
@@ -151,45 +146,36 @@ def train_offline(
         if progress is not None:
             progress(step, steps, f"r̃ {done[-1].similarity:.3f}" if done else "")
 
+    from sme_registry.offline.learn import learn
+
     evaluate_at = [round(steps * (index + 1) / evaluations) for index in range(evaluations)]
     for section in learn(settings, transitions, batch_size, seed, evaluate_at, report_progress):
         learning += section.cpu_seconds
         policy = OfflinePolicy(section.layers, about)
-        states = start_states(seed, len(done), episodes, source.spec.state_dim)
-        done.append(_evaluation(policy, task, states, section))
+        states = start_states(seed, len(done), episodes, task.spec.state_dim)
+        result = rollouts(policy, task, states)
+        done.append(
+            Evaluation(
+                step=section.step,
+                similarity=result.per_step(result.similarity),
+                similarity_sd=result.similarity_sd,
+                episode_return=result.episode_return.mean(),
+                losses=section.losses,
+            )
+        )
     record = OfflineRecord(
-        **arguments,
-        **data_fields,
+        **fields,
         evaluations=tuple(done),
         wall_seconds=round(time.perf_counter() - start, 3),
         cpu_seconds=round(time.process_time() - start_cpu, 3),
         cpu_ms_per_step=round(1e3 * learning / steps, 4),
         versions=versions(PACKAGES),
     )
-    report = evaluate(policy, source.spec, source.protocol, name=algorithm.upper())
+    report = evaluate(policy, task.spec, source.protocol, name=algorithm.upper())
     if target is not None:
-        _write(target, policy, record, report)
+        (target / RECORD).unlink(missing_ok=True)
+        policy.save(target / POLICY)
+        write_evaluation(report, target)
+        # Last, so that a folder with a record is complete.
+        write_atomically(target / RECORD, to_json(record.to_dict()))
     return OfflineResult(policy, record, report, target)
-
-
-def _evaluation(
-    policy: OfflinePolicy, task: Task, states: np.ndarray[Any, Any], section: Section
-) -> Evaluation:
-    result = rollouts(policy, task, states)
-    return Evaluation(
-        step=section.step,
-        similarity=result.per_step(result.similarity),
-        similarity_sd=result.similarity_sd,
-        episode_return=float(result.episode_return.mean()),
-        losses=section.losses,
-    )
-
-
-def _write(
-    folder: Path, policy: OfflinePolicy, record: OfflineRecord, report: EvaluationReport
-) -> None:
-    """Write the record last, so that a folder with a record is complete."""
-    (folder / RECORD).unlink(missing_ok=True)
-    policy.save(folder / POLICY)
-    write_evaluation(report, folder)
-    write_atomically(folder / RECORD, to_json(record.to_dict()))

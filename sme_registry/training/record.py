@@ -80,15 +80,11 @@ class RunRecord(StrictModel):
         return self.model_copy(update=changes)
 
     def check_same_plan(self, plan: RunRecord, folder: Path) -> None:
-        """Check that a run to be resumed has the same plan.
-
-        Raises:
-          OptionError: names the field that differs, both values, and the remedy.
-        """
+        """Raise OptionError if a run to be resumed has another plan."""
         for field in ("spec_digest", "algorithm", "seed", "action_range", "num_envs"):
-            ours, theirs = getattr(self, field), getattr(plan, field)
-            if ours != theirs:
+            before, now = getattr(self, field), getattr(plan, field)
+            if before != now:
                 raise OptionError(
-                    f"{field}={theirs!r}: the run in {folder} has {ours!r}. Resume it with the "
-                    "same value, or train into another folder."
+                    f"{field}={now!r}: the run in {folder} has {before!r}. Resume it with the same "
+                    "value, or train into another folder."
                 )

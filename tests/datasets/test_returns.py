@@ -164,7 +164,7 @@ def test_a_stochastic_policy_has_no_exact_return() -> None:
         ({"states": 3.0}, StateError, r"must be \[M, 3\]"),
         ({"t": 30}, StateError, r"t=30: must be an integer in \[0, 30\)"),
         ({"t": 0.5}, StateError, "t=0.5"),
-        ({"t": [1, 2]}, StateError, "t of shape"),
+        ({"t": [1, 2]}, StateError, r"t=\[1, 2\]: .* of shape \(5,\)"),
         ({"t": "x"}, StateError, "t='x'"),
         ({"t": np.nan}, StateError, "t: contains NaN"),
         ({"r_cum": 0.1}, StateError, r"r_cum=0.1: must be in \[0, 0\] at t=0"),

@@ -7,10 +7,10 @@ import pytest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe
-from sme_registry.datasets.behaviour import ConstantPolicy, EpisodeStream
+from sme_registry.datasets.behaviour import EpisodeStream, constant_policy
 from sme_registry.datasets.collect import collect
 from sme_registry.datasets.recipe import parse_behaviour
-from sme_registry.datasets.scores import play, reference_scores
+from sme_registry.datasets.scores import reference_scores, whole_episodes
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 
@@ -55,7 +55,7 @@ def test_the_optimums_return_is_the_horizon(fields):
 def test_the_returns_are_those_of_single_environments():
     task = materialize(SMESpec(k=3, D=0.02))
     starts = EpisodeStream(4, "start", 20, 8, ahead=1)
-    returns, similarities, steps = play(task, ConstantPolicy(task, 20), starts, 20)
+    returns, similarities, steps = whole_episodes(task, constant_policy(task), starts, 20)
     assert len(set(steps)) > 3  # they end at different steps
     again = EpisodeStream(4, "start", 1, 8, ahead=1)
     env = sme_registry.make(task.spec)
