@@ -20,10 +20,10 @@ from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import BehaviourPolicy, EpisodeStream, behaviour_policy
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.envs.batch import Batch
+from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.regions import expansion
 from sme_registry.task import Task
-from sme_registry.task.draw import Array
 from sme_registry.task.memory import refuse_above_limit
 
 ReportProgress = Callable[[int, int], None]
@@ -33,29 +33,19 @@ _MAX_STEPS = 10**8  # of the environment; a sub-cube that needs more is too smal
 
 
 class Rows(NamedTuple):
-    """`M` transitions as arrays; of shape `[M]` unless another one is given.
+    """`M` transitions as arrays."""
 
-    Attributes:
-      episode, t: index of the episode of its behaviour, and steps before this one.
-      state, next_state: `[M, S]`.
-      observation, next_observation: `[M, S + 1 + n]` float32.
-      action: `[M, A]` float32.
-      optimal: `[M, A]`.
-      values: `[M, 4, n]` similarity, step reward, regret, reward.
-      terminated, truncated: as the task ends episodes.
-    """
-
-    episode: npt.NDArray[np.int64]
-    t: npt.NDArray[np.int64]
-    state: npt.NDArray[np.float64]
-    next_state: npt.NDArray[np.float64]
-    observation: npt.NDArray[np.float32]
-    next_observation: npt.NDArray[np.float32]
-    action: npt.NDArray[np.float32]
-    optimal: npt.NDArray[np.float64]
-    values: npt.NDArray[np.float64]
-    terminated: npt.NDArray[np.bool_]
-    truncated: npt.NDArray[np.bool_]
+    episode: npt.NDArray[np.int64]  # `[M]` index of the episode of its behaviour
+    t: npt.NDArray[np.int64]  # `[M]` steps of the episode before this one
+    state: Array  # `[M, S]`
+    next_state: Array
+    observation: Observation  # `[M, S + 1 + n]`
+    next_observation: Observation
+    action: npt.NDArray[np.float32]  # `[M, A]`
+    optimal: Array  # `[M, A]`
+    values: Array  # `[M, 4, n]` similarity, step reward, regret, reward
+    terminated: Mask  # `[M]` as the task ends episodes
+    truncated: Mask
 
 
 def collect(
@@ -90,7 +80,7 @@ def collect(
         f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}",
         "Collect fewer, or several data sets with different seeds.",
     )
-    kept_share = (1.0 + (recipe.coverage or 0.0)) ** S  # of uniform states
+    kept_share = max(1e-300, (1.0 + (recipe.coverage or 0.0)) ** S)  # of uniform states
     done = 0
     parts = []
     for index, share in enumerate(recipe.shares):

@@ -25,6 +25,7 @@ from sme_registry.spec import (
     SchemaVersion,
     SMESpec,
     StrictModel,
+    TupleOf,
 )
 from sme_registry.spec.document import plain_number
 from sme_registry.spec.validation_errors import short_repr
@@ -80,24 +81,20 @@ class Behaviour(StrictModel):
 class DatasetRecipe(Document):
     """The task, behaviour policies, size, coverage and seed of a data set.
 
-    Attributes:
-      spec: the task.
-      behaviours: the policies that act, one after another; their weights add up to 1.
-      transitions: N, the exact number of transitions.
-      seed: of the starts, of each α and of ã, each by a named stream.
-      coverage: ε: keeps only transitions from states in X_ε = {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}; null
-        keeps all, as 0 does.
-      protocol: for the evaluation of policies that learn from the data set.
+    With coverage ε it keeps only transitions from states in X_ε = {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}; null
+    keeps all, as 0 does. Starts, each α and ã have a named stream of the seed each.
     """
 
     schema_version: SchemaVersion = 1
     spec: SMESpec
-    behaviours: Annotated[tuple[Behaviour, ...], Field(strict=False, min_length=1, max_length=64)]
+    # They act one after another; their weights add up to 1.
+    behaviours: Annotated[TupleOf[Behaviour], Field(min_length=1, max_length=64)]
     transitions: Annotated[
         Integer, Field(ge=1, le=10**9, description="N, rows of the data set")
     ] = 50_000
     seed: Annotated[Integer, Field(ge=0, lt=2**53, description="of the data, not the task")] = 0
     coverage: Annotated[Real | None, Field(gt=-1, le=0, description="ε of the sub-cube")] = None
+    # For the evaluation of policies that learn from the data set.
     protocol: EvaluationProtocol = EvaluationProtocol()
 
     @model_validator(mode="after")

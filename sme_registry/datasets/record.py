@@ -23,30 +23,19 @@ class Seeds(StrictModel):
 
 
 class DatasetRecord(StrictModel):
-    """Provenance, reference scores and digests of a data set.
-
-    Attributes:
-      recipe, recipe_digest: all that the data set was generated from.
-      spec_digest, protocol_digest: of the recipe's task and evaluation protocol.
-      seeds: of the task and of the data.
-      nu: ν if a single mixture acted; null for several behaviours or another policy.
-      trajectories: E, the number of Minari episodes.
-      scores: of the behaviour and of the reference policies.
-      arrays_digest: over all arrays, see `Transitions.digest`.
-      versions: of Python and the packages that the numbers depend on.
-    """
+    """Provenance, reference scores and digests of a data set."""
 
     schema_version: Literal[1] = 1
-    recipe: DatasetRecipe
+    recipe: DatasetRecipe  # all that the data set was generated from
     recipe_digest: Digest
     spec_digest: Digest
     protocol_digest: Digest
     seeds: Seeds
-    nu: float | None
-    trajectories: Annotated[Integer, Field(ge=1)]
+    nu: float | None  # ν if a single mixture acted; null for other or several behaviours
+    trajectories: Annotated[Integer, Field(ge=1)]  # E, the number of Minari episodes
     scores: ReferenceScores
-    arrays_digest: Digest
-    versions: dict[str, str]
+    arrays_digest: Digest  # see `Transitions.digest`
+    versions: dict[str, str]  # of Python and the packages that the numbers depend on
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:

@@ -23,7 +23,7 @@ from sme_registry.datasets.behaviour import (
 )
 from sme_registry.datasets.collect import play
 from sme_registry.datasets.recipe import DatasetRecipe
-from sme_registry.spec import Integer, Real, StrictModel
+from sme_registry.spec import Integer, Real, StrictModel, TupleOf
 from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
@@ -34,48 +34,29 @@ Share = Annotated[Real, Field(ge=0, le=1)]
 
 
 class Rollouts(StrictModel):
-    """Whole episodes of a policy.
+    """Whole episodes of a policy."""
 
-    Attributes:
-      episodes: their number; 0 if the values are exact without rollouts.
-      mean_return: mean sum of rewards, in [0, T].
-      standard_error: of that mean, over episodes.
-      similarity: mean r̃ over all steps.
-    """
-
-    episodes: Integer
-    mean_return: Real
-    standard_error: Real
-    similarity: Share
+    episodes: Integer  # 0 if the values are exact without rollouts
+    mean_return: Real  # mean sum of rewards, in [0, T]
+    standard_error: Real  # of that mean, over episodes
+    similarity: Share  # mean r̃ over all steps
 
 
 class PolicyScore(StrictModel):
-    """The scores of one policy.
+    """The scores of one policy."""
 
-    Attributes:
-      similarity, step_reward: mean r̃ and r over the data set's states.
-      rollouts: over whole episodes; null if the horizon is too long for them.
-    """
-
-    similarity: Share
-    step_reward: Share
-    rollouts: Rollouts | None
+    similarity: Share  # mean r̃ over the data set's states
+    step_reward: Share  # mean r over them
+    rollouts: Rollouts | None  # null if the horizon is too long for whole episodes
 
 
 class ReferenceScores(StrictModel):
-    """The reference scores of a data set.
+    """The reference scores of a data set."""
 
-    Attributes:
-      constant: of a = ½, the lower reference.
-      behaviour: of the policies that collected the data set.
-      behaviours: of each of the recipe's behaviours, over the rows in which it acted.
-      optimum: of π*.
-    """
-
-    constant: PolicyScore
-    behaviour: PolicyScore
-    behaviours: Annotated[tuple[PolicyScore, ...], Field(strict=False)]
-    optimum: PolicyScore
+    constant: PolicyScore  # of a = ½, the lower reference
+    behaviour: PolicyScore  # of the policies that collected the data set
+    behaviours: TupleOf[PolicyScore]  # each over the rows in which it acted
+    optimum: PolicyScore  # of π*
 
 
 def reference_scores(

@@ -26,19 +26,12 @@ _STEPS_PER_REPORT = 50
 
 
 class Section(NamedTuple):
-    """The state of a training where an evaluation is due.
+    """The state of a training where an evaluation is due."""
 
-    Attributes:
-      step: gradient steps done.
-      losses: terms of the loss of the last batch, by name.
-      layers: of the policy.
-      cpu_seconds: of the steps since the previous section.
-    """
-
-    step: int
-    losses: dict[str, float]
-    layers: list[Layer]
-    cpu_seconds: float
+    step: int  # gradient steps done
+    losses: dict[str, float]  # terms of the loss of the last batch, by name
+    layers: list[Layer]  # of the policy
+    cpu_seconds: float  # of the steps since the previous section
 
 
 def learn(

@@ -24,21 +24,13 @@ from sme_registry.evaluation.policies.npz import Layer
 
 
 class Batch(NamedTuple):
-    """The transitions of one gradient step; `B` rows, float32.
+    """The transitions of one gradient step; `B` rows, float32."""
 
-    Attributes:
-      observations: `[B, O]`.
-      actions: `[B, A]` u = 2a − 1, in [−1, 1].
-      next_observations: `[B, O]`.
-      rewards: `[B, 1]`.
-      continues: `[B, 1]` 0 if the episode terminated, else 1, also after a timeout.
-    """
-
-    observations: Tensor
-    actions: Tensor
-    next_observations: Tensor
-    rewards: Tensor
-    continues: Tensor
+    observations: Tensor  # `[B, O]`
+    actions: Tensor  # `[B, A]` u = 2a − 1, in [−1, 1]
+    next_observations: Tensor  # `[B, O]`
+    rewards: Tensor  # `[B, 1]`
+    continues: Tensor  # `[B, 1]` 0 if the episode terminated, else 1, also after a timeout
 
 
 class Learner(ABC):

@@ -9,81 +9,49 @@ from pydantic import Field
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.io import read_json
-from sme_registry.spec import Integer, Real, SMESpec, StrictModel
+from sme_registry.spec import Integer, Real, SMESpec, StrictModel, TupleOf
 
 
 class Evaluation(StrictModel):
-    """Episodes of the policy in the task, played during training.
+    """Episodes of the policy in the task, played during training."""
 
-    Attributes:
-      step: gradient steps before it.
-      similarity: mean r̃ over all steps of all episodes.
-      similarity_sd: standard deviation of r̃ over these steps.
-      episode_return: mean return of the episodes.
-      losses: terms of the loss of the last batch, by name.
-    """
-
-    step: Integer
-    similarity: Real
-    similarity_sd: Real
-    episode_return: Real
-    losses: dict[str, Real]
+    step: Integer  # gradient steps before it
+    similarity: Real  # mean r̃ over all steps of all episodes
+    similarity_sd: Real  # standard deviation over these steps
+    episode_return: Real  # mean over the episodes
+    losses: dict[str, Real]  # terms of the loss of the last batch, by name
 
 
 class BehaviourQuality(StrictModel):
-    """Exact statistics of the data set's transitions.
+    """Exact statistics of the data set's transitions."""
 
-    Attributes:
-      similarity: mean r̃.
-      similarity_sd: standard deviation of r̃.
-      step_reward: mean r.
-    """
-
-    similarity: Real
+    similarity: Real  # mean r̃
     similarity_sd: Real
-    step_reward: Real
+    step_reward: Real  # mean r
 
 
 class OfflineRecord(StrictModel):
-    """The arguments, data, evaluations and cost of an offline training.
-
-    Attributes:
-      algorithm: "bc" or "iql".
-      hyperparameters: all of them, as used.
-      seed: of initial weights, shuffles, and starts of the evaluation episodes.
-      steps, batch_size: gradient steps, and transitions in each.
-      episodes: of each evaluation.
-      dataset: id of the data set; null if only its arrays were passed.
-      dataset_digest: of its arrays.
-      recipe_digest: of the data set's recipe; null if only its arrays were passed.
-      transitions: N, the size of the data set.
-      spec, spec_digest: the task.
-      behaviour: of the data set.
-      evaluations: in order; the last one is of the final policy.
-      wall_seconds, cpu_seconds: of the training and its evaluations.
-      cpu_ms_per_step: of a gradient step, without evaluations.
-      versions: of Python and the packages that the numbers depend on.
-    """
+    """The arguments, data, evaluations and cost of an offline training."""
 
     schema_version: Literal[1] = 1
     algorithm: Literal["bc", "iql"]
-    hyperparameters: dict[str, Any]
-    seed: Integer
-    steps: Integer
-    batch_size: Integer
-    episodes: Integer
-    dataset: str | None
-    dataset_digest: str
-    recipe_digest: str | None
-    transitions: Integer
+    hyperparameters: dict[str, Any]  # all of them, as used
+    seed: Integer  # of initial weights, shuffles, and starts of the evaluation episodes
+    steps: Integer  # of the gradient
+    batch_size: Integer  # transitions in each
+    episodes: Integer  # of each evaluation
+    dataset: str | None  # id of the data set; null if only its arrays were passed
+    dataset_digest: str  # of its arrays
+    recipe_digest: str | None  # null if only the arrays were passed
+    transitions: Integer  # N, the size of the data set
     spec: SMESpec
     spec_digest: str
     behaviour: BehaviourQuality
-    evaluations: Annotated[tuple[Evaluation, ...], Field(strict=False, min_length=1)]
-    wall_seconds: Real
+    evaluations: Annotated[TupleOf[Evaluation], Field(min_length=1)]  # in order; last, the policy's
+    wall_seconds: Real  # of the training and its evaluations
     cpu_seconds: Real
-    cpu_ms_per_step: Real
-    versions: dict[str, str]
+    cpu_ms_per_step: Real  # of a gradient step, without evaluations
+    versions: dict[str, str]  # of Python and the packages that the numbers depend on
 
     @property
     def similarity(self) -> float:

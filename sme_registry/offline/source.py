@@ -19,19 +19,12 @@ _TOLERANCE = 1e-6  # of π* between machines, as for fingerprints
 
 
 class DataSource(NamedTuple):
-    """The data of a training, and the task and protocol for its evaluation.
-
-    Attributes:
-      transitions: the arrays.
-      task: their task, of a single agent.
-      protocol: of the final evaluation.
-      ids: the fields `dataset` and `recipe_digest` of an `OfflineRecord`.
-    """
+    """The data of a training, and the task and protocol for its evaluation."""
 
     transitions: Transitions
-    task: Task
-    protocol: EvaluationProtocol
-    ids: dict[str, str | None]
+    task: Task  # of a single agent
+    protocol: EvaluationProtocol  # of the final evaluation
+    ids: dict[str, str | None]  # the fields `dataset` and `recipe_digest` of an `OfflineRecord`
 
     def record_fields(self) -> dict[str, Any]:
         """The fields of an `OfflineRecord` that describe the data and the task."""

@@ -89,6 +89,7 @@ class EpisodeLog:
     """
 
     def __init__(self, path: Path, up_to_step: int = 0, agents: Sequence[str] = ()) -> None:
+        self.agents = agents
         kept = read_episodes(path) if up_to_step and path.exists() else []
         self.episodes = [episode for episode in kept if episode.step <= up_to_step]
         text = io.StringIO()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,23 +46,9 @@ def learn(
     names = () if team is None else tuple(agent.name for agent in team.agents)
     log = EpisodeLog(folder / episode_files.FILE, first_step, names)
 
-    def current() -> RunRecord:
-        steps, seconds = int(model.num_timesteps) // record.agents, callback.wall_seconds
-        return record.updated(
-            steps_done=steps,
-            episodes=len(log.episodes),
-            wall_seconds=round(seconds, 3),
-            steps_per_second=round(steps / max(seconds, 1e-9), 3),
-        )
-
-    def save_checkpoint() -> None:
-        with defer_interrupts():
-            checkpoint.save(model, folder / checkpoint.FILE)
-            current().write(folder)
-
     title, total = f"training {record.algorithm}", _total_steps(record, model, first_step)
     with Progress(title, total, done=first_step, console=console, enabled=progress) as bar:
-        callback = _Callback(log, bar, save_checkpoint, record.checkpoint_every, names)
+        callback = _Callback(model, record, folder, log, bar)
         try:
             if first_step < record.steps:
                 model.learn(
@@ -72,11 +57,11 @@ def learn(
                     reset_num_timesteps=first_step == 0,
                     tb_log_name="run",
                 )
-                save_checkpoint()
+                callback.save_checkpoint()
         finally:
             log.close()
             env.close()
-    record = current()
+    record = callback.record()
     content = io.BytesIO()
     with defer_interrupts():
         model.save(content)
@@ -93,43 +78,54 @@ class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped w
     """
 
     def __init__(
-        self,
-        log: EpisodeLog,
-        progress: Progress,
-        save_checkpoint: Callable[[], None],
-        checkpoint_every: int,
-        agents: Sequence[str],
+        self, model: Any, record: RunRecord, folder: Path, log: EpisodeLog, progress: Progress
     ) -> None:
         super().__init__()
-        self._log, self._progress, self._save_checkpoint = log, progress, save_checkpoint
-        self._every, self._agents = checkpoint_every, agents
-        self._lanes_each = max(1, len(agents))
+        self.model = model
+        self._record, self._folder = record, folder
+        self._log, self._progress = log, progress
         self._wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
         self._start = time.monotonic()
 
+    def record(self) -> RunRecord:
+        """The record with its present progress."""
+        steps, seconds = self._steps_done, self._wall_seconds
+        return self._record.updated(
+            steps_done=steps,
+            episodes=len(self._log.episodes),
+            wall_seconds=round(seconds, 3),
+            steps_per_second=round(steps / max(seconds, 1e-9), 3),
+        )
+
+    def save_checkpoint(self) -> None:
+        """Write the checkpoint and the record."""
+        with defer_interrupts():
+            checkpoint.save(self.model, self._folder / checkpoint.FILE)
+            self.record().write(self._folder)
+
     @property
-    def wall_seconds(self) -> float:
+    def _wall_seconds(self) -> float:
         """Seconds of training over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
     @property
-    def steps_done(self) -> int:
+    def _steps_done(self) -> int:
         """Environment steps of the whole run over all environments."""
-        return int(self.num_timesteps) // self._lanes_each
+        return int(self.model.num_timesteps) // self._record.agents
 
     def _on_training_start(self) -> None:
         # return, length, sum of regret and sum of similarity of the current episode in each lane
         self._sums = np.zeros((4, self.training_env.num_envs))
-        self._last_checkpoint = self.steps_done
+        self._last_checkpoint = self._steps_done
         self._start = time.monotonic()
         self._note = self._running_mean()
 
     def _on_rollout_start(self) -> None:
         # Between rollouts the model is consistent: it has learnt from all transitions, and they are
         # in its replay buffer. For off-policy algorithms that is after each environment step.
-        if self.steps_done - self._last_checkpoint >= self._every:
-            self._save_checkpoint()
-            self._last_checkpoint = self.steps_done
+        if self._steps_done - self._last_checkpoint >= self._record.checkpoint_every:
+            self.save_checkpoint()
+            self._last_checkpoint = self._steps_done
 
     def _on_step(self) -> bool:
         infos, dones = self.locals["infos"], self.locals["dones"]
@@ -138,35 +134,36 @@ class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped w
         self._sums[2] += [info["regret"] for info in infos]
         self._sums[3] += [info["similarity"] for info in infos]
         # The lanes of a team end together, so checking the first one is enough.
-        for lane in np.flatnonzero(dones[:: self._lanes_each]) * self._lanes_each:
+        agents = self._record.agents
+        for lane in np.flatnonzero(dones[::agents]) * agents:
             self._log_episode(int(lane), int(not infos[lane]["TimeLimit.truncated"]))
         if dones.any():
             self._note = self._running_mean()
-        self._progress.update(self.steps_done, self._note)
+        self._progress.update(self._steps_done, self._note)
         return True
 
     def _log_episode(self, lane: int, terminated: int) -> None:
         """Log the episode that ended in this lane, or in a team's lanes from this one on."""
-        lanes = slice(lane, lane + self._lanes_each)
+        lanes = slice(lane, lane + self._record.agents)
         returned, length, regret, similarity = self._sums[:, lanes].mean(axis=1).tolist()
-        regrets = (self._sums[2, lanes] / length).tolist() if self._agents else []
+        regrets = (self._sums[2, lanes] / length).tolist() if self._log.agents else []
         self._sums[:, lanes] = 0.0
         self._log.add(
             Episode(
                 episode=len(self._log.episodes) + 1,
-                step=self.steps_done,
+                step=self._steps_done,
                 episode_return=returned,
                 length=int(length),
                 regret=regret / length,
                 similarity=similarity / length,
                 terminated=terminated,
-                wall_seconds=round(self.wall_seconds, 3),
+                wall_seconds=round(self._wall_seconds, 3),
                 agents_regret=tuple(regrets),
             )
         )
         self.logger.record_mean("sme/regret", regret / length)
         self.logger.record_mean("sme/similarity", similarity / length)
-        for agent, value in zip(self._agents, regrets, strict=True):
+        for agent, value in zip(self._log.agents, regrets, strict=True):
             self.logger.record_mean(f"sme/regret/{agent}", value)
 
     def _running_mean(self) -> str:
@@ -174,7 +171,7 @@ class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped w
         if not recent:
             return ""
         regret = np.mean([episode.regret for episode in recent])
-        whose = "team's mean regret" if self._agents else "mean regret"
+        whose = "team's mean regret" if self._log.agents else "mean regret"
         return f"{whose} {regret:.3f} (last {len(recent)} episodes)"
 
 

@@ -22,44 +22,32 @@ PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch"
 class RunRecord(StrictModel):
     """A training run: its plan and its progress.
 
-    Attributes:
-      status: "running" (also after a kill), then "finished".
-      spec, spec_digest, algorithm, seed, action_range, num_envs: the plan, which must not change
-        when the run is resumed.
-      hyperparameters: whose defaults, and the changes to them.
-      agents: number of agents of the task; those of a team share the one policy that is trained.
-      steps: requested environment steps over all environments. A step of a team is one step of
-        all its agents, so the algorithm learns from `agents` times as many transitions.
-      steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their
-        last rollout, so it can exceed `steps`.
-      checkpoint_every: steps between checkpoints.
-      episodes: number of finished episodes, which episodes.csv lists.
-      sessions: 1 plus the number of times the run was resumed.
-      wall_seconds, steps_per_second: of the training over all sessions, without evaluation.
-      protocol, protocol_digest: of the final evaluation.
-      versions: of Python and the packages that the numbers depend on.
+    A step of a team is one step of all its agents, so the algorithm learns from `agents` times as
+    many transitions.
     """
 
     schema_version: Literal[1] = 1
-    status: Literal["running", "finished"]
+    status: Literal["running", "finished"]  # "running" also after a kill
     spec: SMESpec
     spec_digest: str
     algorithm: str
-    hyperparameters: str = DEFAULTS
+    hyperparameters: str = DEFAULTS  # whose defaults, and the changes to them
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
     agents: Integer = 1
-    steps: Integer
+    steps: Integer  # requested, of the environment, over all environments
+    # At the last checkpoint, and at the end. On-policy algorithms finish their last rollout, so it
+    # can exceed `steps`.
     steps_done: Integer = 0
-    checkpoint_every: Integer
-    episodes: Integer = 0
-    sessions: Integer = 1
-    wall_seconds: Annotated[Real, Field(ge=0)] = 0.0
+    checkpoint_every: Integer  # steps
+    episodes: Integer = 0  # finished ones, which episodes.csv lists
+    sessions: Integer = 1  # 1 plus the number of times the run was resumed
+    wall_seconds: Annotated[Real, Field(ge=0)] = 0.0  # over all sessions, without evaluation
     steps_per_second: Annotated[Real, Field(ge=0)] = 0.0
-    protocol: EvaluationProtocol
+    protocol: EvaluationProtocol  # of the final evaluation
     protocol_digest: str
-    versions: dict[str, str]
+    versions: dict[str, str]  # of Python and the packages that the numbers depend on
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:

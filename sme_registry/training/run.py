@@ -38,14 +38,7 @@ from sme_registry.training.algorithms import (
     rollout_steps,
 )
 from sme_registry.training.episodes import Episode
-from sme_registry.training.record import (
-    DEFAULTS,
-    MODEL,
-    PACKAGES,
-    RECORD,
-    TENSORBOARD,
-    RunRecord,
-)
+from sme_registry.training.record import DEFAULTS, MODEL, PACKAGES, RECORD, TENSORBOARD, RunRecord
 
 EVALUATION = "evaluation.json"
 DECAY_CURVE = "decay_curve.png"

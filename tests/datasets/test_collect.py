@@ -200,9 +200,10 @@ def test_coverage_zero_keeps_everything():
     assert collected(recipe(coverage=0.0)).digest == collected(recipe()).digest
 
 
-def test_a_sub_cube_that_is_too_small_is_rejected_before_the_work():
+@pytest.mark.parametrize("state_dim", [8, 200])  # 0.01²⁰⁰ is no positive float
+def test_a_sub_cube_that_is_too_small_is_rejected_before_the_work(state_dim):
     with pytest.raises(OptionError, match=r"coverage=-0\.99: 700 transitions need about"):
-        collected(recipe(coverage=-0.99))
+        collected(recipe({"state_dim": state_dim}, coverage=-0.99))
 
 
 def test_a_data_set_larger_than_memory_is_rejected():
