@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -31,6 +32,7 @@ SpecChanges = Annotated[
 Protocol = Annotated[
     str, typer.Option(help="Evaluation protocol: a name from `sme list`, or a path.")
 ]
+Out = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder.")]
 ActionRange = Annotated[
     str | None,
     typer.Option(
@@ -46,6 +48,8 @@ KINDS: dict[str, type[Envelope]] = {
     "study": StudyFile,
 }
 
+_File = TypeVar("_File", bound=Envelope)
+
 
 def kind_of(file: Envelope) -> str:
     """The kind of a file: `env`, `suite`, `protocol` or `study`."""
@@ -56,8 +60,7 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     """Read a file of any kind, which follows from the document in it.
 
     Raises:
-      MalformedDocumentError: not strict JSON, or not one of these files.
-      SpecError, DigestMismatchError: see `Envelope.from_dict`.
+      MalformedDocumentError, SpecError, DigestMismatchError: it is not one of these files.
     """
     data = read_json(path)
     for kind in KINDS.values():
@@ -66,6 +69,15 @@ def read_any(path: str | os.PathLike[str]) -> Envelope:
     refuse_bare_spec(data, os.fspath(path))
     contents = ", ".join(repr(kind.content) for kind in KINDS.values())
     raise MalformedDocumentError(f"{os.fspath(path)}: must be an object with one of {contents}.")
+
+
+def find_file(kind: type[_File], name: str) -> _File:
+    """The file of one kind with a name or path.
+
+    Raises:
+      UnknownNameError, SpecError: there is none, or it is invalid.
+    """
+    return kind.read(name) if is_path(name) else catalogue.find(kind, name)
 
 
 def find_any(name: str) -> Envelope | SMESpec:

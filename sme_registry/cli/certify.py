@@ -10,10 +10,17 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.errors import UnknownNameError
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile
-from sme_registry.terminal import err, mark, out, print_json, table
+from sme_registry.terminal import err, out, print_json, table
 
 if TYPE_CHECKING:
     from sme_registry.task.certify import Certificate
+
+_MARKS = {
+    "passed": "[green]passed[/]",
+    "warning": "[yellow]warning[/]",
+    "refused": "[red]refused[/]",
+    "reported": "[dim]reported[/]",
+}
 
 
 def certify(
@@ -78,20 +85,26 @@ def _print_line(label: str, certificate: Certificate) -> None:
         check.name if check.value is None else f"{check.name} {check.value:.3g}"
         for check in notable
     )
-    outcome = mark(certificate.outcome)
-    out().print(f"{outcome}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True)
+    out().print(
+        f"{_MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True
+    )
 
 
 def _print_certificate(label: str, certificate: Certificate) -> None:
+    def number(value: float | None, before: str = "") -> str:
+        return "" if value is None else f"{before}{value:.3g}"
+
+    rows = [
+        (
+            _MARKS[check.outcome],
+            f"[bold]{check.name}[/]",
+            number(check.value),
+            ", ".join(filter(None, (number(check.low, "≥ "), number(check.high, "≤ ")))),
+        )
+        for check in certificate.checks
+    ]
     columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
-    result = table(f"Certificate of {escape(label)}", columns)
-    for check in certificate.checks:
-        low = "" if check.low is None else f"≥ {check.low:.3g}"
-        high = "" if check.high is None else f"≤ {check.high:.3g}"
-        value = "" if check.value is None else f"{check.value:.3g}"
-        bounds = ", ".join(filter(None, (low, high)))
-        result.add_row(mark(check.outcome), f"[bold]{check.name}[/]", value, bounds)
-    out().print(result)
+    out().print(table(f"Certificate of {escape(label)}", columns, rows))
     out().print()
     for check in certificate.checks:
         out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")

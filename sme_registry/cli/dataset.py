@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 from sme_registry import load
 from sme_registry.cli.arguments import (
@@ -21,15 +23,11 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import catalogue
-from sme_registry.terminal import (
-    Progress,
-    err,
-    failure,
-    out,
-    print_json,
-    print_pairs,
-    table,
-)
+from sme_registry.terminal import Progress, err, failure, out, print_json, print_pairs, table
+
+if TYPE_CHECKING:
+    from sme_registry.datasets import Dataset
+    from sme_registry.datasets.scores import PolicyScore
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -123,19 +121,12 @@ def make(
             force=force,
             progress=progress.update_of,
         )
-    if json:
-        print_json(_summary(dataset))
-    else:
-        _print(dataset)
+    _print(dataset, json)
     err().print(f"wrote {escape(str(dataset.path))}{os.sep}", soft_wrap=True)
 
 
 def _weighted(text: str) -> tuple[Any, float]:
-    """Read `nu=0.5:0.7`, `random:0.1` or `policy=model.zip:0.2` as a policy and its weight.
-
-    Raises:
-      OptionError: it is none of these.
-    """
+    """Read `nu=0.5:0.7`, `random:0.1` or `policy=model.zip:0.2` as a policy and its weight."""
     policy, _, weight = text.rpartition(":")
     kind, _, value = policy.partition("=")
     try:
@@ -169,24 +160,7 @@ def list_(out_folder: Folder = None, json: Json = False) -> None:
     if json:
         print_json([_summary(dataset) for dataset in datasets])
     elif datasets:
-        numbers = ("transitions", "trajectories", "r̃", "r̃ of ½", "MB")
-        result = table(
-            "Data sets",
-            {"id": "text", **dict.fromkeys(numbers, "number")},
-            caption="r̃: similarity of the behaviour, and of the constant action ½, in the states "
-            "of the data set",
-        )
-        for dataset in datasets:
-            record = dataset.record
-            result.add_row(
-                dataset.id,
-                f"{record.recipe.transitions:,}",
-                f"{record.trajectories:,}",
-                f"{record.scores.behaviour.similarity:.3f}",
-                f"{record.scores.constant.similarity:.3f}",
-                f"{dataset.size_bytes / 1e6:.1f}",
-            )
-        out().print(result)
+        out().print(_datasets_table(datasets))
     else:
         err().print(
             f"There are no data sets in {escape(str(datasets_folder(out_folder)))}. "
@@ -209,11 +183,7 @@ def show(name: Name, out_folder: Folder = None, json: Json = False) -> None:
     """
     from sme_registry.datasets import open_dataset
 
-    dataset = open_dataset(name, out_folder)
-    if json:
-        print_json(_summary(dataset))
-    else:
-        _print(dataset)
+    _print(open_dataset(name, out_folder), json)
 
 
 @app.command("validate")
@@ -254,7 +224,29 @@ def validate(
         raise typer.Exit(2)
 
 
-def _summary(dataset: Any) -> dict[str, Any]:
+def _datasets_table(datasets: Sequence[Dataset]) -> Table:
+    numbers = ("transitions", "trajectories", "r̃", "r̃ of ½", "MB")
+    rows = [
+        (
+            dataset.id,
+            f"{dataset.recipe.transitions:,}",
+            f"{dataset.record.trajectories:,}",
+            f"{dataset.record.scores.behaviour.similarity:.3f}",
+            f"{dataset.record.scores.constant.similarity:.3f}",
+            f"{dataset.size_bytes / 1e6:.1f}",
+        )
+        for dataset in datasets
+    ]
+    return table(
+        "Data sets",
+        {"id": "text", **dict.fromkeys(numbers, "number")},
+        rows,
+        caption="r̃: similarity of the behaviour, and of the constant action ½, in the states of "
+        "the data set",
+    )
+
+
+def _summary(dataset: Dataset) -> dict[str, Any]:
     return {
         "id": dataset.id,
         "path": str(dataset.path),
@@ -263,15 +255,16 @@ def _summary(dataset: Any) -> dict[str, Any]:
     }
 
 
-def _print(dataset: Any) -> None:
-    """Print a data set's facts, then its scores."""
-    record = dataset.record
-    recipe = record.recipe
-    states = "all" if recipe.coverage is None else f"E(s) ≤ {recipe.coverage:g}"
+def _print(dataset: Dataset, json: bool) -> None:
+    """Print a data set's facts and scores."""
+    if json:
+        print_json(_summary(dataset))
+        return
+    record, recipe = dataset.record, dataset.recipe
     pairs: dict[str, object] = {
         "task": f"{catalogue.title(recipe.spec)}  {record.spec_digest}",
         "transitions": f"{recipe.transitions:,} in {record.trajectories:,} trajectories",
-        "states": states,
+        "states": "all" if recipe.coverage is None else f"E(s) ≤ {recipe.coverage:g}",
         "seeds": f"task {record.seeds.task}, data {record.seeds.data}",
         "protocol": record.protocol_digest,
         "recipe": record.recipe_digest,
@@ -280,24 +273,27 @@ def _print(dataset: Any) -> None:
     if recipe.expected_similarity is not None:
         pairs["expected r̃ for uniform ã and a*"] = f"{recipe.expected_similarity:.4f}"
     print_pairs(f"[bold]{escape(dataset.id)}[/]", pairs)
-    result = table(
+    scores = record.scores
+    rows = [_score_row("constant ½", scores.constant), _score_row("behaviour", scores.behaviour)]
+    if len(recipe.behaviours) > 1:
+        rows += [
+            _score_row(f"  {behaviour.label}", score, f"{behaviour.weight:g}")
+            for behaviour, score in zip(recipe.behaviours, scores.behaviours, strict=True)
+        ]
+    scores_table = table(
         "Scores",
         {"policy": "text", **dict.fromkeys(("weight", "r̃", "r", "return"), "number")},
+        [*rows, _score_row("optimum", scores.optimum)],
         caption="similarity r̃ and step reward r in the states of the data set · return of whole "
         "episodes, ± standard error",
     )
-    scores = record.scores
-    rows = [("constant ½", "", scores.constant), ("behaviour", "", scores.behaviour)]
-    if len(recipe.behaviours) > 1:
-        rows += [
-            (f"  {behaviour.label}", f"{behaviour.weight:g}", score)
-            for behaviour, score in zip(recipe.behaviours, scores.behaviours, strict=True)
-        ]
-    for policy, weight, score in [*rows, ("optimum", "", scores.optimum)]:
-        rollouts = score.rollouts
-        returns = "" if rollouts is None else f"{rollouts.mean_return:.2f}"
-        if rollouts is not None and rollouts.episodes:
-            returns += f" ± {rollouts.standard_error:.2f}"
-        numbers = f"{score.similarity:.4f}", f"{score.step_reward:.4f}"
-        result.add_row(escape(policy), weight, *numbers, returns)
-    out().print(result)
+    out().print(scores_table)
+
+
+def _score_row(policy: str, score: PolicyScore, weight: str = "") -> tuple[str, ...]:
+    rollouts = score.rollouts
+    returns = "" if rollouts is None else f"{rollouts.mean_return:.2f}"
+    if rollouts is not None and rollouts.episodes:
+        returns += f" ± {rollouts.standard_error:.2f}"
+    numbers = f"{score.similarity:.4f}", f"{score.step_reward:.4f}"
+    return escape(policy), weight, *numbers, returns

@@ -98,19 +98,14 @@ def regret_by_stage(result: TrainingResult) -> list[tuple[int, int, float]]:
 
 def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
     columns = {"steps": "number", "regret": "number", "": "name"}
-    result = table("Mean regret during training (0 is optimal)", columns)
-    for first, last, regret in stages:
-        result.add_row(f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
-    return result
+    rows = [
+        (f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
+        for first, last, regret in stages
+    ]
+    return table("Mean regret during training (0 is optimal)", columns, rows)
 
 
 def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str:
-    template = environment(Path(__file__).parent / "templates", autoescape=False)
-    text = template.get_template("demo.md.jinja").render(
-        task=TASK,
-        record=result.record,
-        report=result.report,
-        stages=stages,
-        figures=result.figures,
-    )
+    templates = environment(Path(__file__).parent / "templates", autoescape=False)
+    text = templates.get_template("demo.md.jinja").render(task=TASK, result=result, stages=stages)
     return f"{text}\n"

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry import load
-from sme_registry.cli.arguments import ActionRange, Force, SpecChanges, changes
+from sme_registry.cli.arguments import ActionRange, Force, Json, Out, SpecChanges, changes
 from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing, to_json, write_atomically
@@ -34,8 +34,7 @@ def diagnose(
         str | None, typer.Option("--task", "-t", help="RUN is a policy, for this task.")
     ] = None,
     cell: Annotated[
-        str | None,
-        typer.Option(help="RUN is a study's folder; the start of a cell's key."),
+        str | None, typer.Option(help="RUN is a study's folder; the start of a cell's key.")
     ] = None,
     against: Annotated[
         str | None,
@@ -52,23 +51,22 @@ def diagnose(
             help="Fit a network of the same layers to the optimal actions; takes under a minute.",
         ),
     ] = False,
-    out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help=f"Folder for {_JSON}, {_PAGE} and figures.")
-    ] = None,
+    out_folder: Out = None,
     action_range: ActionRange = None,
     set_: SpecChanges = None,
     states: Annotated[int, typer.Option(help="Uniform states to evaluate in.")] = 8192,
     episodes: Annotated[int, typer.Option(help="Episodes to evaluate.")] = 64,
     seed: Annotated[int, typer.Option(help="Seed of these states and start states.")] = 0,
     force: Force = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the diagnosis as JSON.")] = False,
+    json: Json = False,
 ) -> None:
     """Show where a policy's regret occurs and what most likely causes it. Takes seconds.
 
     Where: by action channel, state region, distance out of distribution, and time in the episode.
     Likely causes: exploration, credit assignment (k), sparse reward (r_min), capacity (L),
     dimension, survival (D), and budget. The answer is "cannot tell" if the evidence does not
-    separate causes; --against or --probe-capacity then often help.
+    separate causes; --against or --probe-capacity then often help. With --out, it also writes
+    diagnosis.json, diagnosis.md and figures.
 
     Loading a model's .zip can run code: use only files whose author you trust.
 
@@ -94,9 +92,9 @@ def diagnose(
     subject = _subject(run, task, cell, set_, action_range)
     other = None
     if against is not None:
-        other = _other_cell(run, task, cell, against)
-        if other is None:
-            other = _subject(against, task, None, set_, action_range)
+        other = _other_cell(run, task, cell, against) or _subject(
+            against, task, None, set_, action_range
+        )
     result = diagnosis.diagnose(
         subject,
         against=other,
@@ -118,11 +116,7 @@ def diagnose(
 def _subject(
     run: str, task: str | None, cell: str | None, set_: list[str] | None, action_range: str | None
 ) -> Subject:
-    """The run, cell or policy that the arguments name.
-
-    Raises:
-      OptionError: the arguments contradict each other, or RUN is not a folder.
-    """
+    """The run, cell or policy that the arguments name."""
     from sme_registry import diagnosis
 
     if cell is not None and task is not None:

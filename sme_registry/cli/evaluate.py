@@ -11,6 +11,8 @@ from sme_registry import load
 from sme_registry.cli.arguments import (
     ActionRange,
     Force,
+    Json,
+    Out,
     Protocol,
     SpecChanges,
     TaskName,
@@ -32,15 +34,15 @@ def evaluate(
     ],
     task: TaskName,
     protocol: Protocol = "paper-v1",
-    out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for evaluation.json and the figures.")
-    ] = None,
+    out_folder: Out = None,
     action_range: ActionRange = None,
     set_: SpecChanges = None,
     force: Force = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    json: Json = False,
 ) -> None:
     """Evaluate a policy in and out of distribution, compared with reference policies.
+
+    With --out, it also writes evaluation.json and figures.
 
     A function takes observations `[B, S + 2]` and returns actions `[B, A]`, in [0, 1] unless
     --action-range is symmetric; so does an .onnx network. A .zip of Stable-Baselines3 can run code
@@ -89,13 +91,10 @@ def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
 
     figures = [plots.decay_curve(report, target.with_name("decay_curve.png"))]
     if report.spec.state_dim == 2 and report.spec.team is None:
+        path, action_range = target.with_name("similarity_map.png"), report.action_range
         figures.append(
             plots.similarity_map(
-                policy,
-                report.spec,
-                target.with_name("similarity_map.png"),
-                action_range=report.action_range,
-                name=report.policy,
+                policy, report.spec, path, action_range=action_range, name=report.policy
             )
         )
     return figures

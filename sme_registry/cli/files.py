@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
+import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
+from rich.table import Table
 
 from sme_registry.errors import OptionError
-from sme_registry.io import refuse_existing
-from sme_registry.terminal import err
+from sme_registry.io import is_installed, refuse_existing
+from sme_registry.terminal import err, out, print_json
 
 
 def check_document_path(path: Path, *, force: bool) -> None:
@@ -26,10 +28,23 @@ def check_document_path(path: Path, *, force: bool) -> None:
 
 def can_draw() -> bool:
     """Whether figures can be drawn; prints a warning if not."""
-    if importlib.util.find_spec("matplotlib") is not None:
+    if is_installed("matplotlib"):
         return True
     err().print("no figures: matplotlib is not installed (pip install 'sme-registry\\[plot]')")
     return False
+
+
+def print_training(
+    result: Any, folder: Path, tables: Iterable[Table] = (), *, json: bool = False
+) -> None:
+    """Print the record and report of a training in a folder as JSON, or its tables."""
+    if json:
+        record, report = result.record.to_dict(), result.report.to_dict()
+        print_json({"folder": str(folder), "run": record, "evaluation": report})
+        return
+    for each in (*tables, result.report.table()):
+        out().print(each)
+    out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
 
 
 def print_written(paths: Iterable[Path]) -> None:

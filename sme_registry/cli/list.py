@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -15,14 +16,7 @@ from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catal
 from sme_registry.spec.envelope import Envelope
 from sme_registry.terminal import out, print_json, table
 
-
-class Kind(enum.StrEnum):
-    """What `sme list` shows."""
-
-    env = "env"
-    suite = "suite"
-    protocol = "protocol"
-    study = "study"
+Kind = enum.StrEnum("Kind", ["env", "suite", "protocol", "study"])
 
 
 def list_(
@@ -82,63 +76,59 @@ def summary(file: Envelope) -> dict[str, Any]:
 
 def _env_table(files: list[EnvFile]) -> Table:
     numbers = ("n", "S", "A", "L", "k", "r_min", "D", "T")
-    result = table(
-        "Environments",
-        {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
-        caption="n agents · S state channels, A action channels · L layers of π* · k reward "
-        "interval · T horizon",
-    )
+    rows = []
     for file in files:
         spec = file.spec
         values = (
             1 if spec.team is None else len(spec.team.agents), spec.state_dim, spec.action_dim,
             spec.complexity, spec.k, spec.r_min, spec.D, spec.horizon,
         )  # fmt: skip
-        result.add_row(
-            f"{catalogue.NAMESPACE}/{file.versioned_name}",
-            *(f"{value:g}" for value in values),
-            " ".join(file.tags),
-        )
-    return result
+        name = f"{catalogue.NAMESPACE}/{file.versioned_name}"
+        rows.append((name, *(f"{value:g}" for value in values), " ".join(file.tags)))
+    return table(
+        "Environments",
+        {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
+        rows,
+        caption="n agents · S state channels, A action channels · L layers of π* · k reward "
+        "interval · T horizon",
+    )
 
 
 def _suite_table(files: list[SuiteFile]) -> Table:
-    result = table(
-        "Suites", {"name": "name", "classes": "number", "tasks": "number", "description": "text"}
-    )
-    for file in files:
-        counts = len(file.suite.classes), len(file.suite.instances)
-        result.add_row(file.versioned_name, *map(str, counts), escape(file.description))
-    return result
+    columns = {"name": "name", "classes": "number", "tasks": "number", "description": "text"}
+    counts = ((len(file.suite.classes), len(file.suite.instances)) for file in files)
+    return table("Suites", columns, _rows(files, counts))
 
 
 def _protocol_table(files: list[ProtocolFile]) -> Table:
     columns = {"name": "name", "regions": "number", "states each": "number", "description": "text"}
-    result = table("Protocols", columns)
-    for file in files:
-        protocol = file.protocol
-        counts = str(len(protocol.edges)), f"{protocol.states_per_region:,}"
-        result.add_row(file.versioned_name, *counts, escape(file.description))
-    return result
+    counts = ((len(file.protocol.edges), file.protocol.states_per_region) for file in files)
+    return table("Protocols", columns, _rows(files, counts))
 
 
 def study_table(files: list[StudyFile]) -> Table:
     """The plans of studies: how many classes, algorithms, seeds and cells."""
     columns = {"name": "name", "classes": "number", "algorithms": "text"}
-    result = table(
-        "Studies", {**columns, "seeds": "number", "cells": "number", "description": "text"}
-    )
-    for file in files:
-        plan = file.plan
-        result.add_row(
-            file.versioned_name,
-            str(len(plan.classes)),
-            escape(", ".join(algorithm.name for algorithm in plan.algorithms)),
-            str(plan.seeds),
-            f"{len(plan.classes) * len(plan.algorithms) * plan.seeds:,}",
-            escape(file.description),
+    columns |= {"seeds": "number", "cells": "number", "description": "text"}
+    counts = (
+        (
+            len(file.plan.classes),
+            escape(", ".join(algorithm.name for algorithm in file.plan.algorithms)),
+            file.plan.seeds,
+            len(file.plan.classes) * len(file.plan.algorithms) * file.plan.seeds,
         )
-    return result
+        for file in files
+    )
+    return table("Studies", columns, _rows(files, counts))
+
+
+def _rows(
+    files: Sequence[Envelope], values: Iterable[tuple[int | str, ...]]
+) -> Iterator[tuple[str, ...]]:
+    """Each file's name, values and description."""
+    for file, row in zip(files, values, strict=True):
+        texts = (f"{value:,}" if isinstance(value, int) else value for value in row)
+        yield file.versioned_name, *texts, escape(file.description)
 
 
 _TABLES: dict[str, Any] = {

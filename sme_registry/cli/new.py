@@ -147,11 +147,7 @@ def new(
 def _equal_team(
     start: SMESpec, action_dim: Any, agents: int, channels_each: int | None
 ) -> dict[str, Any]:
-    """The fields `team` and `action_dim` of a team of equal agents.
-
-    Raises:
-      OptionError: the channels cannot be shared equally, or contradict --action-dim.
-    """
+    """The fields `team` and `action_dim` of a team of equal agents."""
     integer_in("--agents", agents, 1)
     if channels_each is None:
         A = start.action_dim if action_dim is None else action_dim
@@ -172,11 +168,7 @@ def _equal_team(
 
 
 def _with_reward(start: SMESpec, team: Any, reward: str) -> dict[str, Any]:
-    """A team, given or of the task to start from, with another reward.
-
-    Raises:
-      OptionError: there is no team.
-    """
+    """The team, by default of the task to start from, with another reward."""
     if team is None and start.team is not None:
         team = start.team.to_dict()
     if not isinstance(team, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +9,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli.arguments import Force, changes
-from sme_registry.terminal import Progress, err, out, print_json, table
+from sme_registry.cli.arguments import Force, Json, Out, changes
+from sme_registry.cli.files import print_training
+from sme_registry.terminal import Progress, err, table
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -49,20 +49,16 @@ def train(
         Path | None,
         typer.Option("--datasets", help="Folder of data sets; default Minari's."),
     ] = None,
-    out_folder: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Output folder; default runs/DATASET-ALGORITHM-seedN."),
-    ] = None,
+    out_folder: Out = None,
     force: Force = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the record and the report as JSON.")
-    ] = False,
+    json: Json = False,
 ) -> None:
     """Train behaviour cloning (bc) or implicit Q-learning (iql) on a data set, and evaluate it.
 
     The policy learns from the data alone. Every evaluation runs 10 episodes in the task and
     compares their mean similarity r̃ with the data set's. 20,000 steps take a few minutes on one
-    core. The output folder contains policy.npz, offline.json, evaluation.json and a figure.
+    core. The output folder, by default runs/DATASET-ALGORITHM-seedN, contains policy.npz,
+    offline.json, evaluation.json and a figure.
 
     Hyperparameters: hidden, learning_rate; for iql also discount, expectile, inverse_temperature,
     max_weight, target_rate.
@@ -99,33 +95,21 @@ def train(
             force=force,
             progress=lambda done, total, note: progress.update(done, note),
         )
-    if json:
-        report = result.report.to_dict()
-        print_json(
-            {"folder": str(out_folder), "training": result.record.to_dict(), "evaluation": report}
-        )
-        return
-    out().print(_scores(result.record))
-    out().print(result.report.table())
-    out().print(f"All files are in {escape(str(out_folder))}{os.sep}", soft_wrap=True)
+    print_training(result, out_folder, [_scores(result.record)], json=json)
 
 
 def _scores(record: Any) -> Table:
     behaviour, last = record.behaviour, record.evaluations[-1]
     algorithm = record.algorithm.upper()
-    result = table(
+    rows = [
+        (name, f"{each.similarity:.3f}", f"{each.similarity_sd:.3f}")
+        for name, each in (
+            (f"behaviour, {record.transitions:,} transitions", behaviour),
+            (f"{algorithm}, {record.episodes} episodes", last),
+        )
+    ]
+    return table(
         f"{algorithm} on {escape(record.dataset)}",
         {"": "text", "r̃": "number", "SD over steps": "number"},
+        [*rows, ("improvement", f"{record.improvement:+.3f}", "")],
     )
-    result.add_row(
-        f"behaviour, {record.transitions:,} transitions",
-        f"{behaviour.similarity:.3f}",
-        f"{behaviour.similarity_sd:.3f}",
-    )
-    result.add_row(
-        f"{algorithm}, {record.episodes} episodes",
-        f"{last.similarity:.3f}",
-        f"{last.similarity_sd:.3f}",
-    )
-    result.add_row("improvement", f"{record.improvement:+.3f}", "")
-    return result

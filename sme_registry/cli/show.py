@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import itertools
 import math
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from sme_registry.spec import (
     StudyFile,
     StudyPlan,
     Suite,
+    SuiteClass,
     SuiteFile,
     TeamSpec,
     catalogue,
@@ -30,29 +32,18 @@ from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import known_specs
 from sme_registry.terminal import out, print_json, print_pairs, table
 
-
-class Schema(enum.StrEnum):
-    """The document whose JSON Schema `sme show --json-schema` prints."""
-
-    spec = "spec"
-    env_file = "env-file"
-    suite = "suite"
-    suite_file = "suite-file"
-    protocol = "protocol"
-    protocol_file = "protocol-file"
-    study = "study"
-    study_file = "study-file"
-
-
-_SCHEMAS: dict[Schema, type[BaseModel]] = {
-    Schema.spec: SMESpec,
-    Schema.env_file: EnvFile,
-    Schema.suite: Suite,
-    Schema.suite_file: SuiteFile,
-    Schema.protocol: EvaluationProtocol,
-    Schema.protocol_file: ProtocolFile,
-    Schema.study: StudyPlan,
-    Schema.study_file: StudyFile,
+Schema = enum.StrEnum(
+    "Schema", "spec env-file suite suite-file protocol protocol-file study study-file"
+)
+_SCHEMAS: dict[str, type[BaseModel]] = {
+    "spec": SMESpec,
+    "env-file": EnvFile,
+    "suite": Suite,
+    "suite-file": SuiteFile,
+    "protocol": EvaluationProtocol,
+    "protocol-file": ProtocolFile,
+    "study": StudyPlan,
+    "study-file": StudyFile,
 }
 _SHORT = len("sha256:") + 12  # characters of a digest that name a task
 
@@ -211,27 +202,24 @@ def _agents(spec: SMESpec) -> list[dict[str, Any]]:
 
 def _agents_table(agents: list[dict[str, Any]]) -> Table:
     wrapped = ("action channels", "observed state channels", "observation", "rewarded for")
-    result = table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")})
-    for agent in agents:
-        result.add_row(
+    rows = [
+        (
             escape(agent["name"]),
             _ranges(agent["action_channels"]),
             _ranges(agent["observed_channels"]),
             escape(f"[{agent['observation_dim']}]"),
             agent["rewarded_for"],
         )
-    return result
+        for agent in agents
+    ]
+    return table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")}, rows)
 
 
 def _ranges(channels: list[int]) -> str:
     """Increasing channels as ranges: `0–3, 6`."""
-    runs: list[list[int]] = []
-    for channel in channels:
-        if runs and channel == runs[-1][-1] + 1:
-            runs[-1].append(channel)
-        else:
-            runs.append([channel])
-    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+    runs = itertools.groupby(enumerate(channels), lambda pair: pair[1] - pair[0])
+    ends = [(run[0][1], run[-1][1]) for run in (list(group) for _, group in runs)]
+    return ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in ends)
 
 
 def _show_suite(file: SuiteFile, json: bool) -> None:
@@ -243,23 +231,28 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
         ]
         print_json({**file.to_dict(), "derived": {"instances": instances}})
         return
-    default = SMESpec().to_dict()
     columns = {"class": "name", "differs from the default in": "text", "seed": "number"}
-    result = table(_title(file), {**columns, "task": "name"}, caption=file.digest)
-    for member in file.suite.classes:
-        changed = {k: v for k, v in member.setting.to_dict().items() if v != default[k]}
-        if member.setting.team is not None:
-            changed["team"] = _team_summary(member.setting.team)
-        result.add_row(
+    rows = [
+        (
             member.name,
-            escape(", ".join(f"{k}={v}" for k, v in changed.items())),
+            escape(_changes(member)),
             "\n".join(str(seed) for seed in member.seeds),
             "\n".join(spec.digest[:_SHORT] for spec in member.instances),
         )
-    out().print(result)
+        for member in file.suite.classes
+    ]
+    out().print(table(_title(file), {**columns, "task": "name"}, rows, caption=file.digest))
     first = file.suite.instances[0].digest
     if first in known_specs():  # tasks of a file outside the catalogue have no name to train by
         out().print(f"To train on a task: sme train {first[:_SHORT]}", soft_wrap=True)
+
+
+def _changes(member: SuiteClass) -> str:
+    """The fields that differ from the default: `k=10, r_min=0.5`."""
+    default, fields = SMESpec().to_dict(), member.setting.to_dict()
+    if member.setting.team is not None:
+        fields["team"] = _team_summary(member.setting.team)
+    return ", ".join(f"{k}={v}" for k, v in fields.items() if v != default[k])
 
 
 def _title(file: Envelope) -> str:

@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 import enum
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from sme_registry.cli import study_new, study_plan
-from sme_registry.cli.arguments import Json
+from sme_registry.cli.arguments import Json, Out, find_file
 from sme_registry.cli.study_plan import (
     Evaluations,
     Jobs,
     Only,
     Seeds,
     Steps,
-    find_plan,
     scaled_plan,
     unique,
 )
 from sme_registry.errors import OptionError
+from sme_registry.spec import StudyFile
 from sme_registry.terminal import duration_range, err, out, print_json, table
 
 if TYPE_CHECKING:
-    from sme_registry.studies.engine.status import CellStatus, StudyStatus
+    from sme_registry.studies.engine.status import CellStatus, State, StudyStatus
 
 _FAILURES_SHOWN = 20
+ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -47,14 +49,6 @@ app = typer.Typer(
 )
 app.command("new")(study_new.new)
 app.command("plan")(study_plan.plan)
-
-
-class ExecutorName(enum.StrEnum):
-    """Where cells run."""
-
-    processes = "processes"
-    in_process = "in-process"
-    ray = "ray"
 
 
 @app.command("run")
@@ -84,7 +78,7 @@ def run(
     seeds: Seeds = None,
     evaluations: Evaluations = None,
     only: Only = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the final status as JSON.")] = False,
+    json: Json = False,
 ) -> None:
     """Run the cells of a plan that have no result in the folder.
 
@@ -108,10 +102,10 @@ def run(
     """
     from sme_registry.studies.engine.runner import run_study
 
-    if ray is not None and executor not in (None, ExecutorName.ray):
+    if ray is not None and executor not in (None, "ray"):
         raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
-        scaled_plan(find_plan(plan), steps, seeds, evaluations),
+        scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations),
         folder,
         executor=executor or ("processes" if ray is None else "ray"),
         jobs=jobs,
@@ -121,10 +115,7 @@ def run(
         only=only or (),
         console=err(),
     )
-    if json:
-        print_json(status.to_dict())
-    else:
-        _print_status(status)
+    _print_status(status, json)
     if status.failed:
         err().print(
             f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] Add --retry "
@@ -156,21 +147,16 @@ def status(
     """
     from sme_registry.studies.engine.status import study_status
 
-    result = study_status(
-        folder, only or (), lambda file: scaled_plan(file, steps, seeds, evaluations)
-    )
-    if json:
-        print_json(result.to_dict())
-    else:
-        _print_status(result)
+    def scale(file: StudyFile) -> StudyFile:
+        return scaled_plan(file, steps, seeds, evaluations)
+
+    _print_status(study_status(folder, only or (), scale), json)
 
 
 @app.command("report")
 def report(
     folder: Annotated[Path, typer.Argument(help="The study's folder.")],
-    out_folder: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default FOLDER/report.")
-    ] = None,
+    out_folder: Out = None,
     formats: Annotated[
         str,
         typer.Option("--format", metavar="FORMATS", help="Any of these, separated by commas."),
@@ -179,7 +165,8 @@ def report(
     """Report which property of the task breaks an algorithm, and how certain that is.
 
     It writes a self-contained page index.html, the figures as PNG and PDF, every number as CSV, and
-    LaTeX tables. It uses the cells finished so far, so it may be run during the study.
+    LaTeX tables, by default to FOLDER/report. It uses the cells finished so far, so it may be run
+    during the study.
 
     Maps of tasks with two state channels need the models kept by `sme study run --keep-models`.
     Loading a model can run code: use only models whose author you trust.
@@ -194,29 +181,30 @@ def report(
 
     chosen = [name.strip() for name in formats.split(",") if name.strip()]
     files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)))
-    others = [path for path in files if path.name != "index.html"]
     for path in files:
         if path.name == "index.html":
             out().print(escape(str(path)), soft_wrap=True)
-    for parent in dict.fromkeys(path.parent for path in others):
-        count = sum(path.parent == parent for path in others)
+    counts = Counter(path.parent for path in files if path.name != "index.html")
+    for parent, count in counts.items():
         out().print(f"{escape(str(parent))}  {count} files", soft_wrap=True)
 
 
-def _print_status(status: StudyStatus) -> None:
+def _print_status(status: StudyStatus, json: bool) -> None:
+    if json:
+        print_json(status.to_dict())
+        return
     from sme_registry.studies.engine.executors import available_cores
     from sme_registry.studies.engine.status import STATES
 
     algorithms = unique(cell.planned.algorithm for cell in status.cells)
-    result = table(
-        f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}",
-        {"class": "name", **{escape(name): "number" for name in algorithms}},
-    )
+    title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
+    columns = {"class": "name", **{escape(name): "number" for name in algorithms}}
     counts = status.counts
-    for class_name in unique(cell.planned.class_name for cell in status.cells):
-        row = [counts.get((class_name, name)) for name in algorithms]
-        result.add_row(class_name, *("" if each is None else _counts(each) for each in row))
-    out().print(result)
+    rows = (
+        (class_name, *(_counts(counts.get((class_name, name))) for name in algorithms))
+        for class_name in unique(cell.planned.class_name for cell in status.cells)
+    )
+    out().print(table(title, columns, rows))
     out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")
@@ -249,8 +237,10 @@ def _print_failure(status: StudyStatus, cell: CellStatus) -> None:
     )
 
 
-def _counts(counts: Any) -> str:
-    """`7 +2 !1 / 10`: done, running, failed, all."""
+def _counts(counts: Counter[State] | None) -> str:
+    """`7 +2 !1 / 10`: done, running, failed, all; empty without cells."""
+    if counts is None:
+        return ""
     text = f"{counts['done']}"
     if counts["running"]:
         text += f" [cyan]+{counts['running']}[/]"

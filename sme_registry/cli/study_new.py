@@ -10,12 +10,12 @@ import typer
 from rich.markup import escape
 
 from sme_registry import load
-from sme_registry.cli.arguments import Force, Protocol
+from sme_registry.cli.arguments import Force, Protocol, find_file
 from sme_registry.cli.files import check_document_path
-from sme_registry.cli.study_plan import find_plan, scaled_plan, warn_of_unavailable
+from sme_registry.cli.study_plan import scaled_plan, warn_of_unavailable
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.io import read_json
-from sme_registry.spec import StudyFile, StudyPlan, SuiteClass, SuiteFile, catalogue
+from sme_registry.spec import StudyFile, StudyPlan, SuiteFile, catalogue
 from sme_registry.spec.resolve import is_path
 from sme_registry.terminal import err, out
 
@@ -88,6 +88,7 @@ def new(
     check_document_path(path, force=force)
     about = {"name": name, "description": description}
     about = {field: text for field, text in about.items() if text is not None}
+    default_name = {"name": path.stem}
     if source is None:
         fields = {
             "classes": _classes(suite, task or ()),
@@ -100,13 +101,12 @@ def new(
         plan = StudyPlan.from_dict(fields, str(path))
         draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
         data = scaled_plan(draft, steps, None, None).plan.to_dict()
-        file = StudyFile.with_digest(data, str(path), **{"name": path.stem, **about})
+        file = StudyFile.with_digest(data, str(path), **default_name | about)
     else:
         _refuse_other_options(context)
-        data = read_json(source) if is_path(source) else find_plan(source).to_dict()
+        data = read_json(source) if is_path(source) else find_file(StudyFile, source).to_dict()
         named = isinstance(data, dict) and "name" in data
-        default_name = {} if named else {"name": path.stem}
-        file = StudyFile.with_digest(data, source, **{**default_name, **about})
+        file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.
     uses = (algorithm.uses for algorithm in file.plan.algorithms)
     warn_of_unavailable(uses, MissingDependencyError)
@@ -116,11 +116,7 @@ def new(
 
 
 def _refuse_other_options(context: typer.Context) -> None:
-    """Check that no option is given that the plan of --from already sets.
-
-    Raises:
-      OptionError: names the option.
-    """
+    """Check that no option is given that the plan of --from already sets."""
     for option in context.params:
         origin = context.get_parameter_source(option)
         # By name: newer versions of Typer include their own Click.
@@ -132,33 +128,24 @@ def _refuse_other_options(context: typer.Context) -> None:
 
 
 def _classes(suite: str | None, tasks: Sequence[str]) -> list[dict[str, Any]]:
-    """The classes of a suite, and one for each task.
-
-    Raises:
-      OptionError, UnknownNameError, SpecError: there is none, or a name is unknown.
-    """
+    """The classes of a suite, and one for each task."""
     classes = []
     if suite is not None:
-        file = SuiteFile.read(suite) if is_path(suite) else catalogue.find(SuiteFile, suite)
-        classes += [member.to_dict() for member in file.suite.classes]
+        members = find_file(SuiteFile, suite).suite.classes
+        classes += [member.to_dict() for member in members]
     for task in tasks:
         spec = load(task)
         setting = spec.to_dict()
         seed = setting.pop("seed")
         title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
-        member = SuiteClass.from_dict({"name": title, "setting": setting, "seeds": [seed]})
-        classes.append(member.to_dict())
+        classes.append({"name": title, "setting": setting, "seeds": [seed]})
     if not classes:
         raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
     return classes
 
 
 def _algorithms(texts: Sequence[str], ranges: Sequence[str]) -> list[dict[str, Any]]:
-    """Each `[NAME=]USES` with each action range.
-
-    Raises:
-      OptionError: there is none.
-    """
+    """Each `[NAME=]USES` with each action range."""
     if not texts:
         raise OptionError("--algorithm: is required, such as --algorithm PPO.")
     algorithms = []

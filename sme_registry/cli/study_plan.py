@@ -10,11 +10,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli.arguments import Json
+from sme_registry.cli.arguments import Json, find_file
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import PlannedCell, StudyFile, catalogue
-from sme_registry.spec.resolve import is_path
 from sme_registry.terminal import duration_range, err, out, print_json, table
 
 Steps = Annotated[
@@ -83,7 +82,7 @@ def plan(
     if plan is None:
         _list_plans(json)
         return
-    file = scaled_plan(find_plan(plan), steps, seeds, evaluations)
+    file = scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations)
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
@@ -96,9 +95,9 @@ def plan(
         return Span(*(makespan([span[i] for span in spans], workers) for i in (0, 1)))
 
     here = jobs or available_cores()
-    times = {"one core": seconds(1), f"this machine, {here} at once": seconds(here)}
+    workers = {"one core": 1, f"this machine, {here} at once": here}
     if cores is not None:
-        times[f"a cluster, {cores} cores"] = seconds(cores)
+        workers[f"a cluster, {cores} cores"] = cores
     done = len(cells) - len(waiting)
     if json:
         print_json(
@@ -114,8 +113,7 @@ def plan(
                     {cell.uses for cell in waiting if estimator.knows(cell)}
                 ),
                 "seconds": [
-                    {"cores": n, **seconds(n)._asdict()}
-                    for n in dict.fromkeys([1, here, *([] if cores is None else [cores])])
+                    {"cores": n, **seconds(n)._asdict()} for n in dict.fromkeys(workers.values())
                 ],
             }
         )
@@ -123,8 +121,8 @@ def plan(
     out().print(_plan_table(file, planned, estimator.seconds))
     finished = f", {done:,} of them finished" if results else ""
     out().print(f"{len(cells):,} cells{finished}. Estimated time:")
-    for place, span in times.items():
-        out().print(f"  {place + ':':32}{duration_range(*span)}")
+    for place, n in workers.items():
+        out().print(f"  {place + ':':32}{duration_range(*seconds(n))}")
     unmeasured = sorted({cell.uses for cell in waiting if not estimator.knows(cell)})
     if unmeasured:
         out().print(
@@ -144,34 +142,28 @@ def _list_plans(json: bool) -> None:
 def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -> Table:
     classes = unique(cell.class_name for cell in planned)
     numbers = ("classes", "runs each", "steps", "evaluations", "cells", "time per run")
-    result = table(
-        f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
-        {"algorithm": "name", **dict.fromkeys(numbers, "number")},
-        caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
-    )
+    rows = []
     for name in unique(cell.algorithm for cell in planned):
         cells = [cell for cell in planned if cell.algorithm == name]
         first = cells[0].cell
         spans = [seconds(each.cell) for each in cells]
-        result.add_row(
-            escape(name),
-            str(len({each.class_name for each in cells})),
-            str(len({each.run for each in cells})),
-            f"{first.steps:,}",
-            f"{first.evaluations:,} × {first.evaluation_episodes}",
-            f"{len(cells):,}",
-            duration_range(min(span.low for span in spans), max(span.high for span in spans)),
+        rows.append(
+            (
+                escape(name),
+                str(len({each.class_name for each in cells})),
+                str(len({each.run for each in cells})),
+                f"{first.steps:,}",
+                f"{first.evaluations:,} × {first.evaluation_episodes}",
+                f"{len(cells):,}",
+                duration_range(min(span.low for span in spans), max(span.high for span in spans)),
+            )
         )
-    return result
-
-
-def find_plan(name: str) -> StudyFile:
-    """A plan by its name or path.
-
-    Raises:
-      UnknownNameError, SpecError: there is none, or it is not a valid plan.
-    """
-    return StudyFile.read(name) if is_path(name) else catalogue.find(StudyFile, name)
+    return table(
+        f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
+        {"algorithm": "name", **dict.fromkeys(numbers, "number")},
+        rows,
+        caption=f"{file.digest}\n{len(classes)} classes: {escape(', '.join(classes))}",
+    )
 
 
 def scaled_plan(
@@ -200,21 +192,16 @@ def scaled_plan(
 
 
 def warn_of_unavailable(uses: Iterable[str], errors: type[SMEError]) -> None:
-    """Warn about the algorithms of a plan that cannot run here.
-
-    Args:
-      uses: of the plan's algorithms.
-      errors: those that become a warning; others are raised.
-    """
+    """Warn about algorithms that cannot run here; errors of other types are raised."""
     from sme_registry.studies.engine.cell import refuse_unknown_algorithm
 
-    messages: dict[str, None] = {}
-    for name in dict.fromkeys(uses):
+    messages = []
+    for name in unique(uses):
         try:
             refuse_unknown_algorithm(name)
         except errors as error:
-            messages[str(error)] = None  # one message for several algorithms is printed once
-    for message in messages:
+            messages.append(str(error))
+    for message in unique(messages):  # several algorithms may lack the same package
         err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
 
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any, cast
 
 import typer
-from rich.markup import escape
 
 from sme_registry import load
-from sme_registry.cli.arguments import Force, Protocol, SpecChanges, TaskName, changes
+from sme_registry.cli.arguments import (
+    Force,
+    Json,
+    Out,
+    Protocol,
+    SpecChanges,
+    TaskName,
+    changes,
+)
+from sme_registry.cli.files import print_training
 from sme_registry.spec import SMESpec
-from sme_registry.terminal import err, out, print_json
+from sme_registry.terminal import err
 
 
 def train(
@@ -27,14 +34,7 @@ def train(
         int, typer.Option("--steps", "-n", help="Environment steps; for a team, of the team.")
     ] = 20_000,
     seed: Annotated[int, typer.Option(help="Seed of the algorithm and of the start states.")] = 0,
-    out_folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Output folder; default runs/TASK-ALGORITHM-seedN.",
-        ),
-    ] = None,
+    out_folder: Out = None,
     action_range: Annotated[
         str, typer.Option(help="Action space: symmetric, [-1, 1], or unit, [0, 1].")
     ] = "symmetric",
@@ -55,15 +55,14 @@ def train(
         bool, typer.Option("--resume", help="Continue a run that was interrupted.")
     ] = False,
     force: Force = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the run and its report as JSON.")
-    ] = False,
+    json: Json = False,
 ) -> None:
     """Train an algorithm of Stable-Baselines3, log the exact regret of each episode, evaluate it.
 
     It uses SB3's default hyperparameters on one CPU thread, which is fastest for networks of this
-    size. PPO and A2C finish their last rollout. The output folder contains episodes.csv,
-    checkpoint.zip, model.zip, run.json, evaluation.json, figures, and TensorBoard's logs.
+    size. PPO and A2C finish their last rollout. The output folder, by default
+    runs/TASK-ALGORITHM-seedN, contains episodes.csv, checkpoint.zip, model.zip, run.json,
+    evaluation.json, figures, and TensorBoard's logs.
 
     The agents of a team share one policy (for its observation see `sme evaluate --help`).
     episodes.csv then has the team's mean regret, and one column per agent, such as regret/agent_0.
@@ -110,29 +109,18 @@ def train(
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(how_to_continue(out_folder)) from None
-    if json:
-        report = result.report.to_dict()
-        run = result.record.to_dict()
-        print_json({"folder": str(out_folder), "run": run, "evaluation": report})
-        return
-    out().print(result.report.table())
-    out().print(f"All files are in {escape(str(out_folder))}{os.sep}", soft_wrap=True)
+    print_training(result, out_folder, json=json)
 
 
 def _label(task: str, spec: SMESpec, *, changed: bool) -> str:
-    """A task's name in a folder's name: its own if it has one, otherwise its name by content."""
+    """A task's name in a folder's name; a changed or unnamed task is named by content."""
     if changed or task.startswith("sha256"):
         return spec.content_name
     return Path(task).name.removesuffix(".json").removesuffix("-v1")
 
 
 def how_to_continue(folder: Path, command: str = "the same command with --resume") -> str:
-    """The message after an interrupted training.
-
-    Args:
-      folder: of the run.
-      command: what continues it.
-    """
+    """The message after an interrupted training in a folder, which `command` continues."""
     from sme_registry.training import RunRecord
 
     if RunRecord.read(folder) is None:

@@ -61,11 +61,7 @@ def _check(path: Path) -> dict[str, Any]:
     result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
     try:
         file = read_any(path)
-        result |= {
-            "kind": kind_of(file),
-            "name": file.versioned_name,
-            "digest": file.digest,
-        }
+        result |= {"kind": kind_of(file), "name": file.versioned_name, "digest": file.digest}
         if isinstance(file, EnvFile):
             materialize(file.spec, file.fingerprint)
         elif isinstance(file, SuiteFile):

@@ -3,7 +3,7 @@
 from sme_registry.terminal.commands import CommandGroup, application, version_option
 from sme_registry.terminal.latex import escape_latex
 from sme_registry.terminal.numbers import duration, duration_range, fixed
-from sme_registry.terminal.output import err, failure, mark, out, print_json, print_pairs, table
+from sme_registry.terminal.output import err, failure, out, print_json, print_pairs, table
 from sme_registry.terminal.progress import Progress
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "escape_latex",
     "failure",
     "fixed",
-    "mark",
     "out",
     "print_json",
     "print_pairs",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -11,13 +11,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from sme_registry.io import to_json
-
-_MARKS = {
-    "passed": "[green]passed[/]",
-    "warning": "[yellow]warning[/]",
-    "refused": "[red]refused[/]",
-    "reported": "[dim]reported[/]",
-}
 
 
 class _Out(Console):
@@ -58,17 +51,19 @@ def print_pairs(title: str, pairs: dict[str, object]) -> None:
     out().print(table)
 
 
-def mark(outcome: str) -> str:
-    """An outcome of `certify`, coloured."""
-    return _MARKS[outcome]
-
-
-def table(title: str, columns: Mapping[str, str], *, caption: str = "") -> Table:
-    """An empty table.
+def table(
+    title: str,
+    columns: Mapping[str, str],
+    rows: Iterable[Sequence[str]] = (),
+    *,
+    caption: str = "",
+) -> Table:
+    """A table.
 
     Args:
       title: above it.
       columns: heading → "name" (never wrapped), "number" (to the right) or "text" (wrapped).
+      rows: their cells, with Rich's markup.
       caption: below it.
     """
     result = Table(
@@ -84,4 +79,6 @@ def table(title: str, columns: Mapping[str, str], *, caption: str = "") -> Table
             no_wrap=kind == "name",
             overflow="fold" if kind == "text" else "ellipsis",
         )
+    for row in rows:
+        result.add_row(*row)
     return result

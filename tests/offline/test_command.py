@@ -60,8 +60,8 @@ def test_json_is_the_record_and_the_report(folder: Path, tmp_path: Path) -> None
     )
     assert code == 0, stderr
     output = json.loads(stdout)
-    assert output["training"]["algorithm"] == "bc"
-    assert output["training"]["hyperparameters"]["hidden"] == [8]
+    assert output["run"]["algorithm"] == "bc"
+    assert output["run"]["hyperparameters"]["hidden"] == [8]
     assert len(output["evaluation"]["regions"]) == 6
 
 

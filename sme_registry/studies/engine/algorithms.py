@@ -55,11 +55,7 @@ class Learner(Protocol):
 
 
 def reference_name(uses: str) -> str | None:
-    """The policy that `reference:…` names; None for a learner.
-
-    Raises:
-      UnknownNameError: no such reference.
-    """
+    """The policy that `reference:…` names, as `named_after` reads it."""
     return named_after(REFERENCE, uses, POLICIES)
 
 

@@ -20,7 +20,6 @@ from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import versions, write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import (
-    Learner,
     find_algorithm,
     new_learner,
     reference_name,
@@ -107,7 +106,7 @@ class _Recorder:
         self._report_every = max(1, cell.steps // _REPORTS)
         n = cell.evaluations
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
-        self.rows: list[tuple[int, float, float, float, float]] = []
+        self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
         self.steps, self.regret = 0, 0.0
         self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
 
@@ -142,9 +141,10 @@ class _Recorder:
 
     def curve(self) -> LearningCurve:
         """The learning curve."""
-        columns = zip(*self.rows, strict=True) if self.rows else [()] * 5
-        names = ("steps", "episode_return", "regret", "similarity", "length")
-        return LearningCurve(**dict(zip(names, columns, strict=True)))
+        if not self.rows:
+            return LearningCurve()
+        columns = zip(*self.rows, strict=True)
+        return LearningCurve(**dict(zip(LearningCurve.model_fields, columns, strict=True)))
 
     def timing(self, total: float) -> Timing:
         """Where the time went; `total` is the whole run's."""
@@ -205,17 +205,12 @@ def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy:
     recorder.training_seconds = learning - env.seconds
     while len(recorder.rows) < cell.evaluations:
         evaluate_now(env.steps)
-    if model_path is not None:
-        _save(learner, model_path)
-    return numpy_policy(learner, cell.spec, action_range=cell.action_range)
-
-
-def _save(learner: Learner, path: Path) -> None:
     save = getattr(learner, "save", None)
-    if save is not None:
+    if model_path is not None and save is not None:
         archive = io.BytesIO()
         save(archive)
-        write_atomically(path, archive.getvalue())
+        write_atomically(model_path, archive.getvalue())
+    return numpy_policy(learner, cell.spec, action_range=cell.action_range)
 
 
 def versions_for(uses: str) -> dict[str, str]:
@@ -225,10 +220,7 @@ def versions_for(uses: str) -> dict[str, str]:
 
 
 def refuse_unknown_algorithm(uses: str) -> None:
-    """Check that an algorithm can be found, before anything runs.
-
-    Args:
-      uses: of a plan's algorithm, of any kind.
+    """Check that an algorithm of any kind can be found, before anything runs.
 
     Raises:
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.

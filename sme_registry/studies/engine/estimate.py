@@ -48,11 +48,7 @@ class Span(NamedTuple):
 
 
 class Estimator:
-    """Estimates the seconds of cells; improves as cells finish.
-
-    Args:
-      finished: results to learn from.
-    """
+    """Estimates the seconds of cells; improves as cells finish."""
 
     def __init__(self, finished: Iterable[CellResult] = ()) -> None:
         self._ratios: dict[str | tuple[str, SMESpec], list[float]] = defaultdict(list)

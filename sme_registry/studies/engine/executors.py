@@ -1,8 +1,7 @@
 """Where a study's cells run: in this process, in a process each, or as tasks of a Ray cluster.
 
 Every executor is one `map`: it takes the next cell when a worker is free, and yields the outcomes
-in the order in which cells end. A result travels as the JSON of its file and is validated on
-arrival. The caller of `map` writes it: only the driver touches the study's folder.
+in the order in which cells end. Its caller writes them: only the driver touches the study's folder.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from sme_registry.io import parse_json, to_json, versions
+from sme_registry.io import versions
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.result import CellFailure, CellResult
@@ -33,13 +32,10 @@ TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
 _SECONDS_BETWEEN_REPORTS = 0.5
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a cell ended: a result, or a failure."""
+class Outcome(NamedTuple):
+    """How a cell ended: its result or failure, and the .zip of its model if that is kept."""
 
-    cell: Cell
-    result: CellResult | None = None
-    failure: CellFailure | None = None
+    entry: CellResult | CellFailure
     model: bytes | None = None
 
 
@@ -70,24 +66,9 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-class Message(NamedTuple):
-    """What a worker sends when its cell ends: a result or a failure as JSON text."""
-
-    failed: bool
-    text: str
-    model: bytes | None = None
-
-    def outcome(self, cell: Cell) -> Outcome:
-        """The validated outcome."""
-        data = parse_json(self.text, "the cell's result")
-        if self.failed:
-            return Outcome(cell, failure=CellFailure.from_dict(data))
-        return Outcome(cell, result=CellResult.from_dict(data), model=self.model)
-
-
 def run_one(
     run: RunCell, cell: Cell, keep_model: bool, progress: Callable[[int, int], None]
-) -> Message:
+) -> Outcome:
     """Run a cell; an exception becomes its failure, so that the process goes on."""
     try:
         with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
@@ -96,13 +77,12 @@ def run_one(
             model = path.read_bytes() if path.exists() else None
         if result.key != cell.digest:
             raise RuntimeError(f"the result belongs to another cell, {result.key}")
-        return Message(False, to_json(result.to_dict()), model)
+        return Outcome(result, model)
     except (Exception, SystemExit) as error:
-        name = type(error).__name__
-        return failure_message(cell, f"{name}: {error}", traceback.format_exc())
+        return failed(cell, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def failure_message(cell: Cell, error: str, details: str = "") -> Message:
+def failed(cell: Cell, error: str, details: str) -> Outcome:
     """A cell's failure, with the end of its traceback or output."""
     failure = CellFailure(
         key=cell.digest,
@@ -111,7 +91,7 @@ def failure_message(cell: Cell, error: str, details: str = "") -> Message:
         traceback=details[-TRACEBACK_CHARACTERS:],
         versions=versions(PACKAGES),
     )
-    return Message(True, to_json(failure.to_dict()))
+    return Outcome(failure)
 
 
 def _throttled(report: Callable[[int, int], None]) -> Callable[[int, int], None]:
@@ -143,19 +123,21 @@ class InProcess:
                 time.sleep(POLL_SECONDS)
                 continue
             report = functools.partial(progress, cell)
-            yield run_one(self.run, cell, self.keep_models, report).outcome(cell)
+            yield run_one(self.run, cell, self.keep_models, report)
 
 
 class ConcurrentExecutor(ABC):
     """Keeps as many cells running as there are workers.
 
     Args:
-      jobs: cells at once.
+      jobs: cells at once; None for one per core that can be used.
       run: runs a cell; importable by name.
       keep_models: whether outcomes carry the trained model.
     """
 
-    def __init__(self, jobs: int | None, run: RunCell, keep_models: bool) -> None:
+    def __init__(
+        self, jobs: int | None = None, run: RunCell = run_cell, keep_models: bool = False
+    ) -> None:
         self._jobs, self._run, self._keep_models = jobs, run, keep_models
         self._running: dict[Any, Any] = {}
 
@@ -173,7 +155,7 @@ class ConcurrentExecutor(ABC):
         """Start a cell and add it to those running."""
 
     @abstractmethod
-    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         """Wait up to `POLL_SECONDS`, report progress, and remove the cells that have ended."""
 
     def map(self, cells: Iterator[Cell | None], progress: ReportProgress) -> Iterator[Outcome]:
@@ -188,8 +170,7 @@ class ConcurrentExecutor(ABC):
                         break
                     self._start(cell)
                 if self._running:
-                    for cell, message in self._ended(progress):
-                        yield message.outcome(cell)
+                    yield from self._ended(progress)
                 elif not exhausted:
                     time.sleep(POLL_SECONDS)
 

@@ -13,7 +13,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import Lock, file_lock, is_locked, read_json, to_json, write_atomically
@@ -72,11 +72,7 @@ class Ledger:
         return None
 
     def write_plan(self, file: StudyFile) -> None:
-        """Write the plan; results of earlier plans stay.
-
-        Raises:
-          OptionError: it cannot be written.
-        """
+        """Write the plan; results of earlier plans stay."""
         file.write(self.folder / PLAN)
 
     def result(self, key: str) -> CellResult | None:
@@ -106,13 +102,13 @@ class Ledger:
           OptionError: it cannot be written; existing files are unchanged.
         """
         if isinstance(entry, CellFailure):
-            write_atomically(self._path(FAILED, entry.key), to_json(entry.to_dict()))
+            write_atomically(self.failure_path(entry.key), to_json(entry.to_dict()))
             return
         if model is not None:  # first: a kill in between must not leave a result without its model
             write_atomically(self.model_path(entry.key), model)
         write_atomically(self._path(CELLS, entry.key), to_json(entry.to_dict()))
         with contextlib.suppress(FileNotFoundError):
-            self._path(FAILED, entry.key).unlink()
+            self.failure_path(entry.key).unlink()
 
     def model_path(self, key: str) -> Path:
         """Where a cell's trained model is, if it was kept."""
@@ -140,24 +136,25 @@ class Ledger:
         Raises:
           OptionError: it cannot be renamed.
         """
-        self._set_aside(CellResult, self._path(CELLS, key), key)
-        self._set_aside(CellFailure, self._path(FAILED, key), key)
-
-    def _set_aside(self, kind: type[_Entry], path: Path, key: str) -> None:
-        if not path.exists():
-            return
-        try:
-            _read_entry(kind, path, key)
-        except SMEError as error:
-            aside = path.with_name(f"{path.name}.corrupt")
+        kinds: dict[type[Any], Path] = {
+            CellResult: self._path(CELLS, key),
+            CellFailure: self.failure_path(key),
+        }
+        for kind, path in kinds.items():
+            if not path.exists():
+                continue
             try:
-                path.replace(aside)
-            except OSError as reason:
-                raise OptionError(
-                    f"{path}: is invalid and cannot be renamed: {reason.strerror}. Remove it. "
-                    f"{error}"
-                ) from None
-            self.warn(f"{error} Renamed to {aside.name}; the cell runs again.")
+                _read_entry(kind, path, key)
+            except SMEError as error:
+                aside = path.with_name(f"{path.name}.corrupt")
+                try:
+                    path.replace(aside)
+                except OSError as reason:
+                    raise OptionError(
+                        f"{path}: is invalid and cannot be renamed: {reason.strerror}. Remove it. "
+                        f"{error}"
+                    ) from None
+                self.warn(f"{error} Renamed to {aside.name}; the cell runs again.")
 
     def _path(self, folder: str, key: str) -> Path:
         return self.folder / folder / f"{_hex(key)}.json"
@@ -182,11 +179,7 @@ def _hex(key: str) -> str:
 
 
 def _read_entry(kind: type[_Entry], path: Path, key: str) -> _Entry:
-    """Read a file's entry.
-
-    Raises:
-      SMEError: it cannot be read, is of another kind, or belongs to another cell than its name.
-    """
+    """Read a file's entry; an `SMEError` if it is invalid or belongs to another cell."""
     entry = kind.from_dict(read_json(path), str(path))
     if not key == entry.key == entry.cell.digest:
         raise OptionError(f"{path}: belongs to the cell {entry.cell.digest}, not to its file name.")

@@ -30,11 +30,7 @@ BATCH_SIZE = 256
 
 
 def offline_name(uses: str) -> str | None:
-    """The learner that `offline:…` names; None for other kinds of names.
-
-    Raises:
-      UnknownNameError: no such learner.
-    """
+    """The learner that `offline:…` names, as `algorithms.named_after` reads it."""
     return named_after(OFFLINE, uses, ALGORITHMS)
 
 
@@ -54,14 +50,13 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
     settings: dict[str, Any] = dict(cell.hyperparameters)
     nu: Any = settings.get("nu")
     recipe = _recipe(cell, settings)
-    batch_size = settings.pop("batch_size", BATCH_SIZE)
     data = collect(recipe, materialize(cell.spec), {})
     collected = time.thread_time()
     result = train_offline(
         data,
         algorithm=name,
         steps=cell.steps,
-        batch_size=batch_size,
+        batch_size=settings.pop("batch_size", BATCH_SIZE),
         seed=cell.seed,
         evaluations=max(1, cell.evaluations),
         episodes=cell.evaluation_episodes,
@@ -106,11 +101,7 @@ def run_offline(cell: Cell, name: str, progress: Callable[[int, int], None]) -> 
 
 
 def _recipe(cell: Cell, settings: dict[str, Any]) -> DatasetRecipe:
-    """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`.
-
-    Raises:
-      OptionError, SpecError: see `run_offline`.
-    """
+    """The recipe of a cell's data set; takes its `nu` and `transitions` out of `settings`."""
     if cell.spec.D > 0:
         raise SpecError(f"D={cell.spec.D:g}: must be 0 for an offline cell. Leave it out.")
     if "nu" not in settings:

@@ -23,15 +23,14 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     POLL_SECONDS,
     ConcurrentExecutor,
-    Message,
+    Outcome,
     ReportProgress,
     RunCell,
     available_cores,
-    failure_message,
+    failed,
     run_one,
 )
 from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts
@@ -49,17 +48,7 @@ class Processes(ConcurrentExecutor):
 
     A cell whose process is killed is a failed cell. The processes end with this one, however it
     ends, and ignore Ctrl-C, which this process handles.
-
-    Args:
-      jobs: processes at once; None for one per core that this process may use.
-      run: runs a cell; importable by name.
-      keep_models: whether outcomes carry the trained model.
     """
-
-    def __init__(
-        self, jobs: int | None = None, run: RunCell = run_cell, keep_models: bool = False
-    ) -> None:
-        super().__init__(jobs, run, keep_models)
 
     @property
     def workers(self) -> int:
@@ -83,13 +72,13 @@ class Processes(ConcurrentExecutor):
             process = _CellProcess.start(self._run, cell, self._keep_models, self._scratch)
             self._running[process.pipe] = process
 
-    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         for pipe in connection.wait(list(self._running), POLL_SECONDS):
             process = self._running[pipe]
             received = process.receive()
-            if isinstance(received, Message):
+            if isinstance(received, Outcome):
                 del self._running[pipe]
-                yield process.cell, received
+                yield received
             else:
                 progress(process.cell, *received)
 
@@ -114,14 +103,14 @@ class _CellProcess:
         child_end.close()  # so that the pipe ends when the process does
         return cls(cell, process, pipe, log)
 
-    def receive(self) -> Message | tuple[int, int]:
-        """Its next steps done and in all, or the message after which the process has ended."""
+    def receive(self) -> Outcome | tuple[int, int]:
+        """Its next steps done and in all, or its outcome once the process has ended."""
         try:
             received = self.pipe.recv()
         except (EOFError, OSError):
             self.kill()
             return self._death()
-        if isinstance(received, Message):
+        if isinstance(received, Outcome):
             self.process.join(_SECONDS_TO_END)
             self.kill()
         return received  # type: ignore[no-any-return]
@@ -131,14 +120,14 @@ class _CellProcess:
         self.process.join()
         self.pipe.close()
 
-    def _death(self) -> Message:
+    def _death(self) -> Outcome:
         code = self.process.exitcode
         killed_by = next((each.name for each in signal.Signals if each == -code), None)
         how = f"was killed by {killed_by}" if killed_by else f"ended with exit code {code}"
         hint = " Memory may have run out: try fewer --jobs." if killed_by == "SIGKILL" else ""
         output = self.log.read_text(errors="replace") if self.log.exists() else ""
         error = f"the cell's process {how}.{hint} Run it again with --retry."
-        return failure_message(self.cell, error, output)
+        return failed(self.cell, error, output)
 
 
 def _child(pipe: Any, run: RunCell, cell: Cell, keep_model: bool, log: Path) -> None:

@@ -17,11 +17,11 @@ from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     POLL_SECONDS,
     ConcurrentExecutor,
-    Message,
+    Outcome,
     ReportProgress,
     RunCell,
     available_cores,
-    failure_message,
+    failed,
     run_one,
 )
 
@@ -93,22 +93,17 @@ class OnRay(ConcurrentExecutor):
         task = self._task.remote(self._steps, self._run, cell, self._keep_models)
         self._running[task] = cell
 
-    def _ended(self, progress: ReportProgress) -> Iterator[tuple[Cell, Message]]:
+    def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         ready, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
         for reference in ready:
-            cell = self._running.pop(reference)
-            yield cell, self._message(reference, cell)
+            yield self._outcome(reference, self._running.pop(reference))
         by_key = {cell.digest: cell for cell in self._running.values()}
         for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
             if key in by_key:
                 progress(by_key[key], done, total)
 
     def _connect(self) -> None:
-        """Connect, unless this process is connected already.
-
-        Raises:
-          OptionError: the cluster cannot be reached.
-        """
+        """Connect, unless this process is connected already."""
         if self._ray.is_initialized():
             return
         options: dict[str, Any] = {"address": self._address}
@@ -124,12 +119,12 @@ class OnRay(ConcurrentExecutor):
             ) from None
         self._connected_here = True
 
-    def _message(self, reference: Any, cell: Cell) -> Message:
+    def _outcome(self, reference: Any, cell: Cell) -> Outcome:
         try:
-            return Message(*self._ray.get(reference))
+            return Outcome(*self._ray.get(reference))
         except self._ray.exceptions.RayError as error:
             text = str(error).strip()
-            return failure_message(
+            return failed(
                 cell,
                 f"{type(error).__name__}: lost {_RETRIES + 1} times: {text.splitlines()[0]} "
                 "Run it again with --retry.",
@@ -167,11 +162,7 @@ def _start_step_counts(ray: Any) -> Any:
 
 
 def _refuse_unreachable(address: str) -> None:
-    """Raise if nothing answers at an address: Ray itself would try for many minutes.
-
-    Raises:
-      OptionError: not host:port, or nothing answers there.
-    """
+    """Raise if nothing answers at an address: Ray itself would try for many minutes."""
     host, _, port = address.rpartition(":")
     try:
         socket.create_connection((host, int(port)), _SECONDS_TO_ANSWER).close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
@@ -22,7 +22,7 @@ from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, 
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.processes import Processes
 from sme_registry.studies.engine.ray_executor import OnRay
-from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.studies.engine.scaling import selected
 from sme_registry.studies.engine.status import StudyStatus, label, plan_status
 from sme_registry.terminal import Progress, duration
@@ -171,13 +171,39 @@ class _StudyRun:
             parts.append(f"{self._executor.workers} at once")
             parts.append(f"about {duration(self.seconds_left())}")
         say(f"study {self._file.versioned_name}: {' · '.join(parts)}")
-        results = self._results.values()
-        for note in (
-            _other_versions_note(results),
-            _missing_models_note(results, self._ledger) if keep_models else "",
-        ):
-            if note:
-                say(note)
+        self._announce_other_versions()
+        if keep_models:
+            self._announce_missing_models()
+
+    def _announce_other_versions(self) -> None:
+        installed = functools.cache(versions_for)
+        count, differences = 0, set[str]()
+        for result in self._results.values():
+            now = installed(result.cell.uses)
+            different = {
+                f"{package} {version} (installed: {now[package]})"
+                for package, version in result.versions.items()
+                if now.get(package, version) != version
+            }
+            count, differences = count + bool(different), differences | different
+        if count:
+            self._progress.message(
+                f"{count:,} of the reused results come from other package versions: "
+                f"{', '.join(sorted(differences))}. For results of one set of versions, run the "
+                "plan in a new folder."
+            )
+
+    def _announce_missing_models(self) -> None:
+        missing = sum(
+            # Only a cell that learnt by acting leaves a model.
+            result.online_regret is not None and not self._ledger.model_path(result.key).exists()
+            for result in self._results.values()
+        )
+        if missing:
+            self._progress.message(
+                f"{missing:,} of the finished cells have no model and are not run again. To get "
+                "their models, run the plan in a new folder."
+            )
 
     def run(self) -> None:
         """Run every waiting cell."""
@@ -234,10 +260,9 @@ class _StudyRun:
                 lock.release()
                 raise
             del self._waiting[key]
-            known = self._failures.get(key)
-            failed_since = failure is not None and failure.attempts > (
-                known.attempts if known else 0
-            )
+            earlier = self._failures.get(key)
+            attempts = earlier.attempts if earlier else 0
+            failed_since = failure is not None and failure.attempts > attempts
             if result is None and not failed_since:
                 self._running[key] = lock, time.monotonic()
                 self._progress.start_part(label(planned))
@@ -254,9 +279,10 @@ class _StudyRun:
         self._progress.update_part(label(self._planned[cell.digest]), share, note)
 
     def _handle(self, outcome: Outcome) -> None:
-        planned = self._planned[outcome.cell.digest]
-        if outcome.failure is not None:
-            self._progress.message(f"failed: {label(planned)}: {outcome.failure.error}")
+        entry = outcome.entry
+        if isinstance(entry, CellFailure):
+            name = label(self._planned[entry.key])
+            self._progress.message(f"failed: {name}: {entry.error}")
         try:
             self._write(outcome)
         except OptionError as error:
@@ -267,57 +293,19 @@ class _StudyRun:
             )
 
     def _write(self, outcome: Outcome) -> None:
-        key = outcome.cell.digest
-        if outcome.result is not None:
-            self._ledger.write(outcome.result, outcome.model)
-        elif outcome.failure is not None:
-            before = self._failures.get(key)
-            attempts = 1 if before is None else before.attempts + 1
-            self._ledger.write(outcome.failure.model_copy(update={"attempts": attempts}))
+        entry, key = outcome.entry, outcome.entry.key
+        if isinstance(entry, CellFailure) and key in self._failures:
+            attempts = self._failures[key].attempts + 1
+            entry = entry.model_copy(update={"attempts": attempts})
+        self._ledger.write(entry, outcome.model)
         lock, started = self._running.pop(key)
         lock.release()
-        if outcome.result is not None:
+        if isinstance(entry, CellResult):
             self.finished += 1
-            self._estimator.observe(outcome.result, time.monotonic() - started)
-        self._show_end(self._planned[key], failed=outcome.result is None)
+            self._estimator.observe(entry, time.monotonic() - started)
+        self._show_end(self._planned[key], failed=isinstance(entry, CellFailure))
 
     def _show_end(self, planned: PlannedCell, *, failed: bool) -> None:
         self._failed += failed
         self._progress.end_part(label(planned))
         self._progress.update(self.finished, f"{self._failed} failed" if self._failed else "")
-
-
-def _missing_models_note(results: Iterable[CellResult], ledger: Ledger) -> str:
-    """What to print about reused results whose model was not kept; empty if there are none."""
-    missing = sum(
-        # Only a cell that learnt by acting leaves a model.
-        result.online_regret is not None and not ledger.model_path(result.key).exists()
-        for result in results
-    )
-    if not missing:
-        return ""
-    return (
-        f"{missing:,} of the finished cells have no model and are not run again. To get their "
-        "models, run the plan in a new folder."
-    )
-
-
-def _other_versions_note(results: Iterable[CellResult]) -> str:
-    """What to print about reused results of other package versions; empty if there are none."""
-    installed = functools.cache(versions_for)
-    count, differences = 0, set[str]()
-    for result in results:
-        now = installed(result.cell.uses)
-        different = {
-            f"{package} {version} (installed: {now[package]})"
-            for package, version in result.versions.items()
-            if now.get(package, version) != version
-        }
-        count, differences = count + bool(different), differences | different
-    if not count:
-        return ""
-    return (
-        f"{count:,} of the reused results come from other package versions: "
-        f"{', '.join(sorted(differences))}. For results of one set of versions, run the plan in a "
-        "new folder."
-    )

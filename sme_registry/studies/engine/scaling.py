@@ -6,13 +6,17 @@ digest and name. The selection of the cells to run now is not: `selected` works 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 
 _SUFFIX, _LONGEST_NAME = "-scaled", 64
+_KINDS: dict[str, Callable[[PlannedCell], str]] = {
+    "class": lambda planned: planned.class_name,
+    "algorithm": lambda planned: planned.algorithm,
+}
 
 
 def scaled(
@@ -47,20 +51,15 @@ def scaled(
                 f"steps={name}={steps_of[name]}: the plan has no such algorithm."
                 f"{did_you_mean(name, known)} Its algorithms: {', '.join(known)}."
             )
-    plain = file.plan.to_dict()
-    if steps is not None:
-        plain["steps"] = steps
-    for algorithm in plain["algorithms"]:
+    budgets = {"steps": steps, "seeds": seeds, "evaluations": evaluations}
+    fields = file.plan.to_dict() | {k: v for k, v in budgets.items() if v is not None}
+    for algorithm in fields["algorithms"]:
         budget, name = algorithm["steps"], algorithm["name"]
         if name in steps_of:
             algorithm["steps"] = steps_of[name]
         elif steps is not None and budget != 0:  # 0: a reference, which does not train
             algorithm["steps"] = None
-    if seeds is not None:
-        plain["seeds"] = seeds
-    if evaluations is not None:
-        plain["evaluations"] = evaluations
-    plan = StudyPlan.from_dict(plain, "the scaled plan")
+    plan = StudyPlan.from_dict(fields, "the scaled plan")
     if plan == file.plan:
         return file
     name = file.name.removesuffix(_SUFFIX)[: _LONGEST_NAME - len(_SUFFIX)] + _SUFFIX
@@ -80,30 +79,24 @@ def selected(cells: Iterable[PlannedCell], only: Sequence[str] = ()) -> tuple[Pl
       UnknownNameError: a pattern matches nothing.
     """
     cells = tuple(cells)
-    patterns: dict[str, list[str]] = {"class": [], "algorithm": []}
-    names = {
-        "class": sorted({cell.class_name for cell in cells}),
-        "algorithm": sorted({cell.algorithm for cell in cells}),
-    }
+    matching: dict[str, set[str]] = {}  # the names that the patterns of each kind match
     for text in only:
         kind, equals, glob = text.partition("=")
-        if not equals or kind not in patterns:
+        if not equals or kind not in _KINDS:
             raise OptionError(
                 f"only={text!r}: must be class=GLOB or algorithm=GLOB, such as class='k-*'."
             )
-        if not any(fnmatchcase(name, glob) for name in names[kind]):
-            listed = ", ".join(names[kind][:12]) + (", …" if len(names[kind]) > 12 else "")
+        names = sorted({_KINDS[kind](cell) for cell in cells})
+        matches = [name for name in names if fnmatchcase(name, glob)]
+        if not matches:
+            listed = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
             raise UnknownNameError(
-                f"only={text!r}: matches no {kind} of the plan.{did_you_mean(glob, names[kind])} "
+                f"only={text!r}: matches no {kind} of the plan.{did_you_mean(glob, names)} "
                 f"Available: {listed}."
             )
-        patterns[kind].append(glob)
-
-    def matches(kind: str, name: str) -> bool:
-        return not patterns[kind] or any(fnmatchcase(name, glob) for glob in patterns[kind])
-
+        matching.setdefault(kind, set()).update(matches)
     return tuple(
         cell
         for cell in cells
-        if matches("class", cell.class_name) and matches("algorithm", cell.algorithm)
+        if all(_KINDS[kind](cell) in names for kind, names in matching.items())
     )

@@ -27,12 +27,9 @@ def label(planned: PlannedCell) -> str:
 
 @dataclass(frozen=True)
 class CellStatus:
-    """The state of a cell.
+    """The state of a planned cell, and its error if it failed.
 
-    Attributes:
-      planned: the cell, and its place in the plan.
-      state: "running" if any process runs it; "failed" if it failed and no process runs it again.
-      failure: its error, if it failed.
+    It is "running" if any process runs it, and "failed" if it failed and none runs it again.
     """
 
     planned: PlannedCell
