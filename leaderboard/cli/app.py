@@ -7,27 +7,18 @@ interrupted.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
 
 from leaderboard.cli import administration, demo, results, submissions
 from leaderboard.errors import Rejection, TamperedError
-from sme_registry.terminal import CommandGroup, application, version_option
+from sme_registry.terminal import CommandGroup, application
 
 
 class _Commands(CommandGroup):
-    """The commands of `sme-leaderboard`."""
-
-    program = "sme-leaderboard"
     exit_codes = ((Rejection, 1), (TamperedError, 3))
 
 
-app = application(_Commands)
-
-
-@app.callback()
-def _top(
-    version: Annotated[bool, version_option(_Commands.program)] = False,
-) -> None:
+app = application(
+    "sme-leaderboard",
     """A leaderboard that recomputes every score from the submitted policy.
 
     A board is a folder. Create one, score it and rank its entries:
@@ -41,8 +32,9 @@ def _top(
     To submit a method, use keygen, new, check and submit, in this order.
 
     Exit codes: 0 success, 1 rejected, 2 invalid usage, 3 tampering detected.
-    """
-
+    """,
+    _Commands,
+)
 
 _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "Submissions": {

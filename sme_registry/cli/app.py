@@ -6,60 +6,30 @@ Exit codes: 0 success; 1 a task refused by `certify`, or failed cells of a study
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+from sme_registry.cli import dataset, offline, study
+from sme_registry.cli.certify import certify
+from sme_registry.cli.demo import demo
+from sme_registry.cli.diagnose import diagnose
+from sme_registry.cli.evaluate import evaluate
+from sme_registry.cli.list import list_
+from sme_registry.cli.new import new
+from sme_registry.cli.show import show
+from sme_registry.cli.train import train
+from sme_registry.cli.validate import validate
+from sme_registry.terminal import application
 
-from sme_registry.cli import (
-    certify,
-    dataset,
-    demo,
-    diagnose,
-    evaluate,
-    list,
-    new,
-    offline,
-    show,
-    study,
-    train,
-    validate,
-)
-from sme_registry.terminal import CommandGroup, application, version_option
-
-
-class _Commands(CommandGroup):
-    """The commands of `sme`."""
-
-    program = "sme"
-
-
-app = application(_Commands)
-
-
-@app.callback()
-def _top(
-    version: Annotated[bool, version_option(_Commands.program)] = False,
-) -> None:
+app = application(
+    "sme",
     """Synthetic Monitoring Environments: control tasks whose optimal policy is known exactly.
 
     To start:  **sme list**  ·  **sme show Default**  ·  **sme demo**
 
     Your own task:  **sme new mine.json --complexity 10 --seed 3**
-    """
-
-
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "list": list.list_,
-    "show": show.show,
-    "new": new.new,
-    "validate": validate.validate,
-    "certify": certify.certify,
-    "evaluate": evaluate.evaluate,
-    "train": train.train,
-    "diagnose": diagnose.diagnose,
-    "demo": demo.demo,
-}
-for _name, _command in _COMMANDS.items():
-    app.command(_name)(_command)
+    """,
+)
+app.command("list")(list_)
+for _command in (show, new, validate, certify, evaluate, train, diagnose, demo):
+    app.command()(_command)
 app.add_typer(study.app, name="study")
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(offline.app, name="offline")

@@ -25,10 +25,7 @@ _STAGES = 10
 
 
 def demo(
-    out_folder: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="Output folder; must be new, or use --force."),
-    ] = FOLDER,
+    out_folder: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = FOLDER,
     steps: Annotated[
         int | None, typer.Option("--steps", "-n", help=f"Training steps; default {_STEPS:,}.")
     ] = None,

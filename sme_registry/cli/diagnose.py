@@ -40,8 +40,8 @@ def diagnose(
         str | None,
         typer.Option(
             metavar="RUN2",
-            help="Another run to compare with, for example with one field changed. Given like RUN; "
-            "STUDY:KEY is a study's cell.",
+            help="Another run to compare with, such as one with another field: like RUN, or "
+            "STUDY:KEY, a study's cell.",
         ),
     ] = None,
     probe_capacity: Annotated[

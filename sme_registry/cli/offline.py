@@ -13,11 +13,7 @@ from sme_registry.cli.arguments import Force, Json, Out, changes
 from sme_registry.cli.files import print_training
 from sme_registry.terminal import Progress, err, table
 
-app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    help="Offline reinforcement learning: train on a data set, never in the environment.",
-)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
 
 @app.callback()
@@ -34,20 +30,16 @@ def train(
     steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000,
     batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256,
     seed: Annotated[int, typer.Option(help="Seed of weights, shuffling and episodes.")] = 0,
-    evaluations: Annotated[
-        int, typer.Option(help="Evaluations during training, of 10 episodes each.")
-    ] = 20,
+    evaluations: Annotated[int, typer.Option(help="Evaluations during training.")] = 20,
     protocol: Annotated[
-        str | None,
-        typer.Option(help="Protocol of the final evaluation; default the data set's."),
+        str | None, typer.Option(help="Protocol of the last evaluation; default the data set's.")
     ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
     ] = None,
     folder: Annotated[
-        Path | None,
-        typer.Option("--datasets", help="Folder of data sets; default Minari's."),
+        Path | None, typer.Option("--datasets", help="Folder of data sets; default Minari's.")
     ] = None,
     out_folder: Out = None,
     force: Force = False,

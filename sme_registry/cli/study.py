@@ -12,15 +12,7 @@ from rich.markup import escape
 
 from sme_registry.cli import study_new, study_plan
 from sme_registry.cli.arguments import Json, Out, find_file
-from sme_registry.cli.study_plan import (
-    Evaluations,
-    Jobs,
-    Only,
-    Seeds,
-    Steps,
-    scaled_plan,
-    unique,
-)
+from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
 from sme_registry.errors import OptionError
 from sme_registry.spec import StudyFile
 from sme_registry.terminal import duration_range, err, out, print_json, table
@@ -71,8 +63,7 @@ def run(
         bool, typer.Option("--retry", help="Also run the cells that failed before.")
     ] = False,
     keep_models: Annotated[
-        bool,
-        typer.Option("--keep-models", help="Keep the models trained now, in FOLDER/models."),
+        bool, typer.Option("--keep-models", help="Keep the models trained now, in FOLDER/models.")
     ] = False,
     steps: Steps = None,
     seeds: Seeds = None,

@@ -25,9 +25,7 @@ _ALLOWED_WITH_FROM = ("path", "name", "description", "source", "force")
 def new(
     context: typer.Context,
     path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
-    suite: Annotated[
-        str | None, typer.Option(help="Classes of tasks: a suite's name or path.")
-    ] = None,
+    suite: Annotated[str | None, typer.Option(help="A suite of classes: name or path.")] = None,
     task: Annotated[
         list[str] | None,
         typer.Option("--task", "-t", help="A task as a class of its own. Repeatable."),

@@ -51,9 +51,7 @@ def train(
         int | None,
         typer.Option(help="Steps between checkpoints; default a twentieth of all, at least 1,000."),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a run that was interrupted.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     force: Force = False,
     json: Json = False,
 ) -> None:

@@ -1,6 +1,6 @@
 """Terminal output: tables, plain JSON, progress, and errors as one line."""
 
-from sme_registry.terminal.commands import CommandGroup, application, version_option
+from sme_registry.terminal.commands import CommandGroup, application
 from sme_registry.terminal.latex import escape_latex
 from sme_registry.terminal.numbers import duration, duration_range, fixed
 from sme_registry.terminal.output import err, failure, out, print_json, print_pairs, table
@@ -20,5 +20,4 @@ __all__ = [
     "print_json",
     "print_pairs",
     "table",
-    "version_option",
 ]

@@ -7,7 +7,7 @@ import io
 import os
 import sys
 from importlib import metadata
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -20,16 +20,14 @@ class CommandGroup(TyperGroup):
     """Commands that report invalid input as one line on standard error and an exit code.
 
     Attributes:
-      program: name of the command.
       exit_codes: exit codes of error types; the first match counts. Any other `SMEError` is 2.
     """
 
-    program = ""
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line, and exit with its exit code."""
-        options |= {"standalone_mode": False, "prog_name": self.program}
+        options |= {"standalone_mode": False, "prog_name": self.name}
         _use_utf8()
         try:
             code = super().main(*args, **options)
@@ -42,7 +40,7 @@ class CommandGroup(TyperGroup):
             if not hasattr(error, "format_message"):
                 raise
             context = getattr(error, "ctx", None)
-            command = context.command_path if context is not None else self.program
+            command = context.command_path if context is not None else self.name
             message = error.format_message().replace("Value error, ", "").rstrip(".")
             if message:  # empty if the help was printed instead
                 failure(f"{message}. See `{command} --help`.")
@@ -64,9 +62,19 @@ class CommandGroup(TyperGroup):
             raise typer.Exit(130) from None
 
 
-def application(commands: type[CommandGroup]) -> typer.Typer:
-    """Create the application to which a program's commands are added."""
-    return typer.Typer(
+def _show_version(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{context.info_name} {metadata.version('sme-registry')}")
+        raise typer.Exit
+
+
+def application(
+    program: str, description: str, commands: type[CommandGroup] = CommandGroup
+) -> typer.Typer:
+    """Create the application to which a program's commands are added; it has `--version`."""
+    app = typer.Typer(
+        name=program,
+        help=description,
         cls=commands,
         no_args_is_help=True,
         add_completion=False,
@@ -75,16 +83,18 @@ def application(commands: type[CommandGroup]) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
 
+    @app.callback()
+    def options(
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version", callback=_show_version, is_eager=True, help="Show the version."
+            ),
+        ] = False,
+    ) -> None:
+        pass
 
-def version_option(program: str) -> Any:
-    """`--version`, for the callback of an application."""
-
-    def show(wanted: bool) -> None:
-        if wanted:
-            typer.echo(f"{program} {metadata.version('sme-registry')}")
-            raise typer.Exit
-
-    return typer.Option("--version", callback=show, is_eager=True, help="Show the version.")
+    return app
 
 
 def _use_utf8() -> None:

@@ -77,10 +77,7 @@ def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
 
 
 def find_algorithm(uses: str) -> Any:
-    """The class or function that creates a learner.
-
-    Args:
-      uses: a name of one of these kinds, except a reference.
+    """The class or function that creates a learner, which is no reference.
 
     Raises:
       UnknownNameError: nothing has this name; the message suggests similar ones.

@@ -34,8 +34,6 @@ from sme_registry.training.record import PACKAGES
 
 ReportSteps = Callable[[int, int], None]
 
-_REPORTS = 200  # calls of `progress` in a run
-
 
 def run_cell(
     cell: Cell, progress: ReportSteps | None = None, model_path: Path | None = None
@@ -48,7 +46,7 @@ def run_cell(
 
     Args:
       cell: the cell to run.
-      progress: called now and then with the steps done and the steps in all.
+      progress: called after each step with the steps done and the steps in all.
       model_path: where to save the trained model, if it has a `save` method.
 
     Returns:
@@ -103,7 +101,6 @@ class _Recorder:
     def __init__(self, cell: Cell, progress: ReportSteps) -> None:
         self._cell, self._progress = cell, progress
         self._task = materialize(cell.spec)
-        self._report_every = max(1, cell.steps // _REPORTS)
         n = cell.evaluations
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
@@ -111,9 +108,8 @@ class _Recorder:
         self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
 
     def report(self, steps: int) -> None:
-        """Call `progress`, now and then."""
-        if steps % self._report_every == 0 or steps == self._cell.steps:
-            self._progress(min(steps, self._cell.steps), self._cell.steps)
+        """Report the steps done."""
+        self._progress(min(steps, self._cell.steps), self._cell.steps)
 
     def is_due(self, steps: int) -> bool:
         """Whether an evaluation is due during training; the last one waits for its end."""

@@ -56,12 +56,7 @@ class Estimator:
             self.observe(result)
 
     def observe(self, result: CellResult, seconds: float | None = None) -> None:
-        """Learn from a finished cell.
-
-        Args:
-          result: of the cell.
-          seconds: of wall time, if measured; more than CPU time if other jobs share the cores.
-        """
+        """Learn from a finished cell, and from its wall time in seconds if that was measured."""
         expected = _work(result.cell).low
         if expected > 0 and result.timing.total > 0:
             took = max(result.timing.total, (seconds or 0.0) - _START[0])
@@ -84,15 +79,7 @@ class Estimator:
 
 
 def makespan(seconds: Sequence[float], workers: int) -> float:
-    """When the last of these jobs ends, started in order, each by the first free worker.
-
-    Args:
-      seconds: of each job.
-      workers: at least 1.
-
-    Returns:
-      Seconds; 0 for no job.
-    """
+    """Seconds to the end of jobs that are started in order, each by the first free worker."""
     free = [0.0] * min(workers, len(seconds))
     for job in seconds:
         heapq.heapreplace(free, free[0] + job)

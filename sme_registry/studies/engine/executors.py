@@ -12,7 +12,7 @@ import tempfile
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from sme_registry.training.record import PACKAGES
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
 ReportProgress = Callable[[Cell, int, int], None]
+Cells = Iterator[Cell | None]
 
 POLL_SECONDS = 0.2
 TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
@@ -46,7 +47,7 @@ class Executor(Protocol):
     def workers(self) -> int:
         """Cells that can run at once."""
 
-    def map(self, cells: Iterator[Cell | None], progress: ReportProgress) -> Iterator[Outcome]:
+    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """Run cells. When the iterator is closed or raises, no cell is left running.
 
         Args:
@@ -95,7 +96,7 @@ def failed(cell: Cell, error: str, details: str) -> Outcome:
 
 
 def _throttled(report: Callable[[int, int], None]) -> Callable[[int, int], None]:
-    """Pass on a report only some time after the last one, and at the end."""
+    """Pass on a report if the last one is some time ago, and at the end."""
     last = 0.0
 
     def throttled(done: int, total: int) -> None:
@@ -116,7 +117,7 @@ class InProcess:
     keep_models: bool = False
     workers: int = 1
 
-    def map(self, cells: Iterator[Cell | None], progress: ReportProgress) -> Iterator[Outcome]:
+    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """See `Executor.map`."""
         for cell in cells:
             if cell is None:
@@ -158,7 +159,7 @@ class ConcurrentExecutor(ABC):
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         """Wait up to `POLL_SECONDS`, report progress, and remove the cells that have ended."""
 
-    def map(self, cells: Iterator[Cell | None], progress: ReportProgress) -> Iterator[Outcome]:
+    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """See `Executor.map`."""
         exhausted = False
         with self._session():

@@ -77,19 +77,19 @@ class Ledger:
 
     def result(self, key: str) -> CellResult | None:
         """A cell's result; None if there is no valid one."""
-        return self._read(CellResult, CELLS, key)
+        return self.results([key]).get(key)
 
     def results(self, keys: Iterable[str] | None = None) -> dict[str, CellResult]:
         """Results by key: of all files in the folder, or of these keys, in their order."""
-        return self._read_all(CellResult, CELLS, keys)
+        return self._read(CellResult, CELLS, keys)
 
     def failure(self, key: str) -> CellFailure | None:
         """A cell's failure; None if it has not failed."""
-        return self._read(CellFailure, FAILED, key)
+        return self.failures([key]).get(key)
 
     def failures(self, keys: Iterable[str] | None = None) -> dict[str, CellFailure]:
         """Failures by key, as `results`."""
-        return self._read_all(CellFailure, FAILED, keys)
+        return self._read(CellFailure, FAILED, keys)
 
     def write(self, entry: CellResult | CellFailure, model: bytes | None = None) -> None:
         """Write a cell's result or failure, completely or not at all.
@@ -159,19 +159,16 @@ class Ledger:
     def _path(self, folder: str, key: str) -> Path:
         return self.folder / folder / f"{_hex(key)}.json"
 
-    def _read(self, kind: type[_Entry], folder: str, key: str) -> _Entry | None:
-        try:
-            return _read_entry(kind, self._path(folder, key), key)
-        except SMEError:
-            return None
-
-    def _read_all(
+    def _read(
         self, kind: type[_Entry], folder: str, keys: Iterable[str] | None
     ) -> dict[str, _Entry]:
         if keys is None:
             keys = (f"sha256:{p.stem}" for p in sorted((self.folder / folder).glob("*.json")))
-        entries = ((key, self._read(kind, folder, key)) for key in keys)
-        return {key: entry for key, entry in entries if entry is not None}
+        entries = {}
+        for key in keys:
+            with contextlib.suppress(SMEError):
+                entries[key] = _read_entry(kind, self._path(folder, key), key)
+        return entries
 
 
 def _hex(key: str) -> str:

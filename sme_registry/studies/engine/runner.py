@@ -6,6 +6,7 @@ of a cell decides who runs it, and its result file says that it is done.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import time
@@ -212,12 +213,10 @@ class _StudyRun:
         outcomes = self._executor.map(self._cells(), self._report)
         with self._progress:
             try:
-                for outcome in outcomes:
-                    self._handle(outcome)
+                with contextlib.closing(outcomes):  # ends running cells before their locks go
+                    for outcome in outcomes:
+                        self._handle(outcome)
             finally:
-                close = getattr(outcomes, "close", None)  # ends running cells before their locks go
-                if close is not None:
-                    close()
                 for lock, _ in self._running.values():
                     lock.release()
 
