@@ -81,25 +81,23 @@ def _tasks(name: str) -> list[tuple[str, SMESpec]]:
 
 def _print_line(label: str, certificate: Certificate) -> None:
     notable = [*certificate.of("refused"), *certificate.of("warning")]
-    reasons = ", ".join(
-        check.name if check.value is None else f"{check.name} {check.value:.3g}"
-        for check in notable
-    )
+    reasons = ", ".join(f"{check.name} {_number(check.value)}".rstrip() for check in notable)
     out().print(
         f"{_MARKS[certificate.outcome]}  {escape(label)}  [dim]{reasons}[/]", soft_wrap=True
     )
 
 
-def _print_certificate(label: str, certificate: Certificate) -> None:
-    def number(value: float | None, before: str = "") -> str:
-        return "" if value is None else f"{before}{value:.3g}"
+def _number(value: float | None, sign: str = "") -> str:
+    return "" if value is None else f"{sign}{value:.3g}"
 
+
+def _print_certificate(label: str, certificate: Certificate) -> None:
     rows = [
         (
             _MARKS[check.outcome],
             f"[bold]{check.name}[/]",
-            number(check.value),
-            ", ".join(filter(None, (number(check.low, "≥ "), number(check.high, "≤ ")))),
+            _number(check.value),
+            ", ".join(filter(None, (_number(check.low, "≥ "), _number(check.high, "≤ ")))),
         )
         for check in certificate.checks
     ]

@@ -108,8 +108,9 @@ class _Recorder:
         self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
 
     def report(self, steps: int) -> None:
-        """Report the steps done."""
-        self._progress(min(steps, self._cell.steps), self._cell.steps)
+        """Report the steps done; an algorithm may take more than those of the plan."""
+        if steps <= self._cell.steps:
+            self._progress(steps, self._cell.steps)
 
     def is_due(self, steps: int) -> bool:
         """Whether an evaluation is due during training; the last one waits for its end."""
