@@ -116,10 +116,9 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
     facts = _facts(spec)
     agents = _agents(spec)
     if json:
-        if agents:
-            facts["agents"] = agents
         head = {} if isinstance(document, SMESpec) else summary(document)
-        print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": facts})
+        derived = facts | ({"agents": agents} if agents else {})
+        print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
         return
     fields = spec.to_dict()
     if spec.team is not None:

@@ -99,6 +99,7 @@ def plan(
     if cores is not None:
         workers[f"a cluster, {cores} cores"] = cores
     done = len(cells) - len(waiting)
+    measured = {cell.uses for cell in waiting if estimator.knows(cell)}
     if json:
         print_json(
             {
@@ -109,9 +110,7 @@ def plan(
                 "classes": unique(cell.class_name for cell in planned),
                 "algorithms": unique(cell.algorithm for cell in planned),
                 "seeds": file.plan.seeds,
-                "estimated_from_results": sorted(
-                    {cell.uses for cell in waiting if estimator.knows(cell)}
-                ),
+                "estimated_from_results": sorted(measured),
                 "seconds": [
                     {"cores": n, **seconds(n)._asdict()} for n in dict.fromkeys(workers.values())
                 ],
@@ -123,7 +122,7 @@ def plan(
     out().print(f"{len(cells):,} cells{finished}. Estimated time:")
     for place, n in workers.items():
         out().print(f"  {place + ':':32}{duration_range(*seconds(n))}")
-    unmeasured = sorted({cell.uses for cell in waiting if not estimator.knows(cell)})
+    unmeasured = sorted({cell.uses for cell in waiting} - measured)
     if unmeasured:
         out().print(
             f"[dim]From a table of costs, not from results: {escape(', '.join(unmeasured))}.[/]",
