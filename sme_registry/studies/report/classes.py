@@ -90,9 +90,10 @@ def groups(
     return tuple(result)
 
 
-def setting_label(field: str, value: Any) -> str:
-    """`k = 25`, with the symbol of the field."""
-    return f"{AXES[field][0]} = {value if isinstance(value, str) else format(value, 'g')}"
+def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
+    """`k = 25`, or `25` without the symbol of the field."""
+    text = value if isinstance(value, str) else f"{value:g}"
+    return f"{AXES[field][0]} = {text}" if with_symbol else text
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:

@@ -16,7 +16,8 @@ import pandas as pd
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
 from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
-from sme_registry.terminal import escape_latex, fixed
+from sme_registry.terminal import escape_latex
+from sme_registry.terminal.templates import fixed, signed
 
 CSV_TABLES = (
     "results", "curves", "counts", "missing", "contrasts", "levels", "regions", "aggregates",
@@ -29,13 +30,9 @@ _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
 
 @dataclass(frozen=True, eq=False)
 class TextTable:
-    """A table for people.
+    """A table for people, with the name of its files, a title, and a note on how to read it.
 
-    Attributes:
-      name: of its files.
-      title: what it shows, in a few words.
-      note: how to read it.
-      frame: its columns, all text; the first one names the rows.
+    All columns of its frame are text; the first one names the rows.
     """
 
     name: str
@@ -79,12 +76,13 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
 
 def offline_tables(analysis: Analysis) -> list[TextTable]:
     """The behaviour policies next to the learners, and the differences."""
-    rows, at = analysis.offline, {"class_name": "class", "nu": "ν"}
+    rows = analysis.offline.assign(nu=analysis.offline.nu.map("{:g}".format))
+    at = {"class_name": "class", "nu": "ν"}
     similarity = _wide(
         rows, at, "learner", lambda row: _mean(row.similarity, row.similarity_sd, row.runs)
     )
     data = rows.drop_duplicates(["class_name", "nu"])
-    constant = [number(row.constant_similarity, 3) for row in data.itertuples()]
+    constant = [fixed(row.constant_similarity, 3) for row in data.itertuples()]
     behaviour = [
         _mean(row.behaviour_similarity, row.behaviour_similarity_sd, row.data_sets)
         for row in data.itertuples()
@@ -111,21 +109,14 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
     ]
 
 
-def number(value: float, digits: int = 2, sign: str = "") -> str:
-    """A number with a true minus, and no sign on what rounds to 0."""
-    text = fixed(value, digits)
-    if sign and value > 0 and any(digit in text for digit in "123456789"):
-        text = sign + text
-    return text.replace("-", "−")
-
-
 def _contrasts(analysis: Analysis, metric: str, label: str) -> TextTable:
     rows = analysis.contrasts[analysis.contrasts.metric == metric]
     digits = 1 if metric == "final_return" else 2
-    at, order = {"class_name": "class"}, analysis.algorithms
-    frame = _wide(rows, at, "algorithm", lambda row: _change(row, digits), order)
-    settings = [analysis.classes[name].label for name in frame["class"]]
-    frame.insert(1, "setting", settings)
+    frame = _wide(
+        rows, {"class_name": "class"}, "algorithm", lambda row: _change(row, digits),
+        analysis.algorithms,
+    )  # fmt: skip
+    frame.insert(1, "setting", [analysis.classes[name].label for name in frame["class"]])
     return TextTable(
         f"contrasts-{metric.replace('_', '-')}",
         f"Change of {label}, from the class {analysis.base}",
@@ -138,7 +129,7 @@ def _contrasts(analysis: Analysis, metric: str, label: str) -> TextTable:
 def _regions(analysis: Analysis, algorithm: str) -> TextTable:
     rows = analysis.regions[analysis.regions.algorithm == algorithm]
     return TextTable(
-        f"regions-{_file_name(algorithm)}",
+        "regions-" + "".join(letter if letter.isalnum() else "-" for letter in algorithm),
         f"Similarity r̃ of {algorithm} by region",
         "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 for the optimum, 1 "
         "for the constant ½.",
@@ -159,7 +150,7 @@ def _aggregates(analysis: Analysis) -> TextTable:
         "Aggregates of 1 − normalised regret",
         "Means over classes of a statistic over runs, with 95 % stratified bootstrap intervals. "
         "For the optimality gap less is better.",
-        _wide(rows, at, "algorithm", lambda row: _with_interval(row.value, row.low, row.high)),
+        _wide(rows, at, "algorithm", lambda row: _with_interval(row.value, row)),
     )
 
 
@@ -171,7 +162,7 @@ def _improvements(analysis: Analysis) -> TextTable:
         "improvements",
         "Probability of improvement",
         "That a run of the first algorithm beats one of the second, on a class drawn at random.",
-        _wide(rows, at, "metric", lambda row: _with_interval(row.probability, row.low, row.high)),
+        _wide(rows, at, "metric", lambda row: _with_interval(row.probability, row)),
     )
 
 
@@ -195,14 +186,9 @@ def _wide(
     entry: Callable[[Any], str],
     order: Sequence[str] = (),
 ) -> pd.DataFrame:
-    """A long table as text, `across` as columns, in the order of the rows.
+    """A long table as text: a column for each value of `across`, in the order of the rows.
 
-    Args:
-      rows: the long table.
-      index: its columns that name the rows, and their headings.
-      across: the column whose values become columns.
-      entry: the text of a row.
-      order: of the columns; by default that of the rows, too.
+    `index` has the columns that name the rows, and their headings; `order` is of the new columns.
     """
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows.itertuples():
@@ -213,37 +199,29 @@ def _wide(
         [dict(zip(index.values(), place, strict=True)) | line for place, line in lines.items()],
         columns=[*index.values(), *names],
     )
-    if "nu" in index:
-        wide[index["nu"]] = wide[index["nu"]].map("{:g}".format)
     return wide.fillna(ABSENT)
 
 
 def _change(row: Any, digits: int) -> str:
-    if math.isnan(row.low):
-        return f"{number(row.change, digits, '+')} (1 pair)"
-    mark = {"worse": " *", "better": " †", "open": ""}[row.verdict] if row.enough_pairs else ""
-    few = "" if row.enough_pairs else f" (n = {row.pairs})"
-    ends = f"{number(row.low, digits, '+')}, {number(row.high, digits, '+')}"
-    return f"{number(row.change, digits, '+')} [{ends}]{few}{mark}"
+    count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
+    mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
+    return _with_interval(row.change, row, digits, signed) + count + mark
 
 
 def _improvement(row: Any) -> str:
-    text = number(row.improvement, 3, "+")
-    if math.isnan(row.low):
-        return f"{text} (n = {row.runs})"
+    count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
     mark = {"above": " †", "below": " *"}.get(row.verdict, "")
-    few = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
-    return f"{text} [{number(row.low, 3, '+')}, {number(row.high, 3, '+')}]{few}{mark}"
+    return _with_interval(row.improvement, row, 3, signed) + count + mark
+
+
+def _with_interval(
+    value: float, row: Any, digits: int = 2, text: Callable[[float, int], str] = fixed
+) -> str:
+    """A number with the row's interval; without it where it is unknown."""
+    if math.isnan(row.low):
+        return text(value, digits)
+    return f"{text(value, digits)} [{text(row.low, digits)}, {text(row.high, digits)}]"
 
 
 def _mean(value: float, sd: float, runs: int) -> str:
-    return f"{number(value, 3)} ± {number(sd, 3)} ({runs})"
-
-
-def _with_interval(value: float, low: float, high: float) -> str:
-    return number(value) if math.isnan(low) else f"{number(value)} [{number(low)}, {number(high)}]"
-
-
-def _file_name(text: str) -> str:
-    """An algorithm's name as a part of a file's."""
-    return "".join(letter if letter.isalnum() else "-" for letter in text)
+    return f"{fixed(value, 3)} ± {fixed(sd, 3)} ({runs})"

@@ -16,14 +16,15 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult, OfflineResult
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.classes import ALL
-from sme_registry.studies.report.exports import number, offline_tables
+from sme_registry.studies.report.exports import offline_tables
 from sme_registry.studies.report.tables import CURVES
+from sme_registry.terminal.templates import fixed
 from tests.studies.finished import study_file
 
 pytest.importorskip("matplotlib")
 
 from sme_registry.studies.report.figures import draw_figures
-from sme_registry.studies.report.figures.offline import draw_offline
+from sme_registry.studies.report.figures.curves import draw_offline
 from sme_registry.studies.report.findings import findings
 from sme_registry.studies.report.offline_findings import Learner, offline_findings
 from sme_registry.studies.report.write import write_report
@@ -246,7 +247,7 @@ def test_the_report_has_it_first_and_in_every_format(
 
 def test_the_table_has_the_behaviour_beside_the_learners(analysis: Analysis) -> None:
     similarities, improvements = (table.frame for table in offline_tables(analysis))
-    constant = number(analysis.offline.constant_similarity[0], 3)
+    constant = fixed(analysis.offline.constant_similarity[0], 3)
     assert similarities.iloc[0].to_dict() == {
         "class": "shallow",
         "ν": "0",
@@ -267,4 +268,4 @@ def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
     assert found.offline.empty
     assert not found.has_offline_runs
     assert findings(found).offline is None
-    assert draw_offline(found, ("svg",)) == []
+    assert list(draw_offline(found, ("svg",))) == []

@@ -10,20 +10,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.aggregates import draw_aggregates
-from sme_registry.studies.report.figures.contrasts import draw_contrasts
-from sme_registry.studies.report.figures.decay import draw_decay
-from sme_registry.studies.report.figures.improvements import draw_improvements
-from sme_registry.studies.report.figures.learning_curves import draw_learning_curves
-from sme_registry.studies.report.figures.maps import draw_maps
-from sme_registry.studies.report.figures.offline import draw_offline
+from sme_registry.studies.report.figures import comparisons, curves, maps
 from sme_registry.studies.report.figures.panels import Picture
-from sme_registry.studies.report.figures.profiles import draw_profiles
-from sme_registry.studies.report.figures.regions import draw_regions
-from sme_registry.studies.report.figures.regret import draw_regret
-from sme_registry.studies.report.tables import METRICS, REGRET_METRICS
 
 __all__ = ["Picture", "draw_figures"]
+
+# Why there is no figure of a table that is empty.
+_REASONS = {
+    "contrasts": "No contrasts: they need finished runs of one number on the first class and on "
+    "another.",
+    "aggregates": "No aggregates over classes and no performance profiles: no class has runs of "
+    "every algorithm.",
+    "improvements": "No comparison of algorithms: no two of them have runs on the same classes "
+    "and, if they learn from data, the same data.",
+    "learning_curves": "No learning curves: the plan has no evaluations during training.",
+}
 
 
 def draw_figures(
@@ -32,7 +33,7 @@ def draw_figures(
     """Draw every figure that the finished runs allow.
 
     Args:
-      analysis: the tables.
+      analysis: the tables, of at least one run.
       formats: of `plots.FORMATS`.
       models: paths of kept models by the digests of their cells. They are loaded.
 
@@ -42,18 +43,18 @@ def draw_figures(
     Raises:
       MissingDependencyError: Matplotlib is not installed.
     """
-    results = (
-        draw_contrasts(analysis, formats, METRICS[:3], "contrasts-regret"),
-        draw_contrasts(analysis, formats, METRICS[3:], "contrasts-training"),
-        *(draw_regret(analysis, formats, metric) for metric in REGRET_METRICS),
-        draw_regions(analysis, formats),
-        draw_decay(analysis, formats),
-        draw_aggregates(analysis, formats),
-        *(draw_profiles(analysis, formats, metric) for metric in REGRET_METRICS),
-        draw_improvements(analysis, formats),
-        *draw_learning_curves(analysis, formats),
-        draw_maps(analysis, formats, models),
-        *draw_offline(analysis, formats),
-    )
-    pictures = [picture for picture in results if isinstance(picture, Picture)]
-    return pictures, [reason for reason in results if isinstance(reason, str)]
+    plane = maps.draw_maps(analysis, formats, models)
+    pictures = [
+        *comparisons.draw_contrasts(analysis, formats),
+        *curves.draw_regret(analysis, formats),
+        maps.draw_regions(analysis, formats),
+        comparisons.draw_decay(analysis, formats),
+        *comparisons.draw_aggregates(analysis, formats),
+        *curves.draw_profiles(analysis, formats),
+        *comparisons.draw_improvements(analysis, formats),
+        *curves.draw_learning_curves(analysis, formats),
+        *([plane] if isinstance(plane, Picture) else ()),
+        *curves.draw_offline(analysis, formats),
+    ]
+    reasons = [reason for table, reason in _REASONS.items() if getattr(analysis, table).empty]
+    return pictures, reasons if isinstance(plane, Picture) else [*reasons, plane]

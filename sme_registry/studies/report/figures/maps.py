@@ -1,4 +1,4 @@
-"""Similarity over the plane, for tasks with two state channels."""
+"""Figures whose colours are similarities: by class and region, and over the plane."""
 
 from __future__ import annotations
 
@@ -11,18 +11,64 @@ import pandas as pd
 
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import draw_similarity, drawing, literal, map_side, similarity_on_grid
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures.panels import WIDTH, Picture
+from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
 
 _EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+_LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue
+
+
+def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture:
+    """Similarity of every algorithm on every class in every region: one heat map an algorithm."""
+    rows = analysis.regions
+    regions = list(dict.fromkeys(rows.region))
+    classes = [name for name in analysis.classes if name in set(rows.class_name)]
+    heights = 0.75, 0.62 + 0.2 * len(classes)
+    with panel_grid(len(analysis.algorithms), formats, heights) as grid:
+        for axes, name in zip(grid.panels, analysis.algorithms, strict=True):
+            selected = rows[rows.algorithm == name]
+            values = selected.pivot(index="class_name", columns="region", values="similarity")
+            image = _heat_map(axes, values.reindex(index=classes, columns=regions).to_numpy())
+            axes.set_title(literal(name))
+            axes.set_xticks(range(len(regions)), [region.replace("OOD ", "") for region in regions])
+            axes.set_yticks(range(len(classes)), classes, fontsize=8)
+        bar = grid.figure.colorbar(
+            image, ax=grid.panels, location="bottom", shrink=0.5, aspect=40, pad=0.02,
+            label="similarity r̃ (IQM over runs) in WD and in the shells OOD 1, 2, …", extend="min",
+        )  # fmt: skip
+        bar.outline.set_visible(False)
+    return Picture(
+        "regions",
+        "Similarity within and out of distribution",
+        "IQM over runs of r̃, 1 for the optimum, in the unit cube (WD) and in each shell around "
+        f"it. A dash: no run has finished. {NOT_COMPARABLE}",
+        grid.files,
+        is_map=True,
+    )
+
+
+def _heat_map(axes: Any, values: Any) -> Any:
+    """`[class, region]` similarities as an image with their numbers."""
+    image = axes.imshow(values, vmin=0.4, vmax=1.0, cmap="viridis", aspect="auto")
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    for (y, x), value in np.ndenumerate(values):
+        known = not np.isnan(value)
+        dark = known and np.dot(image.to_rgba(value)[:3], _LUMINANCE) < 0.5
+        text = f"{value:.2f}"[1 - (value >= 0.995) :] if known else "–"
+        colour = "white" if dark else "black"
+        axes.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour)
+    return image
 
 
 def draw_maps(
     analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
 ) -> Picture | str:
-    """One map a class and algorithm whose models were kept; a sentence where there is none."""
+    """One map a class and algorithm whose models were kept, or the reason why there is none."""
     plane = analysis.runs[analysis.runs.state_dim == 2]
     if plane.empty:
         return "No maps of the plane: no finished run has a task with two state channels."

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 WIDTH = 7.2  # inches: of a page, so that 9 points stay 9 points
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)))
-LINEAR_DASH = REFERENCE_DASHES["linear_least_squares"]
-CONSTANT_DASH = REFERENCE_DASHES["constant_half"]
 HEADINGS = {"wd_regret": "within distribution (WD)", "ood_regret": "out of distribution (OOD)"}
 
 
@@ -45,7 +43,7 @@ class Picture:
 
 
 class Look(NamedTuple):
-    """How an algorithm, or a class, is drawn."""
+    """How an algorithm, a class or a reference is drawn."""
 
     colour: Any
     marker: str
@@ -62,16 +60,22 @@ class Look(NamedTuple):
         return self.line | {"linestyle": "none"}
 
 
+LINEAR = Look(GREY, "", REFERENCE_DASHES["linear_least_squares"])
+CONSTANT = Look(GREY, "", REFERENCE_DASHES["constant_half"])
+
+
 class Grid(NamedTuple):
     """Panels in reading order.
 
     Attributes:
-      figure: that they are in.
+      figure: the figure that they are in.
+      files: the figure in each format, once it is finished.
       stacks: `[panel, row]`: a panel is a stack of axes, mostly of one.
       across: panels in a row of the grid.
     """
 
     figure: Figure
+    files: dict[str, bytes]
     stacks: Any
     across: int
 
@@ -92,6 +96,12 @@ class Grid(NamedTuple):
             axes.tick_params(labelbottom=lowest)
             axes.set_xlabel(label if lowest else "")
 
+    def name_rows(self, places: Mapping[str, float]) -> None:
+        """Name the rows of marks, by their heights, on the first panel; the first row is on top."""
+        first = self.panels[0]
+        first.set_yticks([*places.values()], [literal(name) for name in places], fontsize=8)
+        first.set_ylim(max(places.values()) + 0.6, -0.6)
+
 
 @contextmanager
 def panel_grid(
@@ -103,8 +113,8 @@ def panel_grid(
     most_across: int = 3,
     stack: int = 1,
     share_x: bool = False,
-) -> Iterator[tuple[Grid, dict[str, bytes]]]:
-    """A figure of panels with a common y axis, at most so many in a row.
+) -> Iterator[Grid]:
+    """A figure of panels with a common y axis; its files are complete after the block.
 
     Args:
       panels: how many.
@@ -114,9 +124,6 @@ def panel_grid(
       most_across: panels in a row.
       stack: axes in a panel, one above the other; they share x, and y with the same row of others.
       share_x: whether all panels share x.
-
-    Yields:
-      The grid, and a dict that holds each format's bytes after the block.
     """
     across = min(most_across, panels)
     down = math.ceil(panels / across)
@@ -135,7 +142,7 @@ def panel_grid(
                 one.tick_params(labelleft=index % across == 0)
             if share_x and index:
                 panel[-1].sharex(stacks[0][-1])
-        yield Grid(figure, stacks[:panels], across), files
+        yield Grid(figure, files, stacks[:panels], across)
 
 
 def looks(analysis: Analysis) -> dict[str, Look]:
@@ -157,6 +164,12 @@ def numbered_looks(
     }
 
 
+def side_by_side(looks: Mapping[str, Look], spread: float) -> Iterator[tuple[str, Look, float]]:
+    """Each name and look, with a shift around their common place; `spread` is the whole width."""
+    for index, (name, look) in enumerate(looks.items()):
+        yield name, look, (index - (len(looks) - 1) / 2) * spread / len(looks)
+
+
 def marks(
     axes: Axes,
     rows: pd.DataFrame,
@@ -168,13 +181,13 @@ def marks(
     upright: bool = False,
     joined: bool = False,
 ) -> None:
-    """Values with their intervals, `low` to `high`.
+    """Values with their intervals.
 
     Args:
       axes: to draw in.
       rows: with the columns `low` and `high`, NaN where there is no interval.
       value: the column that is drawn.
-      at: where each row stands on the other axis.
+      at: the place of each row on the other axis.
       filled: whether each mark is filled, not hollow.
       look: of the marks.
       upright: values along y instead of x.
@@ -209,40 +222,16 @@ def marks_by_algorithm(
     **options: bool,
 ) -> None:
     """`marks` of each algorithm, next to one another around each place."""
-    for index, (name, look) in enumerate(looks.items()):
+    for name, look, shift in side_by_side(looks, spread):
         selected = rows.algorithm == name
-        shift = (index - (len(looks) - 1) / 2) * spread / len(looks)
         marks(axes, rows[selected], value, at[selected] + shift, filled[selected], look, **options)
 
 
-def shade_rows(axes: Axes, places: Iterable[float]) -> None:
-    """A light band behind each row of marks, instead of grid lines."""
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
-    for y in places:
-        axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
-
-
-def legend(
-    figure: Figure,
-    looks: Mapping[str, Look],
-    lines: Mapping[str, tuple[str, Any]] | None = None,
-    across: int = 6,
-) -> None:
-    """The legend below a figure.
-
-    Args:
-      figure: that the legend is for.
-      looks: of what the labels name.
-      lines: colour and dash of further lines, by label.
-      across: entries in a row, at most.
-    """
-    styles = {name: {**look.line, "linewidth": 1.4} for name, look in looks.items()} | {
-        label: {"color": colour, "linestyle": dash, "linewidth": 1.2}
-        for label, (colour, dash) in (lines or {}).items()
-    }
+def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
+    """The legend below a figure, with at most `across` entries in a row."""
     handles = [
-        figure.axes[0].plot([], [], label=literal(label), markersize=4.5, **style)[0]
-        for label, style in styles.items()
+        figure.axes[0].plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look.line)
+        for name, look in looks.items()
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(across, len(handles)))
+    lines = [line for (line,) in handles]
+    figure.legend(handles=lines, loc="outside lower center", ncols=min(across, len(lines)))

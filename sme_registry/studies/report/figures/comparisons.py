@@ -1,0 +1,155 @@
+"""Figures that compare classes or algorithms: contrasts, aggregates, improvements, decay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from sme_registry.evaluation.report import NOT_COMPARABLE
+from sme_registry.plots import GREY, drawing, literal
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.classes import ALL
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import Look, Picture
+from sme_registry.studies.report.frames import RUN
+from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, REGRET_METRICS
+
+
+def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """The change that each class makes: of regret, and of metrics of training."""
+    for name, metrics in (("regret", METRICS[:3]), ("training", METRICS[3:])):
+        rows = analysis.contrasts[analysis.contrasts.metric.isin([m.key for m in metrics])]
+        if rows.empty:
+            continue
+        looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
+        place = _class_places(analysis, set(rows.class_name))
+        height = 1.15 + (0.07 * len(looks) + 0.09) * max(5.0, max(place.values()) + 1)
+        with panels.panel_grid(len(metrics), formats, (0.0, height)) as grid:
+            for axes, metric in zip(grid.panels, metrics, strict=True):
+                selected = rows[rows.metric == metric.key]
+                at, enough = selected.class_name.map(place), selected.enough_pairs
+                panels.marks_by_algorithm(axes, selected, "change", at, enough, looks)
+                axes.axvline(0.0, color="black", linewidth=0.9, zorder=1.5)
+                side = "right" if metric.worse > 0 else "left"
+                axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
+                axes.locator_params(axis="x", nbins=15 // len(metrics))
+                _shade_rows(axes, place.values())
+            grid.name_rows(place)
+            panels.legend(grid.figure, looks)
+        labels = [metric.label.partition(",")[0] for metric in metrics]
+        yield Picture(
+            f"contrasts-{name}",
+            f"What each class changes: {', '.join(labels[:-1])} and {labels[-1]}",
+            f"IQM over runs of the change from the first class, {analysis.base}, to each other "
+            "class, each run compared with the run of the same number, with its 95 % bootstrap "
+            f"interval. Hollow: fewer than {ENOUGH_RUNS} pairs, so that the interval is an "
+            "indication only.",
+            grid.files,
+        )
+
+
+def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
+    rows = analysis.aggregates[analysis.aggregates.statistic == "iqm"]
+    if rows.empty:
+        return
+    place = _places(rows.group)
+    looks = panels.looks(analysis)
+    height = 1.1 + (0.09 * len(looks) + 0.1) * max(2, len(place))
+    with panels.panel_grid(2, formats, (0.0, height)) as grid:
+        for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
+            selected = rows[rows.metric == metric.key]
+            at, enough = selected.group.map(place), selected.fewest_runs >= ENOUGH_RUNS
+            panels.marks_by_algorithm(axes, selected, "value", at, enough, looks)
+            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
+            axes.set_xlabel("IQM of 1 − normalised regret")
+            _shade_rows(axes, place.values())
+        grid.name_rows(place)
+        panels.legend(grid.figure, looks)
+    yield Picture(
+        "aggregates",
+        "Aggregates over kinds of tasks",
+        "Mean over classes of the IQM over runs, with its 95 % stratified bootstrap interval: "
+        "1 is the optimum, 0 the constant ½. The classes of an axis include the first class.",
+        grid.files,
+    )
+
+
+def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """How probably one algorithm beats another, WD and OOD side by side, one row a pair."""
+    rows = analysis.improvements[analysis.improvements.group == ALL]
+    if rows.empty:
+        return
+    pairs = rows["first"] + " over " + rows["second"]
+    place = _places(pairs)
+    with panels.panel_grid(2, formats, (1.0, 0.26 * max(3, len(place)))) as grid:
+        for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
+            selected = rows[rows.metric == metric.key]
+            at, enough = pairs[selected.index].map(place), selected.fewest_runs >= ENOUGH_RUNS
+            panels.marks(axes, selected, "probability", at, enough, Look("black", "o", "-"))
+            axes.axvline(0.5, color=GREY, linewidth=1.0, zorder=1.5)
+            axes.set_xlim(-0.02, 1.02)
+            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
+            axes.set_xlabel("P(a run of X beats a run of Y)")
+            _shade_rows(axes, ())
+        grid.name_rows(place)
+    caption = (
+        "How probably a run of the first algorithm beats a run of the second on a class drawn at "
+        "random, with its 95 % interval: ½ where neither is better."
+    )
+    if analysis.has_offline_runs:
+        caption += " Algorithms that learnt from different data are not compared."
+    yield Picture("improvements", "Probability of improvement", caption, grid.files)
+
+
+def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture:
+    """What each run loses out of distribution, against its similarity within; one mark a run."""
+    inside = analysis.results.drop_duplicates(RUN, keep="first")
+    outside = analysis.results.drop_duplicates(RUN, keep="last")
+    loss = outside.similarity_loss.to_numpy()
+    with drawing((4.8, 3.5), tuple(formats)) as (figure, files):
+        axes = figure.add_subplot()
+        for name, look in panels.looks(analysis).items():
+            selected = (inside.algorithm == name).to_numpy()
+            edge = 0.8 if look.marker in "x+12" else 0.0
+            axes.plot(
+                inside.similarity[selected], loss[selected], **look.points, markersize=4,
+                markeredgewidth=edge, alpha=0.55, label=literal(name),
+            )  # fmt: skip
+        axes.axhline(0.0, color=GREY, linewidth=1.0)
+        axes.set_xlabel("similarity r̃ within distribution")
+        axes.set_ylabel(f"points of r̃ lost in the shell up to ε = {outside.epsilon_high.max():g}")
+        figure.legend(loc="outside right center")
+    dims = sorted(set(inside.state_dim))
+    caption = (
+        "One mark a run: its similarity in the unit cube, and the hundredths of r̃ that it loses in "
+        "the outermost shell. Below 0 a run is better outside, which an agent can be whose actions "
+        "saturate before it has learnt."
+    )
+    if len(dims) > 1:
+        caption += f" It includes runs with S = {', '.join(map(str, dims))}. {NOT_COMPARABLE}"
+    return Picture("decay", "Similarity lost outside against similarity inside", caption, files)
+
+
+def _places(names: Iterable[str]) -> dict[str, float]:
+    """The height of each name's row."""
+    return {name: float(i) for i, name in enumerate(dict.fromkeys(names))}
+
+
+def _class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
+    """The height of each class's row, with a gap between axes."""
+    places: dict[str, float] = {}
+    y, last = -1.0, None
+    for info in analysis.classes.values():
+        if info.name in present:
+            y += 1.0 if last in (None, info.axis) else 1.4
+            places[info.name], last = y, info.axis
+    return places
+
+
+def _shade_rows(axes: Any, places: Iterable[float]) -> None:
+    """A light band behind each row of marks, instead of grid lines."""
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    for y in places:
+        axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)

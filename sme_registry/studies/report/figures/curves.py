@@ -1,0 +1,247 @@
+"""Figures of curves: regret along each axis, profiles, learning curves, learning from data."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from sme_registry.evaluation.report import NOT_COMPARABLE
+from sme_registry.plots import GREY, literal, shades
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.classes import AXES, SEVERAL, Group, setting_label
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture
+from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.tables import (
+    CURVES,
+    ENOUGH_RUNS,
+    REGRET_METRICS,
+    Metric,
+    training_data,
+)
+
+_OFFLINE_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+_BEHAVIOUR = Look("black", "", "-")
+_OPTIMUM = Look(GREY, "", (0, (1, 1.2)))
+
+
+def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """Normalised regret within and out of distribution, one panel an axis."""
+    groups = _axis_groups(analysis)
+    names = analysis.learners or analysis.algorithms
+    looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
+    for metric in REGRET_METRICS:
+        with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as grid:
+            for axes, group in zip(grid.panels, groups, strict=True):
+                _draw_axis(axes, analysis, group, metric, looks)
+            grid.panels[0].set_ylim(bottom=0.0)  # last: it ends autoscaling, for all panels
+            grid.label_rows("normalised regret")
+            panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
+        yield Picture(
+            metric.key.replace("_", "-"),
+            f"Normalised regret {panels.HEADINGS[metric.key]}, along each axis",
+            "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
+            "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
+            f"Hollow: fewer than {ENOUGH_RUNS} runs."
+            + (f" {NOT_COMPARABLE}" if metric.key == "ood_regret" else ""),
+            grid.files,
+        )
+
+
+def _draw_axis(
+    axes: Any, analysis: Analysis, group: Group, metric: Metric, looks: Mapping[str, Look]
+) -> None:
+    """The classes of one axis, in the order of its values."""
+    x = {name: i for i, name in enumerate(group.classes)}
+    levels = analysis.levels[
+        (analysis.levels.metric == metric.key) & analysis.levels.class_name.isin(x)
+    ]
+    levels = levels.sort_values("class_name", key=lambda names: names.map(x), kind="stable")
+    at = levels.class_name.map(x)
+    ordered = group.axis not in ("", SEVERAL)
+    linear = levels.drop_duplicates("class_name", keep="last")
+    look = LINEAR if ordered else Look(GREY, "_", "none")
+    axes.plot(
+        at[linear.index], linear.linear, **look.line, linewidth=1.2, markersize=14, zorder=1.6
+    )
+    axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=CONSTANT.dash, zorder=1.6)
+    panels.marks_by_algorithm(
+        axes, levels, "iqm", at, levels.runs >= ENOUGH_RUNS, looks, spread=0.5, upright=True,
+        joined=ordered,
+    )  # fmt: skip
+    axes.set_xticks(
+        range(len(group.classes)),
+        [literal(label) for label in _class_labels(analysis, group)],
+        **({} if ordered else {"rotation": 30, "ha": "right", "fontsize": 8}),
+    )
+    axes.set_title(literal(group.name), fontsize=9)
+    axes.set_xlim(-0.5, len(group.classes) - 0.5)
+    axes.grid(visible=False, axis="x")
+
+
+def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """The share of runs above each value of 1 − normalised regret, one panel a group of classes."""
+    groups = list(dict.fromkeys(analysis.profiles.group))
+    looks = panels.looks(analysis)
+    for metric in REGRET_METRICS if groups else ():
+        rows = analysis.profiles[analysis.profiles.metric == metric.key]
+        with panels.panel_grid(len(groups), formats, (0.7, 2.1), share_x=True) as grid:
+            for axes, group in zip(grid.panels, groups, strict=True):
+                for name, profile in rows[rows.group == group].groupby("algorithm", sort=False):
+                    columns = ["threshold", "low", "share", "high"]
+                    _line_with_band(axes, profile[columns], looks[name], (5, 20))
+                axes.set_title(literal(group), fontsize=9)
+                axes.set_ylim(-0.02, 1.02)
+                axes.set_xlim(0.0, 1.0)
+                axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            grid.label_rows("share of runs above τ")
+            grid.label_columns("τ (1 − normalised regret)")
+            panels.legend(grid.figure, {name: looks[name] for name in analysis.algorithms})
+        yield Picture(
+            f"profiles-{metric.key.removesuffix('_regret')}",
+            f"Performance profiles {panels.HEADINGS[metric.key]}",
+            "The share of runs whose 1 − normalised regret is above τ, classes counting alike, "
+            "with pointwise 95 % bands. A line above another is better at every τ.",
+            grid.files,
+        )
+
+
+def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """One figure an axis: algorithms as panels, the values of the axis as lines."""
+    for group in _axis_groups(analysis):
+        rows = analysis.learning_curves
+        rows = rows[rows.class_name.isin(group.classes)]
+        present = set(rows.algorithm)
+        names = [name for name in analysis.learners if name in present]
+        if names:
+            yield _draw_learning_curves(analysis, formats, group, rows, names)
+
+
+def _draw_learning_curves(
+    analysis: Analysis, formats: Sequence[str], group: Group, rows: pd.DataFrame, names: list[str]
+) -> Picture:
+    data = training_data(analysis.runs)
+    looks = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
+    width = min(panels.WIDTH, 1.2 + 2.6 * len(names))
+    with panels.panel_grid(
+        len(names), formats, (0.6, 4.4), width=width, most_across=4, stack=len(CURVES)
+    ) as grid:
+        for stack, name in zip(grid.stacks, names, strict=True):
+            for axes, measure in zip(stack, CURVES, strict=True):
+                selected = rows[(rows.algorithm == name) & (rows.measure == measure)]
+                _draw_classes(axes, selected, looks)
+            stack[0].set_title(literal(name))
+            stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
+            stack[-1].set_xlim(left=0)
+            stack[-1].locator_params(axis="x", nbins=4)
+            stack[-1].xaxis.set_major_formatter(_steps)
+        for index, label in enumerate(CURVES.values()):
+            grid.label_rows(label, index)
+        labels = _class_labels(analysis, group, with_symbol=True)
+        panels.legend(grid.figure, dict(zip(labels, looks.values(), strict=True)), across=4)
+    window = rows.window.max()
+    return Picture(
+        f"learning-curves-{(group.axis or group.name).replace(' ', '-').lower()}",
+        f"Learning curves: {group.name}",
+        "Median over runs, with the interquartile range as a band"
+        + (f", averaged over {window} evaluations" if window > 1 else "")
+        + ". Above: return in % of the optimum's. Below: mean exact regret per step, 0 for the "
+        "optimum.",
+        grid.files,
+    )
+
+
+def _draw_classes(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> None:
+    """The curves of one algorithm and measure, one a class; markers do not coincide."""
+    curves = dict(iter(rows.groupby("class_name")))
+    for index, (name, look) in enumerate(looks.items()):
+        if name in curves:
+            curve = curves[name][["step", "q25", "median", "q75"]]
+            every = max(1, len(curve) // 6)
+            _line_with_band(axes, curve, look, (index * every // len(looks), every))
+
+
+def draw_offline(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """The improvement of offline learners over the behaviour policy, one panel a class."""
+    if not analysis.has_offline_runs:
+        return
+    classes = list(dict.fromkeys(analysis.offline.class_name))
+    looks = panels.numbered_looks(dict.fromkeys(analysis.offline.learner), dashes=_OFFLINE_DASHES)
+    across = min(3, len(classes))
+    width = max(3.6, min(panels.WIDTH, 1.0 + 2.4 * across))
+    with panels.panel_grid(len(classes), formats, (0.9, 2.4), width=width, share_x=True) as grid:
+        for axes, class_name in zip(grid.panels, classes, strict=True):
+            _draw_improvements(axes, analysis, class_name, looks)
+        grid.label_rows("r̃ − r̃ of the behaviour")
+        grid.label_columns("ν of the behaviour policy")
+        references = {
+            "behaviour policy": _BEHAVIOUR, "optimum": _OPTIMUM, "constant ½": CONSTANT,
+        }  # fmt: skip
+        panels.legend(grid.figure, {**looks, **references}, across=2 * across)
+    title = "Improvement over the behaviour policy"
+    yield Picture("offline-improvement", title, _offline_caption(analysis), grid.files)
+
+
+def _draw_improvements(
+    axes: Any, analysis: Analysis, class_name: str, looks: Mapping[str, Look]
+) -> None:
+    rows = analysis.offline[analysis.offline.class_name == class_name]
+    runs = analysis.offline_runs[analysis.offline_runs.class_name == class_name]
+    data = rows.drop_duplicates("nu")
+    axes.axhline(0.0, color="black", linewidth=0.9, zorder=1.5)
+    for look, similarity in ((_OPTIMUM, 1.0), (CONSTANT, data.constant_similarity)):
+        height = similarity - data.behaviour_similarity
+        axes.plot(data.nu, height, **look.line, linewidth=1.1, zorder=1.6)
+    nus = sorted(set(analysis.offline.nu))
+    apart = min((b - a for a, b in itertools.pairwise(nus)), default=1.0)
+    for name, look, shift in panels.side_by_side(looks, 0.25 * apart):
+        selected, each = rows[rows.learner == name], runs[runs.learner == name]
+        at, enough = selected.nu + shift, selected.runs >= ENOUGH_RUNS
+        panels.marks(axes, selected, "improvement", at, enough, look, upright=True, joined=True)
+        axes.plot(
+            each.nu + shift, each.improvement, **look.points, markersize=2.5, markeredgewidth=0.0,
+            alpha=0.5, zorder=3.5,
+        )  # fmt: skip
+    axes.set_title(literal(class_name))
+
+
+def _offline_caption(analysis: Analysis) -> str:
+    few = analysis.offline.runs.min()
+    caption = (
+        "A small mark is a run, a large one the mean over runs: similarity of the learner minus "
+        "that of the policy that made its data."
+    )
+    if not analysis.offline.low.isna().all():
+        caption += " Bars are 95 % bootstrap intervals of the mean."
+    if few < OFFLINE_INTERVAL:
+        caption += f" With fewer than {OFFLINE_INTERVAL} runs there is no interval."
+    if few < ENOUGH_RUNS:
+        caption += f" Hollow: fewer than {ENOUGH_RUNS} runs, an indication only."
+    return caption
+
+
+def _line_with_band(axes: Any, curve: pd.DataFrame, look: Look, markevery: tuple[int, int]) -> None:
+    """The columns of a curve are x, the lower end of the band, the line, and the upper end."""
+    x, low, middle, high = (curve[name] for name in curve)
+    axes.fill_between(x, low, high, color=look.colour, alpha=0.14, linewidth=0)
+    axes.plot(x, middle, **look.line, linewidth=1.6, markersize=4, markevery=markevery)
+
+
+def _axis_groups(analysis: Analysis) -> Sequence[Group]:
+    """The groups of single axes; all classes where the plan has no axis."""
+    return [group for group in analysis.groups if group.axis] or analysis.groups
+
+
+def _class_labels(analysis: Analysis, group: Group, *, with_symbol: bool = False) -> list[str]:
+    """The value of the axis in each class, `25` or `k = 25`; the class's name without an axis."""
+    if group.axis not in AXES:
+        return list(group.classes)
+    values = [analysis.classes[name].setting[group.axis] for name in group.classes]
+    return [setting_label(group.axis, value, with_symbol=with_symbol) for value in values]
+
+
+def _steps(value: float, _: Any) -> str:
+    return f"{value / 1000:g}k" if value >= 10_000 else f"{value:g}"
