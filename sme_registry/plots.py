@@ -11,7 +11,7 @@ import contextlib
 import csv
 import io
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -113,47 +113,28 @@ def decay_curve(
 def _decay_panel(
     axes: Axes, reports: Sequence[EvaluationReport], measure: Measure, references: bool
 ) -> None:
-    def line(regions: Any) -> tuple[list[float], list[float]]:
-        return [r.epsilon_high for r in regions], [getattr(r, measure) for r in regions]
+    def draw(regions: Any, **style: Any) -> None:
+        x, y = [r.epsilon_high for r in regions], [getattr(r, measure) for r in regions]
+        axes.plot(x, y, **style)
 
     for index, report in enumerate(reports):
-        axes.plot(
-            *line(report.regions),
-            color=COLOURS[index % len(COLOURS)],
-            marker=MARKERS[index % len(MARKERS)],
-            markersize=4.5,
-            linewidth=2,
+        colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
+        draw(
+            report.regions, color=colour, marker=marker, markersize=4.5, linewidth=2,
             label=literal(report.policy),
-        )
+        )  # fmt: skip
     agents = reports[0].agents if len(reports) == 1 else {}
+    several = len(agents) >= len(COLOURS)  # too many to distinguish
     for index, (name, agent) in enumerate(agents.items()):
-        several = len(agents) >= len(COLOURS)  # too many to distinguish
-        label = name if not several else "" if index else f"each of {len(agents)} agents"
-        axes.plot(
-            *line(agent.regions),
-            color=COLOURS[5 if several else index + 1],
-            marker="" if several else MARKERS[index + 1],
-            markersize=3.5,
-            linewidth=1.2,
-            alpha=0.8,
-            zorder=1.8,
-            label=label,
-        )
-    tasks: dict[str, int] = {}
-    for index, report in enumerate(reports if references else ()):
-        tasks.setdefault(report.spec_digest, index)
-    for index in tasks.values():
-        for name, regions in reports[index].references.items():
-            axes.plot(
-                *line(regions),
-                color=GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)],
-                linewidth=1.1,
-                linestyle=REFERENCE_DASHES.get(name, "-"),
-                zorder=1.5,
-            )
-    for name in reports[0].references if references else ():
-        dash = REFERENCE_DASHES.get(name, "-")
-        axes.plot([], [], color=GREY, linewidth=1.1, linestyle=dash, label=LABELS.get(name, name))
+        style = {"markersize": 3.5, "linewidth": 1.2, "alpha": 0.8, "zorder": 1.8}
+        if several:
+            label = "" if index else f"each of {len(agents)} agents"
+            draw(agent.regions, color=COLOURS[5], label=label, **style)
+        else:
+            colour, marker = COLOURS[index + 1], MARKERS[index + 1]
+            draw(agent.regions, color=colour, marker=marker, label=name, **style)
+    if references:
+        _decay_references(axes, reports, draw)
     levels = sorted({r.epsilon_high for report in reports for r in report.regions})
     dims = sorted({report.spec.state_dim for report in reports})
     warning = (
@@ -167,6 +148,23 @@ def _decay_panel(
         axes.set_xticks(levels, [f"{level:g}" if level > 0 else "WD" for level in levels])
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.5) if measure == "similarity" else 0.0 - 0.03 * high, high)
+
+
+def _decay_references(
+    axes: Axes, reports: Sequence[EvaluationReport], draw: Callable[..., None]
+) -> None:
+    """The references of each task, and one grey entry for each in the legend."""
+    tasks: dict[str, int] = {}
+    for index, report in enumerate(reports):
+        tasks.setdefault(report.spec_digest, index)
+    for index in tasks.values():
+        colour = GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)]
+        for name, regions in reports[index].references.items():
+            dash = REFERENCE_DASHES.get(name, "-")
+            draw(regions, color=colour, linewidth=1.1, linestyle=dash, zorder=1.5)
+    for name in reports[0].references:
+        dash = REFERENCE_DASHES.get(name, "-")
+        axes.plot([], [], color=GREY, linewidth=1.1, linestyle=dash, label=LABELS.get(name, name))
 
 
 def similarity_map(
@@ -207,13 +205,14 @@ def similarity_map(
         raise OptionError(
             f"state_dim={spec.state_dim}: must be 2 for a map. Use a task such as SME/Plane1-v1."
         )
-    _check_range("epsilon", epsilon, 0.0, 100.0, open_below=True)
+    if not 0.0 < epsilon <= 100.0:
+        raise OptionError(f"epsilon={epsilon!r:.40}: must be in (0, 100].")
     resolution = integer_in("resolution", resolution, 2, 2000)
-    _check_range("time", time, 0.0, 1.0)
+    if not 0.0 <= time <= 1.0:
+        raise OptionError(f"time={time!r:.40}: must be in [0, 1].")
     loaded = as_policy(policy, spec, action_range=action_range, name=name)
     with _figure_file(path, (5.0, 4.2)) as figure:
-        side = map_side(epsilon, resolution)
-        similarity = similarity_on_grid(loaded, spec, side, time)
+        side, similarity = similarity_on_grid(loaded, spec, epsilon, resolution, time)
         axes = figure.add_subplot()
         image = draw_similarity(axes, similarity, epsilon)
         bar = figure.colorbar(image, ax=axes, label="similarity r̃  (1 = optimal)")
@@ -230,12 +229,6 @@ def similarity_map(
     return Path(path)
 
 
-def map_side(epsilon: float, resolution: int) -> Array:
-    """`[resolution]` evenly spaced coordinates along a side of the cube X_ε."""
-    low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0
-    return low + (np.arange(resolution) + 0.5) * (high - low) / resolution
-
-
 def draw_similarity(axes: Axes, similarity: Array, epsilon: float) -> Any:
     """A map of similarities `[N, N]` over the cube X_ε, with the unit square; returns its image."""
     extent = (-epsilon / 2.0, 1.0 + epsilon / 2.0) * 2
@@ -250,28 +243,27 @@ def draw_similarity(axes: Axes, similarity: Array, epsilon: float) -> Any:
     return image
 
 
-def similarity_on_grid(policy: Any, spec: SMESpec, side: Array, time: float) -> Array:
-    """r̃ of a policy over the plane of a task with two state channels.
-
-    Args:
-      policy: as `as_policy` returns it.
-      spec: the task.
-      side: `[N]` coordinates of each state channel.
-      time: the input t/T.
+def similarity_on_grid(
+    policy: Any, spec: SMESpec, epsilon: float, resolution: int, time: float
+) -> tuple[Array, Array]:
+    """r̃ of a policy of `as_policy` over the plane of a task with two state channels.
 
     Returns:
-      `[N, N]` in [0, 1], rows by the second state channel.
+      `[N]` evenly spaced coordinates along a side of the cube X_ε, and `[N, N]` similarities in
+      [0, 1] at time t/T, rows by the second state channel.
     """
     task = materialize(spec)
     oracle = engine(task).optimal_action
+    low, high = -epsilon / 2.0, 1.0 + epsilon / 2.0
+    side = low + (np.arange(resolution) + 0.5) * (high - low) / resolution
     rows = []
     for second in side:
-        observations = np.zeros((len(side), 4), dtype=np.float32)
+        observations = np.zeros((resolution, 4), dtype=np.float32)
         observations[:, 0], observations[:, 1], observations[:, 2] = side, second, time
         s = observations[:, :2].astype(np.float64)
         a = np.clip(policy(observations), 0.0, 1.0)
         rows.append(task.similarity_of(a, oracle(s)))
-    return np.array(rows)
+    return side, np.array(rows)
 
 
 def training_curve(
@@ -423,11 +415,3 @@ def shades(count: int) -> list[tuple[float, ...]]:
 def literal(text: str) -> str:
     """Text that Matplotlib prints as it is, not as a formula."""
     return text.replace("$", r"\$")
-
-
-def _check_range(
-    name: str, value: float, low: float, high: float, *, open_below: bool = False
-) -> None:
-    if not low <= value <= high or (open_below and value == low):
-        bracket = "(" if open_below else "["
-        raise OptionError(f"{name}={value!r:.40}: must be in {bracket}{low:g}, {high:g}].")

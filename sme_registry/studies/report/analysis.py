@@ -1,7 +1,4 @@
-"""`analyse`: the tables of a study, from the runs that have finished. Nothing is drawn or written.
-
-The same results give the same numbers.
-"""
+"""`analyse`: the tables of a study, from the runs that have finished; equal for equal results."""
 
 from __future__ import annotations
 
@@ -25,20 +22,14 @@ class Analysis:
       file: the plan.
       cells: finished cells of the plan, by digest.
       classes: every class of the plan, by name; the first one first.
-      base: the name of the first class.
       algorithms: those with a finished run, in the plan's order.
-      learners: those of them that learn.
+      learners: those of the algorithms that learn.
       groups: classes that are compared with each other.
-      results: one row per run and region.
-      curves: one row per run and evaluation.
-      runs: one row per run.
-      offline_runs: one row per run of an offline learner.
     """
 
     file: StudyFile
     cells: Mapping[str, CellResult]
     classes: Mapping[str, ClassInfo]
-    base: str
     algorithms: tuple[str, ...]
     learners: tuple[str, ...]
     groups: tuple[Group, ...]
@@ -58,6 +49,11 @@ class Analysis:
     offline: pd.DataFrame
 
     @property
+    def base(self) -> str:
+        """The name of the first class."""
+        return next(iter(self.classes))
+
+    @property
     def has_offline_runs(self) -> bool:
         """Whether any run learnt from a data set."""
         return not self.offline_runs.empty
@@ -74,12 +70,11 @@ def analyse(
 
     Args:
       file: the plan.
-      finished: results by the digests of their cells; other cells are ignored.
-      errors: of failed runs, likewise.
+      finished: results by the digests of their cells; cells outside the plan are ignored.
+      errors: of failed runs, by the digests of their cells.
       draws: bootstrap samples of each interval.
     """
     plan = file.plan
-    planned = [cell.cell.digest for cell in plan.cells]
     results, curves = frames.study_frames(plan, finished)
     runs = frames.runs(results)
     classes = class_infos(plan)
@@ -91,9 +86,8 @@ def analyse(
     bootstrap = tables.Bootstrap(file.digest, draws)
     return Analysis(
         file=file,
-        cells={key: finished[key] for key in planned if key in finished},
+        cells={key: finished[key] for key in runs.key},
         classes=classes,
-        base=plan.classes[0].name,
         algorithms=names,
         learners=tuple(a.name for a in present if not a.uses.startswith("reference:")),
         groups=compared,

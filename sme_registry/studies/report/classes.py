@@ -70,10 +70,7 @@ def groups(
 ) -> tuple[Group, ...]:
     """All classes, then for each axis its classes together with the first one.
 
-    Args:
-      classes: by name; the first one first.
-      algorithms: those to compare.
-      done: (class, algorithm) pairs with a finished run.
+    `done` are the (class, algorithm) pairs with a finished run.
     """
     first, *others = classes.values()
     result = []

@@ -113,12 +113,7 @@ def load(folder: str | os.PathLike[str]) -> StudyFrames:
 
 
 def plan_file(ledger: Ledger) -> StudyFile:
-    """The plan in a study's folder.
-
-    Raises:
-      OptionError: the folder holds no study.
-      MalformedDocumentError, SpecError, DigestMismatchError: the plan is invalid.
-    """
+    """The plan in a study's folder; raises the errors of `load`."""
     file = ledger.plan_file()
     if file is None:
         raise OptionError(
@@ -128,12 +123,7 @@ def plan_file(ledger: Ledger) -> StudyFile:
 
 
 def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFrames:
-    """The frames of a plan's runs.
-
-    Args:
-      plan: the plan; cells that are not in it are ignored.
-      results: finished runs, by the digests of their cells.
-    """
+    """The frames of a plan's runs, from results by the digests of their cells."""
     planned = [(cell, results.get(cell.cell.digest)) for cell in ordered(plan)]
     finished = [(cell, result) for cell, result in planned if result is not None]
     rows = [row for cell, result in finished for row in _result_rows(cell, result)]
@@ -155,12 +145,7 @@ def ordered(plan: StudyPlan) -> list[PlannedCell]:
 
 
 def frame(rows: Sequence[Any], columns: str) -> pd.DataFrame:
-    """A frame of rows, with the same columns and dtypes where there are none.
-
-    Args:
-      rows: tuples or dicts.
-      columns: `name:dtype`, or `name` alone for float64, separated by spaces.
-    """
+    """A frame of tuples or dicts, with columns `name:dtype`, or `name` alone for float64."""
     dtypes = _dtypes(columns)
     return pd.DataFrame(rows, columns=list(dtypes)).astype(dtypes)
 
@@ -176,14 +161,10 @@ def window(evaluations: int) -> int:
 
 
 def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
-    """One row a region."""
     run = _place(cell) | _run_columns(result)
     references = result.report.references
     for index, region in enumerate(result.report.regions):
-        regrets = {
-            column: references[name][index].normalised_regret
-            for column, name in _REFERENCES.items()
-        }
+        regrets = {c: references[name][index].normalised_regret for c, name in _REFERENCES.items()}
         yield {
             **run,
             **region.model_dump(exclude={"name", "channels"}),
@@ -194,7 +175,6 @@ def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, An
 
 
 def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[tuple[Any, ...]]:
-    """One row an evaluation."""
     curve = result.curve
     columns = (curve.steps, curve.episode_return, curve.regret, curve.similarity, curve.length)
     for evaluation in zip(*columns, strict=True):
@@ -202,7 +182,7 @@ def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[tuple[Any, ..
 
 
 def _place(cell: PlannedCell) -> dict[str, Any]:
-    return {"class_name": cell.class_name, "algorithm": cell.algorithm, "run": cell.run}
+    return {name: getattr(cell, name) for name in RUN}
 
 
 def _run_columns(result: CellResult) -> dict[str, Any]:
@@ -210,17 +190,12 @@ def _run_columns(result: CellResult) -> dict[str, Any]:
     cell, report, offline = result.cell, result.report, result.offline
     columns = {
         **cell.spec.model_dump(exclude={"schema_version", "seed", "team"}),
-        "wd_regret": report.wd_regret,
-        "ood_regret": report.ood_regret,
-        "ood_decay": report.ood_decay,
+        **{name: getattr(report, name) for name in ("wd_regret", "ood_regret", "ood_decay")},
+        **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
         "final_return": _final_return(result),
         "online_regret": math.nan if result.online_regret is None else result.online_regret,
-        "uses": cell.uses,
-        "action_range": cell.action_range,
-        "steps": cell.steps,
         "spec_seed": str(cell.spec.seed),
         "spec_digest": cell.spec.digest,
-        "seed": cell.seed,
         "seconds": result.timing.total,
         "steps_per_second": result.timing.steps_per_second,
         "key": result.key,

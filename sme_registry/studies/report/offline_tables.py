@@ -33,29 +33,21 @@ OFFLINE_INTERVAL = 4  # with fewer runs a mean improvement has no interval at al
 
 
 def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) -> pd.DataFrame:
-    """One row per run of an offline learner: with `learner` and the WD `constant_similarity`.
-
-    Ordered by class, ν, learner and run.
-    """
+    """One row per run of an offline learner, ordered by class, ν, learner and run."""
     names = learner_names(algorithms)
-    places = list(dict.fromkeys(names.values()))
     rows = results[results.nu.notna()].drop_duplicates(RUN)
     rows = rows.assign(learner=rows.algorithm.map(names))
-    order = {name: i for i, name in enumerate(dict.fromkeys(rows.class_name))}
-    keys = pd.DataFrame({
-        "class": rows.class_name.map(order), "nu": rows.nu,
-        "learner": rows.learner.map(places.index), "run": rows.run,
-    })  # fmt: skip
-    return rows.loc[keys.sort_values([*keys], kind="stable").index].reset_index(drop=True)
+    order = {"class_name": list(dict.fromkeys(rows.class_name)),
+             "learner": list(dict.fromkeys(names.values()))}  # fmt: skip
+
+    def key(column: pd.Series) -> pd.Series:
+        return column.map(order[column.name].index) if column.name in order else column
+
+    return rows.sort_values(["class_name", "nu", "learner", "run"], key=key, ignore_index=True)
 
 
 def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
-    """Each offline learner on each class at each ν, with the data that it learnt from.
-
-    Args:
-      runs: see `offline_runs`.
-      bootstrap: of the intervals.
-    """
+    """Each offline learner on each class at each ν, from `offline_runs`."""
     data = {place: _data_columns(group) for place, group in runs.groupby(["class_name", "nu"])}
     rows = []
     for (class_name, nu, learner), group in runs.groupby(
@@ -64,8 +56,8 @@ def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
         changes = group.improvement.to_numpy()
         low = high = math.nan
         if len(changes) >= OFFLINE_INTERVAL:
-            label = f"offline {learner} {class_name} {nu:g}"
-            low, high = bootstrap.interval(changes, label, statistics.mean)
+            place = "offline", learner, class_name, f"{nu:g}"
+            low, high = bootstrap.interval(changes, *place, statistic=statistics.mean)
         rows.append(
             {
                 "class_name": class_name, "nu": nu, "learner": learner, "runs": len(group),

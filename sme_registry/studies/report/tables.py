@@ -58,18 +58,10 @@ CURVES = {"episode_return": "return, % of optimum", "regret": "mean regret per s
 PLACE = ["class_name", "algorithm"]
 _PLACE = "class_name:str algorithm:str"
 
-Runs = Mapping[tuple[str, str], pd.DataFrame]
-
 
 @dataclass(frozen=True)
 class Metric:
-    """A number of a run that a task may change.
-
-    Attributes:
-      key: its column in `results`.
-      label: on an axis of a figure.
-      worse: +1 where more of it is worse, −1 where less is.
-    """
+    """A column of `results`, and whether more of it is worse (+1) or less (−1)."""
 
     key: str
     label: str
@@ -88,28 +80,23 @@ REGRET_METRICS = METRICS[:2]
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Intervals as a function of the study, of the table and of the row that they are in.
-
-    Attributes:
-      digest: of the study's plan.
-      draws: bootstrap samples of each interval.
-    """
+    """Intervals as a function of the plan's digest and of their table and row."""
 
     digest: str
     draws: int = statistics.DRAWS
 
-    def seed(self, *parts: str) -> str:
-        """The seed of an interval."""
-        return " ".join((self.digest, *parts))
+    def seed(self, *place: str) -> str:
+        """The seed of the interval at a place."""
+        return " ".join((self.digest, *place))
 
     def interval(
-        self, values: Array, label: str, statistic: Statistic = statistics.iqm
+        self, values: Array, *place: str, statistic: Statistic = statistics.iqm
     ) -> tuple[float, float]:
         """The interval of a statistic of `[n]` runs; NaN for a single run."""
         if len(values) < 2:
             return math.nan, math.nan
-        column = {"": np.asarray(values)[:, None]}
-        low, high = statistics.stratified_bootstrap(column, self.draws, self.seed(label), statistic)
+        column, seed = {"": np.asarray(values)[:, None]}, self.seed(*place)
+        low, high = statistics.stratified_bootstrap(column, self.draws, seed, statistic)
         return float(low[0]), float(high[0])
 
 
@@ -160,9 +147,9 @@ def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
         for metric in METRICS:
             values = group[metric.key].dropna().to_numpy()
             if len(values):
-                low, high = bootstrap.interval(values, _label("level", place, metric))
+                ends = bootstrap.interval(values, "level", *reversed(place), metric.key)
                 reference = linear[place].get(metric.key, math.nan)
-                rows.append((*place, metric.key, len(values), _iqm(values), low, high, reference))
+                rows.append((*place, metric.key, len(values), _iqm(values), *ends, reference))
     return frame(rows, f"{_PLACE} metric:str runs:int64 iqm low high linear")
 
 
@@ -181,7 +168,7 @@ def contrasts(
             if not len(both):
                 continue
             change = both[:, 0] - both[:, 1]
-            low, high = bootstrap.interval(change, _label("contrast", place, metric))
+            low, high = bootstrap.interval(change, "contrast", *reversed(place), metric.key)
             level, before = statistics.iqm(both)
             middle = _iqm(change)
             verdict = contrast_verdict(middle * metric.worse, low, high)
@@ -316,18 +303,15 @@ def _compared(
         yield group, metric, algorithm, _values(at, group, algorithm, metric)
 
 
-def _values(at: Runs, group: Group, algorithm: str, metric: Metric) -> dict[str, Array]:
+def _values(
+    at: Mapping[tuple[str, str], pd.DataFrame], group: Group, algorithm: str, metric: Metric
+) -> dict[str, Array]:
     """`[n]` 1 − regret of the runs of each class."""
     return {name: 1.0 - at[name, algorithm][metric.key].to_numpy() for name in group.compared}
 
 
 def _iqm(values: Any) -> float:
     return float(statistics.iqm(values))
-
-
-def _label(table: str, place: tuple[str, str], metric: Metric) -> str:
-    class_name, algorithm = place
-    return f"{table} {algorithm} {class_name} {metric.key}"
 
 
 def _smoothed(line: Array, width: int) -> Array:

@@ -107,7 +107,7 @@ def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture:
     inside = analysis.results.drop_duplicates(RUN, keep="first")
     outside = analysis.results.drop_duplicates(RUN, keep="last")
     loss = outside.similarity_loss.to_numpy()
-    with drawing((4.8, 3.5), tuple(formats)) as (figure, files):
+    with drawing((4.8, 3.5), formats) as (figure, files):
         axes = figure.add_subplot()
         for name, look in panels.looks(analysis).items():
             selected = (inside.algorithm == name).to_numpy()

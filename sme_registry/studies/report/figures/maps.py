@@ -12,9 +12,10 @@ import pandas as pd
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.report import NOT_COMPARABLE
-from sme_registry.plots import draw_similarity, drawing, literal, map_side, similarity_on_grid
+from sme_registry.plots import draw_similarity, drawing, literal, similarity_on_grid
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
+from sme_registry.studies.report.tables import by_place
 
 _EPSILON, _RESOLUTION, _TIME = 1.0, 120, 0.5
 _BOX = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
@@ -69,7 +70,8 @@ def draw_maps(
     analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
 ) -> Picture | str:
     """One map a class and algorithm whose models were kept, or the reason why there is none."""
-    plane = analysis.runs[analysis.runs.state_dim == 2]
+    inside = analysis.results[analysis.results.region == "WD"]
+    plane = inside[inside.state_dim == 2]
     if plane.empty:
         return "No maps of the plane: no finished run has a task with two state channels."
     maps, problem = _maps(analysis, plane[plane.key.isin(models)], models)
@@ -81,7 +83,7 @@ def draw_maps(
     classes = list(dict.fromkeys(class_name for class_name, _ in maps))
     names = list(dict.fromkeys(algorithm for _, algorithm in maps))
     size = (min(WIDTH, 1.4 + 2.0 * len(classes)), 0.5 + 1.95 * len(names))
-    with drawing(size, tuple(formats)) as (figure, files):
+    with drawing(size, formats) as (figure, files):
         panels = figure.subplots(len(names), len(classes), squeeze=False, sharex=True, sharey=True)
         image: Any = None
         for (y, x), axes in np.ndenumerate(panels):
@@ -117,19 +119,14 @@ def _maps(
     analysis: Analysis, runs: pd.DataFrame, models: Mapping[str, Path]
 ) -> tuple[dict[tuple[str, str], tuple[Any, float]], str]:
     """(class, algorithm) → its median run's map and WD similarity; and the last problem."""
-    side = map_side(_EPSILON, _RESOLUTION)
-    inside = analysis.results[analysis.results.region == "WD"].drop_duplicates("key")
-    similarity = inside.set_index("key").similarity
     maps, problem = {}, ""
-    for place, group in runs.groupby(["class_name", "algorithm"], sort=False):
-        ordered = group.assign(similarity=group.key.map(similarity)).sort_values(
-            ["similarity", "run"]
-        )
-        median = ordered.iloc[(len(ordered) - 1) // 2]
+    for place, group in by_place(runs).items():
+        median = group.sort_values(["similarity", "run"]).iloc[(len(group) - 1) // 2]
         spec = analysis.cells[median.key].cell.spec
         try:
             policy = as_policy(models[median.key], spec)
-            maps[place] = similarity_on_grid(policy, spec, side, _TIME), median.similarity
+            _, grid = similarity_on_grid(policy, spec, _EPSILON, _RESOLUTION, _TIME)
+            maps[place] = grid, median.similarity
         except SMEError as error:
             problem = f" {error}"
     return maps, problem

@@ -116,18 +116,12 @@ def panel_grid(
 ) -> Iterator[Grid]:
     """A figure of panels with a common y axis; its files are complete after the block.
 
-    Args:
-      panels: how many.
-      formats: of `plots.FORMATS`.
-      heights: in inches, of all but the panels and of each row of panels.
-      width: in inches.
-      most_across: panels in a row.
-      stack: axes in a panel, one above the other; they share x, and y with the same row of others.
-      share_x: whether all panels share x.
+    `heights` are those of all but the panels and of each row of panels, in inches like `width`.
+    A panel is a `stack` of axes that share x, and y with the same row of other panels.
     """
     across = min(most_across, panels)
     down = math.ceil(panels / across)
-    with drawing((width, heights[0] + down * heights[1]), tuple(formats)) as (figure, files):
+    with drawing((width, heights[0] + down * heights[1]), formats) as (figure, files):
         axes = figure.subplots(stack * down, across, squeeze=False)
         stacks = np.concatenate([block.T for block in np.split(axes, down)])
         for unused in stacks[panels:].ravel():
@@ -181,33 +175,23 @@ def marks(
     upright: bool = False,
     joined: bool = False,
 ) -> None:
-    """Values with their intervals.
+    """The column `value` along x, or y if `upright`, with its intervals from `low` to `high`.
 
-    Args:
-      axes: to draw in.
-      rows: with the columns `low` and `high`, NaN where there is no interval.
-      value: the column that is drawn.
-      at: the place of each row on the other axis.
-      filled: whether each mark is filled, not hollow.
-      look: of the marks.
-      upright: values along y instead of x.
-      joined: whether a line joins them.
+    `at` has the place of each row on the other axis; `low` is NaN where there is no interval.
     """
     at = list(at)
     if joined:
         axes.plot(at, rows[value], color=look.colour, linewidth=1.1, linestyle=look.dash, alpha=0.7)
-    for place, row_value, low, high, is_filled in zip(
+    style = look.points | {"markersize": 4.5, "markeredgewidth": 1.1, "zorder": 3}
+    for x, y, low, high, is_filled in zip(
         at, rows[value], rows.low, rows.high, filled, strict=True
     ):
+        point, ends = ((x, y), ((x, x), (low, high)))
+        if not upright:
+            point, ends = point[::-1], ends[::-1]
         if not math.isnan(low):
-            ends = ([place, place], [low, high])
-            axes.plot(*(ends if upright else ends[::-1]), color=look.colour, linewidth=1.4)
-        point = (place, row_value) if upright else (row_value, place)
-        face = look.colour if is_filled else "white"
-        axes.plot(
-            *point, **look.points, markersize=4.5, markeredgewidth=1.1, markerfacecolor=face,
-            zorder=3,
-        )  # fmt: skip
+            axes.plot(*ends, color=look.colour, linewidth=1.4)
+        axes.plot(*point, markerfacecolor=look.colour if is_filled else "white", **style)
 
 
 def marks_by_algorithm(
