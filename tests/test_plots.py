@@ -34,7 +34,7 @@ EPISODES = [{"step": 100 * (i + 1), "regret": 1.0 - i / 50} for i in range(50)]
 @pytest.mark.parametrize("ending", plots.FORMATS)
 @pytest.mark.parametrize("kind", ["decay_curve", "similarity_map", "training_curve"])
 def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind):
-    path = tmp_path / "made" / f"figure.{ending}"
+    path = tmp_path / "new" / f"figure.{ending}"
     written = {
         "decay_curve": lambda: plots.decay_curve(report, path),
         "similarity_map": lambda: plots.similarity_map(half, PLANE, path, resolution=20),

@@ -56,9 +56,8 @@ class TextTable:
 def csv_tables(analysis: Analysis) -> dict[str, str]:
     """Every frame of the study as CSV, by name; floats read back as they are."""
     names = (*CSV_TABLES, "offline") if analysis.has_offline_runs else CSV_TABLES
-    return {
-        name: getattr(analysis, name).to_csv(index=False, lineterminator="\n") for name in names
-    }
+    frames = {name: getattr(analysis, name) for name in names}
+    return {name: f.to_csv(index=False, lineterminator="\n") for name, f in frames.items()}
 
 
 def text_tables(analysis: Analysis) -> list[TextTable]:

@@ -1,8 +1,4 @@
-"""`load`: a study's finished runs as two tidy pandas frames, from which the report is made, too.
-
-    results, curves = sme_registry.studies.load("runs/ablations")
-    inside = results[results.region == "WD"]
-    inside.groupby(["class_name", "algorithm"]).wd_regret.median().unstack()
+"""`load`: a study's finished runs as two tidy pandas frames, which the report also uses.
 
 `results`: one row per run and region, ordered by class, algorithm, run, region.
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import pandas as pd
 
@@ -48,25 +47,28 @@ def offline_runs(results: pd.DataFrame, algorithms: Sequence[StudyAlgorithm]) ->
 
 def offline(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     """Each offline learner on each class at each ν, from `offline_runs`."""
-    data = {place: _data_columns(group) for place, group in runs.groupby(["class_name", "nu"])}
     rows = []
-    for (class_name, nu, learner), group in runs.groupby(
-        ["class_name", "nu", "learner"], sort=False
-    ):
-        changes = group.improvement.to_numpy()
-        low = high = math.nan
-        if len(changes) >= OFFLINE_INTERVAL:
-            place = "offline", learner, class_name, f"{nu:g}"
-            low, high = bootstrap.interval(changes, *place, statistic=statistics.mean)
-        rows.append(
-            {
+    for (class_name, nu), same_data in runs.groupby(["class_name", "nu"], sort=False):
+        data_sets = same_data.drop_duplicates("dataset_digest")  # however many runs learnt from one
+        data = {
+            "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
+            "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
+            "data_sets": len(data_sets),
+            "constant_similarity": same_data.constant_similarity.to_numpy().mean(),
+        }
+        for learner, group in same_data.groupby("learner", sort=False):
+            changes = group.improvement.to_numpy()
+            low = high = math.nan
+            if len(changes) >= OFFLINE_INTERVAL:
+                place = "offline", learner, class_name, f"{nu:g}"
+                low, high = bootstrap.interval(changes, *place, statistic=statistics.mean)
+            rows.append({
                 "class_name": class_name, "nu": nu, "learner": learner, "runs": len(group),
                 "similarity": group.offline_similarity.to_numpy().mean(),
                 "similarity_sd": group.offline_similarity_sd.to_numpy().mean(),
                 "improvement": changes.mean(), "low": low, "high": high,
-                "verdict": offline_verdict(changes, low, high), **data[class_name, nu],
-            }
-        )  # fmt: skip
+                "verdict": offline_verdict(changes, low, high), **data,
+            })  # fmt: skip
     return frame(
         rows,
         "class_name:str nu learner:str runs:int64 similarity similarity_sd improvement low high "
@@ -107,14 +109,3 @@ def learner_names(algorithms: Sequence[StudyAlgorithm]) -> dict[str, str]:
         name = algorithm.uses.removeprefix("offline:").upper()
         names[algorithm.name] = f"{name} ({', '.join(differing)})" if differing else name
     return names
-
-
-def _data_columns(runs: pd.DataFrame) -> dict[str, Any]:
-    """The data sets of one ν on a class; each counts once, however many runs learnt from it."""
-    data_sets = runs.drop_duplicates("dataset_digest")
-    return {
-        "behaviour_similarity": data_sets.behaviour_similarity.to_numpy().mean(),
-        "behaviour_similarity_sd": data_sets.behaviour_similarity_sd.to_numpy().mean(),
-        "data_sets": len(data_sets),
-        "constant_similarity": runs.constant_similarity.to_numpy().mean(),
-    }

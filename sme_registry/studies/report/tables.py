@@ -192,18 +192,16 @@ def aggregates(
 ) -> pd.DataFrame:
     """Statistics of 1 − normalised regret over the classes of each group; classes count alike."""
     rows = []
-    for group, metric, algorithm, values in _compared(runs, groups, algorithms):
-        sizes = [len(x) for x in values.values()]
-        classes = {name: x[:, None] for name, x in values.items()}
-        seed = bootstrap.seed("aggregate", algorithm, metric.key)
-        for name, statistic in STATISTICS.items():
+    for group, metric, values in _compared(runs, groups, algorithms):
+        for algorithm, (name, statistic) in itertools.product(values, STATISTICS.items()):
+            classes = {key: x[:, None] for key, x in values[algorithm].items()}
+            sizes = [len(x) for x in classes.values()]
+            seed = bootstrap.seed("aggregate", algorithm, metric)
             low, high = statistics.stratified_bootstrap(classes, bootstrap.draws, seed, statistic)
             ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
             value = statistics.aggregate(classes, statistic)[0]
-            rows.append(
-                (group.name, metric.key, algorithm, name, len(sizes), sum(sizes), min(sizes), value,
-                 *ends)
-            )  # fmt: skip
+            counts = len(sizes), sum(sizes), min(sizes)
+            rows.append((group, metric, algorithm, name, *counts, value, *ends))
     columns = "statistic:str classes:int64 runs:int64 fewest_runs:int64 value low high"
     return frame(rows, f"group:str metric:str algorithm:str {columns}")
 
@@ -213,12 +211,13 @@ def profiles(
 ) -> pd.DataFrame:
     """Shares of runs whose 1 − normalised regret is above each threshold."""
     rows: list[Any] = []
-    for group, metric, algorithm, values in _compared(runs, groups, algorithms):
-        fewest = min(map(len, values.values()))
-        seed = bootstrap.seed("profile", algorithm, metric.key)
-        shares = statistics.performance_profile(values, THRESHOLDS, bootstrap.draws, seed)
-        shares_at = zip(THRESHOLDS.round(4), shares.value, shares.low, shares.high, strict=True)
-        rows += [(group.name, metric.key, algorithm, fewest, *at) for at in shares_at]
+    for group, metric, values in _compared(runs, groups, algorithms):
+        for algorithm, classes in values.items():
+            fewest = min(map(len, classes.values()))
+            seed = bootstrap.seed("profile", algorithm, metric)
+            shares = statistics.performance_profile(classes, THRESHOLDS, bootstrap.draws, seed)
+            shares_at = zip(THRESHOLDS.round(4), shares.value, shares.low, shares.high, strict=True)
+            rows += [(group, metric, algorithm, fewest, *at) for at in shares_at]
     columns = "fewest_runs:int64 threshold share low high"
     return frame(rows, f"group:str metric:str algorithm:str {columns}")
 
@@ -227,23 +226,18 @@ def improvements(
     runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str], bootstrap: Bootstrap
 ) -> pd.DataFrame:
     """Every pair of algorithms, except those that learnt from different data."""
-    data, at = training_data(runs), by_place(runs)
-    pairs = [
-        pair
-        for pair in itertools.combinations(algorithms, 2)
-        if len({data[name] for name in pair} - {None}) < 2
-    ]
+    data = training_data(runs)
     rows = []
-    for group, metric, (first, second) in itertools.product(groups, REGRET_METRICS, pairs):
-        if not group.compared:
-            continue
-        x, y = (_values(at, group, algorithm, metric) for algorithm in (first, second))
-        fewest = min(len(values) for values in (*x.values(), *y.values()))
-        seed = bootstrap.seed("improvement", first, second, metric.key)
-        estimate = statistics.probability_of_improvement(x, y, bootstrap.draws, seed)
-        ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
-        place = group.name, metric.key, first, second
-        rows.append((*place, len(x), fewest, estimate.value[0], *ends))
+    for group, metric, values in _compared(runs, groups, algorithms):
+        for first, second in itertools.combinations(algorithms, 2):
+            if len({data[first], data[second]} - {None}) == 2:
+                continue
+            x, y = values[first], values[second]
+            fewest = min(map(len, (*x.values(), *y.values())))
+            seed = bootstrap.seed("improvement", first, second, metric)
+            estimate = statistics.probability_of_improvement(x, y, bootstrap.draws, seed)
+            ends = (estimate.low[0], estimate.high[0]) if fewest > 1 else (math.nan, math.nan)
+            rows.append((group, metric, first, second, len(x), fewest, estimate.value[0], *ends))
     columns = "first:str second:str classes:int64 fewest_runs:int64 probability low high"
     return frame(rows, f"group:str metric:str {columns}")
 
@@ -295,19 +289,16 @@ def _linear_medians(results: pd.DataFrame) -> dict[str, float]:
 
 def _compared(
     runs: pd.DataFrame, groups: Sequence[Group], algorithms: Sequence[str]
-) -> Iterator[tuple[Group, Metric, str, dict[str, Array]]]:
-    """Each group that can be compared, with each regret metric and algorithm, and its values."""
+) -> Iterator[tuple[str, str, dict[str, dict[str, Array]]]]:
+    """Each group and regret metric with `[n]` values 1 − regret, by algorithm and class."""
     at = by_place(runs)
     comparable = [group for group in groups if group.compared]
-    for group, metric, algorithm in itertools.product(comparable, REGRET_METRICS, algorithms):
-        yield group, metric, algorithm, _values(at, group, algorithm, metric)
-
-
-def _values(
-    at: Mapping[tuple[str, str], pd.DataFrame], group: Group, algorithm: str, metric: Metric
-) -> dict[str, Array]:
-    """`[n]` 1 − regret of the runs of each class."""
-    return {name: 1.0 - at[name, algorithm][metric.key].to_numpy() for name in group.compared}
+    for group, metric in itertools.product(comparable, REGRET_METRICS):
+        values = {
+            a: {c: 1.0 - at[c, a][metric.key].to_numpy() for c in group.compared}
+            for a in algorithms
+        }
+        yield group.name, metric.key, values
 
 
 def _iqm(values: Any) -> float:

@@ -50,16 +50,17 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = dict(attrs)
+        attributes = dict(attrs)
         if tag not in self.VOID:
             self.open.append(tag)
-        if "id" in found:
-            self.ids.append(str(found["id"]))
+        if "id" in attributes:
+            self.ids.append(str(attributes["id"]))
         if tag == "a":
-            self.links.append(str(found["href"]))
+            self.links.append(str(attributes["href"]))
         if tag == "img":
-            self.images.append(found)
-        self.loads += [str(found[name]) for name in ("src", "data", "srcset") if name in found]
+            self.images.append(attributes)
+        sources = {"src", "data", "srcset"} & attributes.keys()
+        self.loads += [str(attributes[name]) for name in sources]
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
@@ -84,7 +85,7 @@ def analysis(finished: Path) -> Analysis:
     return analyse(file, ledger.results(), draws=300)
 
 
-def test_every_figure_is_there_in_every_format(written: Path):
+def test_every_figure_is_written_in_every_format(written: Path):
     for ending, signature in SIGNATURES.items():
         files = {path.stem: path for path in (written / "figures").glob(f"*.{ending}")}
         assert set(files) == FIGURES
@@ -166,9 +167,9 @@ def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]
     levels = analysis.levels.copy()  # the worst is in the last panel, and far above the others
     worst = (levels.class_name == "plane") & (levels.algorithm == "Alpha")
     levels.loc[worst, ["iqm", "low", "high"]] = 1.7, 1.5, 1.9
-    found, _ = draw_figures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
-    assert len(figures) == len(found) == len(FIGURES)
-    for picture, figure in zip(found, figures, strict=True):
+    pictures, _ = draw_figures(dataclasses.replace(analysis, levels=levels), ("svg",), {})
+    assert len(figures) == len(pictures) == len(FIGURES)
+    for picture, figure in zip(pictures, figures, strict=True):
         for axes in figure.axes:
             (left, right), (bottom, top) = sorted(axes.get_xlim()), sorted(axes.get_ylim())
             for line in axes.lines:
@@ -177,7 +178,7 @@ def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]
                         assert left <= x <= right, picture.name
                         assert bottom <= y <= top, picture.name
     bottoms = {axes.get_ylim()[0] for axes in figures[2].axes}
-    assert (found[2].name, bottoms) == ("wd-regret", {0.0})
+    assert (pictures[2].name, bottoms) == ("wd-regret", {0.0})
 
 
 def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):
@@ -220,7 +221,7 @@ def test_another_format_is_refused(finished: Path, tmp_path: Path, formats: list
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_writes_into_the_study_or_where_it_is_told(finished: Path, tmp_path: Path):
+def test_the_command_writes_into_the_study_or_another_folder(finished: Path, tmp_path: Path):
     study = tmp_path / "study"
     shutil.copytree(finished, study)
     done = CliRunner().invoke(app, ["study", "report", str(study), "--format", "csv,latex"])

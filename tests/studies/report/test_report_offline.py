@@ -48,14 +48,14 @@ def planned(**fields: Any) -> StudyFile:
 
 def results(file: StudyFile) -> dict[str, CellResult]:
     """The reports of a constant, with scores that were never reached."""
-    judged: dict[str, CellResult] = {}
-    found = {}
+    constants: dict[str, CellResult] = {}
+    finished = {}
     for place in file.plan.cells:
         cell = place.cell
         spec = cell.spec.digest
-        if spec not in judged:
+        if spec not in constants:
             fields = {"uses": "reference:constant", "steps": 0, "hyperparameters": {}}
-            judged[spec] = run_cell(cell.model_copy(update=fields))
+            constants[spec] = run_cell(cell.model_copy(update=fields))
         nu = float(str(cell.hyperparameters["nu"]))
         behaviour = 1.0 - nu / 6.0 + 0.001 * place.run
         change = CHANGES[place.algorithm.split()[0], place.class_name] + 0.0005 * (place.run - 2)
@@ -68,9 +68,9 @@ def results(file: StudyFile) -> dict[str, CellResult]:
             similarity=behaviour + change,
             similarity_sd=0.01 * (1 + place.run),
         )
-        own = {"key": cell.digest, "cell": cell, "offline": scores}
-        found[cell.digest] = judged[spec].model_copy(update=own)
-    return found
+        update = {"key": cell.digest, "cell": cell, "offline": scores}
+        finished[cell.digest] = constants[spec].model_copy(update=update)
+    return finished
 
 
 def hash_of(class_name: str, nu: float, run: int) -> int:
@@ -110,14 +110,14 @@ def test_learners_are_named_without_their_nu_and_data_sets_count_once(analysis: 
         assert row.low < row.improvement < row.high
 
 
-def test_settings_besides_nu_tell_learners_apart() -> None:
+def test_learners_of_one_kind_are_named_by_their_settings_other_than_nu() -> None:
     algorithms = [
-        {"name": name, "uses": "offline:iql", "action_range": "unit", "hyperparameters": own}
-        for name, own in (("IQL a", {"nu": 0.5}), ("IQL b", {"nu": 0.5, "expectile": 0.9}))
+        {"name": name, "uses": "offline:iql", "action_range": "unit", "hyperparameters": settings}
+        for name, settings in (("IQL a", {"nu": 0.5}), ("IQL b", {"nu": 0.5, "expectile": 0.9}))
     ]
     file = planned(algorithms=algorithms, seeds=1)
-    found = analyse(file, results(file), draws=300)
-    assert list(found.offline.learner) == [
+    analysis = analyse(file, results(file), draws=300)
+    assert list(analysis.offline.learner) == [
         "IQL (default expectile)", "IQL (expectile = 0.9)",
     ] * 2  # fmt: skip
 
@@ -126,8 +126,8 @@ def of_learner(analysis: Analysis, name: str) -> Learner:
     return next(each for each in offline_findings(analysis).learners if each.name == name)
 
 
-def places(found: Any) -> list[tuple[str, float]]:
-    return [(place.class_name, place.nu) for place in found]
+def places(differences: Any) -> list[tuple[str, float]]:
+    return [(place.class_name, place.nu) for place in differences]
 
 
 def test_findings_name_who_imitates_who_surpasses_and_who_collapses(analysis: Analysis) -> None:
@@ -184,9 +184,9 @@ def test_only_learners_with_equal_data_are_compared(analysis: Analysis) -> None:
 
 
 def test_findings_have_an_example_of_an_algorithm_and_its_nu(analysis: Analysis) -> None:
-    found = offline_findings(analysis)
-    assert (found.example, found.nu) == ("BC (0)", 0.0)
-    assert (found.fewest_runs, found.most_runs) == (5, 5)
+    offline = offline_findings(analysis)
+    assert (offline.example, offline.nu) == ("BC (0)", 0.0)
+    assert (offline.fewest_runs, offline.most_runs) == (5, 5)
 
 
 def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
@@ -204,13 +204,13 @@ def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
         for measure in CURVES
     )  # fmt: skip
     runs = pd.concat([analysis.runs[:1].assign(algorithm=name) for name in names])
-    nothing = {name: getattr(analysis, name)[:0] for name in ("contrasts", "profiles", "offline")}
+    empty = {name: getattr(analysis, name)[:0] for name in ("contrasts", "profiles", "offline")}
     many = dataclasses.replace(
         analysis, algorithms=tuple(names), learners=tuple(names), runs=runs, learning_curves=curves,
-        offline_runs=analysis.offline_runs[:0], **nothing,
+        offline_runs=analysis.offline_runs[:0], **empty,
     )  # fmt: skip
-    found, _ = draw_figures(many, ("svg",), {})
-    assert found[-1].name == "learning-curves-complexity"
+    pictures, _ = draw_figures(many, ("svg",), {})
+    assert pictures[-1].name == "learning-curves-complexity"
     figure = figures[-1]
     shown = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title() for axes in shown if axes.get_title()] == names
@@ -219,7 +219,7 @@ def test_learning_curves_of_many_learners_are_wrapped_and_over_gradient_steps(
     assert len({axes.get_ylim() for axes in shown}) == 1  # of all learners, not of a row
 
 
-def test_the_report_has_it_first_and_in_every_format(
+def test_learning_from_data_comes_first_in_the_report_and_has_every_format(
     file: StudyFile, done: dict[str, CellResult], tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "study")
@@ -245,7 +245,7 @@ def test_the_report_has_it_first_and_in_every_format(
     assert list(rows.improvement) == pytest.approx(list(difference), abs=1e-12)
 
 
-def test_the_table_has_the_behaviour_beside_the_learners(analysis: Analysis) -> None:
+def test_the_table_has_the_behaviour_policy_next_to_the_learners(analysis: Analysis) -> None:
     similarities, improvements = (table.frame for table in offline_tables(analysis))
     constant = fixed(analysis.offline.constant_similarity[0], 3)
     assert similarities.iloc[0].to_dict() == {
@@ -260,12 +260,12 @@ def test_the_table_has_the_behaviour_beside_the_learners(analysis: Analysis) -> 
     assert improvements.IQL.iloc[-1].endswith(" *")
 
 
-def test_studies_without_such_cells_have_none_of_it(finished: Path) -> None:
+def test_a_study_without_offline_runs_has_no_offline_findings_and_figures(finished: Path) -> None:
     ledger = Ledger(finished)
     file = ledger.plan_file()
     assert file is not None
-    found = analyse(file, ledger.results(), draws=100)
-    assert found.offline.empty
-    assert not found.has_offline_runs
-    assert findings(found).offline is None
-    assert list(draw_offline(found, ("svg",))) == []
+    analysis = analyse(file, ledger.results(), draws=100)
+    assert analysis.offline.empty
+    assert not analysis.has_offline_runs
+    assert findings(analysis).offline is None
+    assert list(draw_offline(analysis, ("svg",))) == []

@@ -15,13 +15,7 @@ from sme_registry.studies.report.classes import AXES, SEVERAL, Group, setting_la
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.tables import (
-    CURVES,
-    ENOUGH_RUNS,
-    REGRET_METRICS,
-    Metric,
-    training_data,
-)
+from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, REGRET_METRICS, training_data
 
 _OFFLINE_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 _BEHAVIOUR = Look("black", "", "-")
@@ -33,7 +27,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
     groups = _axis_groups(analysis)
     names = analysis.learners or analysis.algorithms
     looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
-    for metric in REGRET_METRICS:
+    for metric in (metric.key for metric in REGRET_METRICS):
         with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as grid:
             for axes, group in zip(grid.panels, groups, strict=True):
                 _draw_axis(axes, analysis, group, metric, looks)
@@ -41,24 +35,23 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
             grid.label_rows("normalised regret")
             panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
         yield Picture(
-            metric.key.replace("_", "-"),
-            f"Normalised regret {panels.HEADINGS[metric.key]}, along each axis",
+            metric.replace("_", "-"),
+            f"Normalised regret {panels.HEADINGS[metric]}, along each axis",
             "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
             "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
             f"Hollow: fewer than {ENOUGH_RUNS} runs."
-            + (f" {NOT_COMPARABLE}" if metric.key == "ood_regret" else ""),
+            + (f" {NOT_COMPARABLE}" if metric == "ood_regret" else ""),
             grid.files,
         )
 
 
 def _draw_axis(
-    axes: Any, analysis: Analysis, group: Group, metric: Metric, looks: Mapping[str, Look]
+    axes: Any, analysis: Analysis, group: Group, metric: str, looks: Mapping[str, Look]
 ) -> None:
     """The classes of one axis, in the order of its values."""
     x = {name: i for i, name in enumerate(group.classes)}
-    levels = analysis.levels[
-        (analysis.levels.metric == metric.key) & analysis.levels.class_name.isin(x)
-    ]
+    levels = analysis.levels[analysis.levels.metric == metric]
+    levels = levels[levels.class_name.isin(x)]
     levels = levels.sort_values("class_name", key=lambda names: names.map(x), kind="stable")
     at = levels.class_name.map(x)
     ordered = group.axis not in ("", SEVERAL)
@@ -84,10 +77,9 @@ def _draw_axis(
 
 def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The share of runs above each value of 1 − normalised regret, one panel a group of classes."""
-    groups = list(dict.fromkeys(analysis.profiles.group))
     looks = panels.looks(analysis)
-    for metric in REGRET_METRICS if groups else ():
-        rows = analysis.profiles[analysis.profiles.metric == metric.key]
+    for metric, rows in analysis.profiles.groupby("metric", sort=False):
+        groups = list(dict.fromkeys(rows.group))
         with panels.panel_grid(len(groups), formats, (0.7, 2.1), share_x=True) as grid:
             for axes, group in zip(grid.panels, groups, strict=True):
                 for name, profile in rows[rows.group == group].groupby("algorithm", sort=False):
@@ -99,10 +91,10 @@ def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictur
                 axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
             grid.label_rows("share of runs above τ")
             grid.label_columns("τ (1 − normalised regret)")
-            panels.legend(grid.figure, {name: looks[name] for name in analysis.algorithms})
+            panels.legend(grid.figure, looks)
         yield Picture(
-            f"profiles-{metric.key.removesuffix('_regret')}",
-            f"Performance profiles {panels.HEADINGS[metric.key]}",
+            f"profiles-{metric.removesuffix('_regret')}",
+            f"Performance profiles {panels.HEADINGS[metric]}",
             "The share of runs whose 1 − normalised regret is above τ, classes counting alike, "
             "with pointwise 95 % bands. A line above another is better at every τ.",
             grid.files,
@@ -111,47 +103,41 @@ def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictur
 
 def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """One figure an axis: algorithms as panels, the values of the axis as lines."""
+    data = training_data(analysis.runs)
     for group in _axis_groups(analysis):
         rows = analysis.learning_curves
         rows = rows[rows.class_name.isin(group.classes)]
-        present = set(rows.algorithm)
-        names = [name for name in analysis.learners if name in present]
-        if names:
-            yield _draw_learning_curves(analysis, formats, group, rows, names)
-
-
-def _draw_learning_curves(
-    analysis: Analysis, formats: Sequence[str], group: Group, rows: pd.DataFrame, names: list[str]
-) -> Picture:
-    data = training_data(analysis.runs)
-    looks = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
-    width = min(panels.WIDTH, 1.2 + 2.6 * len(names))
-    with panels.panel_grid(
-        len(names), formats, (0.6, 4.4), width=width, most_across=4, stack=len(CURVES)
-    ) as grid:
-        for stack, name in zip(grid.stacks, names, strict=True):
-            for axes, measure in zip(stack, CURVES, strict=True):
-                selected = rows[(rows.algorithm == name) & (rows.measure == measure)]
-                _draw_classes(axes, selected, looks)
-            stack[0].set_title(literal(name))
-            stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
-            stack[-1].set_xlim(left=0)
-            stack[-1].locator_params(axis="x", nbins=4)
-            stack[-1].xaxis.set_major_formatter(_steps)
-        for index, label in enumerate(CURVES.values()):
-            grid.label_rows(label, index)
-        labels = _class_labels(analysis, group, with_symbol=True)
-        panels.legend(grid.figure, dict(zip(labels, looks.values(), strict=True)), across=4)
-    window = rows.window.max()
-    return Picture(
-        f"learning-curves-{(group.axis or group.name).replace(' ', '-').lower()}",
-        f"Learning curves: {group.name}",
-        "Median over runs, with the interquartile range as a band"
-        + (f", averaged over {window} evaluations" if window > 1 else "")
-        + ". Above: return in % of the optimum's. Below: mean exact regret per step, 0 for the "
-        "optimum.",
-        grid.files,
-    )
+        names = [name for name in analysis.learners if name in set(rows.algorithm)]
+        if not names:
+            continue
+        looks = panels.numbered_looks(group.classes, colours=shades(len(group.classes)))
+        width = min(panels.WIDTH, 1.2 + 2.6 * len(names))
+        with panels.panel_grid(
+            len(names), formats, (0.6, 4.4), width=width, most_across=4, stack=len(CURVES)
+        ) as grid:
+            for stack, name in zip(grid.stacks, names, strict=True):
+                for axes, measure in zip(stack, CURVES, strict=True):
+                    selected = rows[(rows.algorithm == name) & (rows.measure == measure)]
+                    _draw_classes(axes, selected, looks)
+                stack[0].set_title(literal(name))
+                stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
+                stack[-1].set_xlim(left=0)
+                stack[-1].locator_params(axis="x", nbins=4)
+                stack[-1].xaxis.set_major_formatter(_steps)
+            for index, label in enumerate(CURVES.values()):
+                grid.label_rows(label, index)
+            labels = _class_labels(analysis, group, with_symbol=True)
+            panels.legend(grid.figure, dict(zip(labels, looks.values(), strict=True)), across=4)
+        window = rows.window.max()
+        yield Picture(
+            f"learning-curves-{(group.axis or group.name).replace(' ', '-').lower()}",
+            f"Learning curves: {group.name}",
+            "Median over runs, with the interquartile range as a band"
+            + (f", averaged over {window} evaluations" if window > 1 else "")
+            + ". Above: return in % of the optimum's. Below: mean exact regret per step, 0 for the "
+            "optimum.",
+            grid.files,
+        )
 
 
 def _draw_classes(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> None:
