@@ -154,8 +154,8 @@ def test_decay_curve_of_a_team_has_a_line_for_each_agent(tmp_path, figures, n):
 
 def test_similarity_map_of_a_team_shows_its_joint_action(tmp_path, figures):
     team = PLANE.derive(team={"agents": [{"action_dim": 1, "observes": [1]}, {"action_dim": 1}]})
-    own = {"agent_0": lambda o: o[:, :1], "agent_1": lambda o: o[:, :1]}
-    plots.similarity_map(own, team, tmp_path / "map.png", resolution=8, epsilon=1.0)
+    policies = {"agent_0": lambda o: o[:, :1], "agent_1": lambda o: o[:, :1]}
+    plots.similarity_map(policies, team, tmp_path / "map.png", resolution=8, epsilon=1.0)
     drawn = figures[0].axes[0].images[0].get_array()
     side = -0.5 + (np.arange(8) + 0.5) / 4
     s = np.array([[x, y] for y in side for x in side])

@@ -123,11 +123,11 @@ def test_one_run_has_no_interval(study):
 
 def test_only_classes_with_runs_of_every_algorithm_are_compared(study):
     file, results, _ = study
-    gone = {
+    removed = {
         cell.cell.digest for cell in file.plan.cells
         if (cell.class_name, cell.algorithm) == ("plane", "Beta")
     }  # fmt: skip
-    cut = analyse(file, {k: v for k, v in results.items() if k not in gone}, draws=50)
+    cut = analyse(file, {k: v for k, v in results.items() if k not in removed}, draws=50)
     group = cut.groups[0]
     assert group.name == ALL
     assert group.left_out == ("plane",)
