@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import GREY, drawing, literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
-from sme_registry.studies.report.figures.panels import Look, Picture
+from sme_registry.studies.report.figures.panels import Grid, Look, Picture
 from sme_registry.studies.report.frames import RUN
 from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, REGRET_METRICS
 
@@ -33,8 +32,7 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
                 side = "right" if metric.worse > 0 else "left"
                 axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
                 axes.locator_params(axis="x", nbins=15 // len(metrics))
-                _shade_rows(axes, place.values())
-            grid.name_rows(place)
+            _name_rows(grid, place)
             panels.legend(grid.figure, looks)
         labels = [metric.label.partition(",")[0] for metric in metrics]
         yield Picture(
@@ -63,8 +61,7 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pict
             panels.marks_by_algorithm(axes, selected, "value", at, enough, looks)
             axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
             axes.set_xlabel("IQM of 1 − normalised regret")
-            _shade_rows(axes, place.values())
-        grid.name_rows(place)
+        _name_rows(grid, place)
         panels.legend(grid.figure, looks)
     yield Picture(
         "aggregates",
@@ -91,8 +88,7 @@ def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pi
             axes.set_xlim(-0.02, 1.02)
             axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
             axes.set_xlabel("P(a run of X beats a run of Y)")
-            _shade_rows(axes, ())
-        grid.name_rows(place)
+        _name_rows(grid, place, shaded=False)
     caption = (
         "How probably a run of the first algorithm beats a run of the second on a class drawn at "
         "random, with its 95 % interval: ½ where neither is better."
@@ -147,9 +143,13 @@ def _class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
     return places
 
 
-def _shade_rows(axes: Any, places: Iterable[float]) -> None:
-    """A light band behind each row of marks, instead of grid lines."""
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
-    for y in places:
-        axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
+def _name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool = True) -> None:
+    """Rows of marks from top to bottom, on light bands instead of grid lines."""
+    for axes in grid.panels:
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        for y in places.values() if shaded else ():
+            axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
+    first = grid.panels[0]
+    first.set_yticks([*places.values()], [literal(name) for name in places], fontsize=8)
+    first.set_ylim(max(places.values()) + 0.6, -0.6)

@@ -96,12 +96,6 @@ class Grid(NamedTuple):
             axes.tick_params(labelbottom=lowest)
             axes.set_xlabel(label if lowest else "")
 
-    def name_rows(self, places: Mapping[str, float]) -> None:
-        """Name the rows of marks, by their heights, on the first panel; the first row is on top."""
-        first = self.panels[0]
-        first.set_yticks([*places.values()], [literal(name) for name in places], fontsize=8)
-        first.set_ylim(max(places.values()) + 0.6, -0.6)
-
 
 @contextmanager
 def panel_grid(
@@ -122,18 +116,18 @@ def panel_grid(
     across = min(most_across, panels)
     down = math.ceil(panels / across)
     with drawing((width, heights[0] + down * heights[1]), formats) as (figure, files):
-        axes = figure.subplots(stack * down, across, squeeze=False)
-        stacks = np.concatenate([block.T for block in np.split(axes, down)])
+        grid = figure.subplots(stack * down, across, squeeze=False)
+        stacks = np.concatenate([block.T for block in np.split(grid, down)])
         for unused in stacks[panels:].ravel():
             unused.set_visible(False)
         for index, panel in enumerate(stacks[:panels]):
-            for row, one in enumerate(panel):
+            for row, axes in enumerate(panel):
                 if index:
-                    one.sharey(stacks[0][row])
+                    axes.sharey(stacks[0][row])
                 if row < stack - 1:
-                    one.sharex(panel[-1])
-                    one.tick_params(labelbottom=False)
-                one.tick_params(labelleft=index % across == 0)
+                    axes.sharex(panel[-1])
+                    axes.tick_params(labelbottom=False)
+                axes.tick_params(labelleft=index % across == 0)
             if share_x and index:
                 panel[-1].sharex(stacks[0][-1])
         yield Grid(figure, files, stacks[:panels], across)
@@ -168,8 +162,8 @@ def marks(
     axes: Axes,
     rows: pd.DataFrame,
     value: str,
-    at: Iterable[float],
-    filled: Iterable[bool],
+    at: pd.Series,
+    filled: pd.Series,
     look: Look,
     *,
     upright: bool = False,
@@ -179,7 +173,6 @@ def marks(
 
     `at` has the place of each row on the other axis; `low` is NaN where there is no interval.
     """
-    at = list(at)
     if joined:
         axes.plot(at, rows[value], color=look.colour, linewidth=1.1, linestyle=look.dash, alpha=0.7)
     style = look.points | {"markersize": 4.5, "markeredgewidth": 1.1, "zorder": 3}
@@ -214,8 +207,9 @@ def marks_by_algorithm(
 def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
     """The legend below a figure, with at most `across` entries in a row."""
     handles = [
-        figure.axes[0].plot([], [], label=literal(name), markersize=4.5, linewidth=1.4, **look.line)
+        figure.axes[0].plot(
+            [], [], label=literal(name), markersize=4.5, linewidth=1.4, **look.line
+        )[0]
         for name, look in looks.items()
-    ]
-    lines = [line for (line,) in handles]
-    figure.legend(handles=lines, loc="outside lower center", ncols=min(across, len(lines)))
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(across, len(handles)))
