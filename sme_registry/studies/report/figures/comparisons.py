@@ -11,7 +11,7 @@ from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import Grid, Look, Picture
 from sme_registry.studies.report.frames import RUN
-from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, REGRET_METRICS
+from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
 
 
 def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
@@ -55,11 +55,11 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pict
     looks = panels.looks(analysis)
     height = 1.1 + (0.09 * len(looks) + 0.1) * max(2, len(place))
     with panels.panel_grid(2, formats, (0.0, height)) as grid:
-        for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
-            selected = rows[rows.metric == metric.key]
+        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
+            selected = rows[rows.metric == metric]
             at, enough = selected.group.map(place), selected.fewest_runs >= ENOUGH_RUNS
             panels.marks_by_algorithm(axes, selected, "value", at, enough, looks)
-            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
+            axes.set_title(heading, fontsize=9)
             axes.set_xlabel("IQM of 1 − normalised regret")
         _name_rows(grid, place)
         panels.legend(grid.figure, looks)
@@ -80,13 +80,13 @@ def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pi
     pairs = rows["first"] + " over " + rows["second"]
     place = _places(pairs)
     with panels.panel_grid(2, formats, (1.0, 0.26 * max(3, len(place)))) as grid:
-        for axes, metric in zip(grid.panels, REGRET_METRICS, strict=True):
-            selected = rows[rows.metric == metric.key]
+        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
+            selected = rows[rows.metric == metric]
             at, enough = pairs[selected.index].map(place), selected.fewest_runs >= ENOUGH_RUNS
             panels.marks(axes, selected, "probability", at, enough, Look("black", "o", "-"))
             axes.axvline(0.5, color=GREY, linewidth=1.0, zorder=1.5)
             axes.set_xlim(-0.02, 1.02)
-            axes.set_title(panels.HEADINGS[metric.key], fontsize=9)
+            axes.set_title(heading, fontsize=9)
             axes.set_xlabel("P(a run of X beats a run of Y)")
         _name_rows(grid, place, shaded=False)
     caption = (

@@ -15,7 +15,7 @@ from sme_registry.studies.report.classes import AXES, SEVERAL, Group, setting_la
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, REGRET_METRICS, training_data
+from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, training_data
 
 _OFFLINE_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1, 1, 1)), (0, (8, 2)))
 _BEHAVIOUR = Look("black", "", "-")
@@ -27,7 +27,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
     groups = _axis_groups(analysis)
     names = analysis.learners or analysis.algorithms
     looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
-    for metric in (metric.key for metric in REGRET_METRICS):
+    for metric, heading in panels.HEADINGS.items():
         with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as grid:
             for axes, group in zip(grid.panels, groups, strict=True):
                 _draw_axis(axes, analysis, group, metric, looks)
@@ -36,7 +36,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
             panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
         yield Picture(
             metric.replace("_", "-"),
-            f"Normalised regret {panels.HEADINGS[metric]}, along each axis",
+            f"Normalised regret {heading}, along each axis",
             "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
             "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
             f"Hollow: fewer than {ENOUGH_RUNS} runs."
