@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from leaderboard.scoring.metrics import Array
-from sme_registry.statistics import iqm
+from sme_registry.statistics import Array, iqm
 from sme_registry.statistics import stratified_bootstrap as bootstrap
 
 RUNS, CLASSES = 10, 6

@@ -17,7 +17,7 @@ CLASSES = {
     "one": np.array([[0.4, 1.0]]),
 }
 
-# What `leaderboard.scoring.metrics` has given for them, with 400 draws and the seed "seed".
+# What the leaderboard has computed for them, with 400 draws and the seed "seed".
 GOLDEN = (
     [0.18188150111927803, 1.256840920051007],
     [0.5892296099918332, 3.8542701910601047],

@@ -4,7 +4,7 @@ Checks that the schema cannot express, in this order. The first failure is repor
 
     unsafe_name      names, texts and links contain only safe characters, and no name imitates
                      the board's own
-    unknown_suite    suite and track are the board's
+    unknown_suite    suite is the board's
     schema           the time exists
     stale_time       and is near the board's
     unknown_spec     every run is on an instance of the suite
@@ -27,13 +27,13 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.submission import (
     MAX_ARTEFACT_BYTES,
     MAX_BYTES,
+    MAX_RUNS,
     Artefact,
     Method,
     Run,
     SignedSubmission,
     Submission,
     Submitter,
-    refuse_countless,
 )
 from leaderboard.errors import BoardError, Rejection
 from sme_registry.spec import Suite
@@ -63,7 +63,13 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
       Rejection: the first code that applies, in the order above.
     """
     check_names(submission, board.key)
-    _check_suite(board, submission)
+    expected = board.suite_reference
+    if submission.suite != expected:
+        raise Rejection(
+            "unknown_suite",
+            f"suite={submission.suite.name}, {submission.suite.digest}: must be "
+            f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
+        )
     _check_time(submission.created, at, board.limits.age_days)
     check_runs(board.suite, submission)
     for index, run in enumerate(submission.runs):
@@ -123,11 +129,7 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
 
 
 def check_text(field: str, text: str) -> None:
-    """Reject a text whose invisible characters could disguise what is shown next to it.
-
-    Raises:
-      Rejection: `unsafe_name`.
-    """
+    """Reject (`unsafe_name`) a text whose invisible characters could disguise other text."""
     for letter in text:
         if letter != "\n" and unicodedata.category(letter) in _UNSAFE_CATEGORIES:
             raise Rejection(
@@ -213,22 +215,6 @@ def most_runs(board: BoardDocument) -> int:
     return 1 + (MAX_BYTES - one) // (two - one)
 
 
-def _check_suite(board: BoardDocument, submission: Submission) -> None:
-    expected = board.suite_reference
-    if submission.suite != expected:
-        raise Rejection(
-            "unknown_suite",
-            f"suite={submission.suite.name}, {submission.suite.digest}: must be "
-            f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
-        )
-    if submission.track != board.track:
-        raise Rejection(
-            "unknown_suite",
-            f"track={submission.track!r}: must be {board.track!r} on this board. Submit to a board "
-            "of this track.",
-        )
-
-
 def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
     try:
         moment = datetime.datetime.fromisoformat(created)
@@ -250,25 +236,19 @@ def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
 
 
 def _check_duplicates(submission: Submission) -> None:
-    seeds: dict[tuple[str, int], int] = {}
-    artefacts: dict[tuple[str, str], int] = {}
+    first: dict[tuple[str, str, int | str], int] = {}
     for index, run in enumerate(submission.runs):
-        before = seeds.setdefault((run.spec, run.seed), index)
-        if before != index:
-            raise Rejection(
-                "duplicate_run",
-                f"runs.{index}.seed={run.seed}: runs.{before} has the same spec and seed. Remove "
-                "one of them.",
-            )
-        if run.artefact is None:
-            continue
-        before = artefacts.setdefault((run.spec, run.artefact.sha256), index)
-        if before != index:
-            raise Rejection(
-                "duplicate_run",
-                f"runs.{index}.artefact.sha256={run.artefact.sha256}: runs.{before} has the same "
-                "spec and the same policy. Remove one of them.",
-            )
+        values: list[tuple[str, str, int | str]] = [("seed", "seed", run.seed)]
+        if run.artefact is not None:
+            values.append(("artefact.sha256", "policy", run.artefact.sha256))
+        for field, name, value in values:
+            before = first.setdefault((run.spec, field, value), index)
+            if before != index:
+                raise Rejection(
+                    "duplicate_run",
+                    f"runs.{index}.{field}={value}: runs.{before} has the same spec and {name}. "
+                    "Remove one of them.",
+                )
 
 
 def _check_started(submission: Submission, listed: Counter[str]) -> None:
@@ -287,4 +267,9 @@ def _check_started(submission: Submission, listed: Counter[str]) -> None:
                 f"runs_started.{name}={started.get(name)}: must be at least {count}, the number of "
                 "listed runs. Count every run that was ever started with this method.",
             )
-    refuse_countless(started)
+    if sum(started.values()) > MAX_RUNS:
+        raise Rejection(
+            "schema",
+            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in total. "
+            "Count the runs of this version of the method only.",
+        )

@@ -14,10 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import (
-    Ed25519PrivateKey,
-    Ed25519PublicKey,
-)
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from pydantic import Field
 
 from leaderboard.errors import BoardError
@@ -33,11 +30,7 @@ Signature = Annotated[
 
 @dataclass(frozen=True)
 class SigningKey:
-    """A private key; `repr` never shows it.
-
-    Attributes:
-      public: the public half, 64 hex digits.
-    """
+    """A private key; `repr` never shows it."""
 
     _private: Ed25519PrivateKey
 

@@ -9,7 +9,6 @@ A bundle is the submitted folder: `submission.json` (a `SignedSubmission`) and o
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
@@ -253,20 +252,3 @@ def utc(moment: datetime.datetime) -> str:
 def now() -> str:
     """The current time as documents write it."""
     return utc(datetime.datetime.now(datetime.UTC))
-
-
-def refuse_countless(started: Mapping[str, int]) -> None:
-    """Reject more runs than fit into a result.
-
-    Args:
-      started: number of runs by class.
-
-    Raises:
-      Rejection: `schema`.
-    """
-    if sum(started.values()) > MAX_RUNS:
-        raise Rejection(
-            "schema",
-            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in total. "
-            "Count the runs of this version of the method only.",
-        )

@@ -14,9 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from leaderboard.documents.result import Estimate, Metric, Scores
+import numpy as np
+import numpy.typing as npt
+
+from leaderboard.documents.result import Metric, Scores
 from leaderboard.errors import NotPublishable
-from leaderboard.scoring.metrics import rank_ranges
 from leaderboard.store import EntryRow
 
 NotRanked = Literal["", "reference", "too_few_runs", "not_learned"]
@@ -58,27 +60,40 @@ class RankedRow:
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
     """Every scored entry that is not withdrawn, ordered by its score, the best first.
 
-    Args:
-      entries: of a board, in any order.
-      metric: "wd_regret" (N₀), "ood_regret" (N̄) or "ood_decay" (N̄ − N₀); lower is better.
-
-    Returns:
-      The rows; equal scores are in order of submission.
+    Lower is better in every metric; equal scores are in order of submission.
     """
     scored = [
-        (_estimate(entry.scores, metric), entry, _reason(entry, entry.scores, metric))
+        (getattr(entry.scores, metric), entry, _reason(entry, entry.scores, metric))
         for entry in entries
         if entry.status == "scored" and entry.scores is not None
     ]
     scored.sort(key=lambda row: (row[0].value, row[1].sequence))
     ranked = [estimate for estimate, _, reason in scored if not reason]
-    first, last = rank_ranges([one.low for one in ranked], [one.high for one in ranked])
-    ranges = iter(zip(first.tolist(), last.tolist(), strict=True))
+    first, last = rank_ranges([each.low for each in ranked], [each.high for each in ranked])
+    ranges = zip(first.tolist(), last.tolist(), strict=True)
     rows = []
     for _, entry, reason in scored:
         best, worst = (None, None) if reason else next(ranges)
         rows.append(RankedRow(entry, best, worst, reason))
     return rows
+
+
+def rank_ranges(
+    low: npt.ArrayLike, high: npt.ArrayLike
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The best and the worst rank that each entry's interval allows; lower scores are better.
+
+    Args:
+      low: `[N]` lower ends.
+      high: `[N]` upper ends, none below its lower end.
+
+    Returns:
+      `first` and `last`, `[N]` each, 1 ≤ first ≤ last ≤ N. In O(N log N).
+    """
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    first = 1 + np.searchsorted(np.sort(high), low, side="left")
+    last = np.searchsorted(np.sort(low), high, side="right")
+    return first.astype(np.int64), last.astype(np.int64)
 
 
 def refuse_unpublishable(entries: list[EntryRow]) -> None:
@@ -123,11 +138,6 @@ def _known_scores(scores: Scores, regret: float) -> Iterator[tuple[str, float, f
     yield "ood_regret", scores.ood_regret.value, regret
     yield "ood_decay", scores.ood_decay.value, 0.0
     yield "regret_slope", scores.regret_slope.value, 0.0
-
-
-def _estimate(scores: Scores, metric: Metric) -> Estimate:
-    estimate: Estimate = getattr(scores, metric)
-    return estimate
 
 
 def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> NotRanked:

@@ -8,11 +8,16 @@ Protocol, spec and artefact determine the seed of a run's states:
 
 Anyone can recompute it, and each attempt at luckier states needs another policy. Memory holds one
 artefact and one batch of states at a time.
+
+θ of a metric is the mean over classes of the interquartile mean within a class, and not the pooled
+interquartile mean, which hardly changes when a method fails on one whole class.
+`python -m benchmarks.interval_coverage` measures the coverage of its intervals.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib import metadata
 
@@ -20,34 +25,27 @@ import numpy as np
 
 from leaderboard.artefact.sandbox import Actions, Observations, Sandbox
 from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.checks import check_runs
 from leaderboard.documents.result import METRICS, ClassScore, Estimate, Result, RunScore, Scores
-from leaderboard.documents.submission import Submission, refuse_countless
+from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
-from leaderboard.scoring.metrics import run_metrics
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.statistics import aggregate, iqm, stratified_bootstrap
 
 Progress = Callable[[int, int], None]
-Instances = dict[str, tuple[str, SMESpec]]
 
 ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
 """Oracle-like: N̄ at most the first, or N₀ at most the second and |N̄ − N₀| at most the third."""
 
-_NOT_NEGATIVE = ("wd_regret", "ood_regret")
+_SIGNED = ("ood_decay", "regret_slope", "similarity_loss")  # may be negative
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch")
 
 
 def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str) -> int:
-    """The seed of a run's states, in [0, 2⁵³).
-
-    Args:
-      protocol_digest: of the board's protocol.
-      spec_digest: of the instance.
-      artefact_digest: of the policy's file.
-    """
+    """The seed of a run's states, in [0, 2⁵³)."""
     text = f"{protocol_digest}\n{spec_digest}\n{artefact_digest}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
 
@@ -99,7 +97,7 @@ def result_of(
       board: the suite, and the numbers of runs and bootstrap draws.
       submission: its id.
       runs: all runs that were started, at least one of each class.
-      versions: of packages, for the result.
+      versions: of packages.
     """
     by_class = {
         member.name: [run for run in runs if run.class_name == member.name]
@@ -127,86 +125,57 @@ def _score_runs(
     progress: Progress | None,
 ) -> tuple[list[RunScore], dict[str, str]]:
     """The listed runs in order, then the unlisted ones; and the versions of packages."""
+    unlisted = never_listed(board, submission)
     instances = board.instances
-    unlisted = never_listed(board, submission, instances)
-    policies = {(run.spec, run.artefact.sha256) for run in submission.runs if run.artefact}
     states = board.protocol.states_per_region * len(board.protocol.edges)
-    scored: dict[tuple[str, str], RunScore] = {}
+    policies = sum(run.artefact is not None for run in submission.runs)
     versions: dict[str, str] = {}
-    runs = []
+    runs: list[RunScore] = []
+    evaluated = 0
     for index, run in enumerate(submission.runs):
         class_name, spec = instances[run.spec]
         if run.artefact is None:
             runs.append(failed_run(board, class_name, run.spec))
             continue
+
+        def advanced(done: int, _: int, before: int = states * evaluated) -> None:
+            if progress is not None:
+                progress(before + done, states * policies)
+
         digest = run.artefact.sha256
-        if (run.spec, digest) not in scored:
-            before = states * len(scored)
-
-            def advanced(done: int, _: int, before: int = before) -> None:
-                if progress is not None:
-                    progress(before + done, states * len(policies))
-
-            try:
-                report = _evaluate(board, spec, artefact(digest), digest, advanced)
-            except Rejection as error:
-                raise Rejection(
-                    error.code,
-                    f"runs.{index} (class {class_name}, spec {run.spec}, artefact {digest}): "
-                    f"{error.message}",
-                ) from None
-            scored[run.spec, digest] = _run_score(board, class_name, report, digest)
-            versions = versions or _versions(report)
-        runs.append(scored[run.spec, digest])
+        try:
+            report = _evaluate(board, spec, artefact(digest), digest, advanced)
+        except Rejection as error:
+            raise Rejection(
+                error.code,
+                f"runs.{index} (class {class_name}, spec {run.spec}, artefact {digest}): "
+                f"{error.message}",
+            ) from None
+        evaluated += 1
+        runs.append(_run_score(board, class_name, report, digest))
+        versions = versions or _versions(report)
     return runs + unlisted, versions
 
 
-def never_listed(
-    board: BoardDocument, submission: Submission, instances: Instances
-) -> list[RunScore]:
+def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]:
     """A score of 1 for each run that was started and is not listed.
 
-    Args:
-      board: the suite.
-      submission: with the number of runs started.
-      instances: of the board.
-
     Raises:
-      Rejection: `unknown_spec`, `missing_run` or `schema`, if `checks` did not accept it.
+      Rejection: a code of `check_runs`.
     """
-    listed = dict.fromkeys((member.name for member in board.suite.classes), 0)
-    for index, run in enumerate(submission.runs):
-        if run.spec not in instances:
-            raise Rejection(
-                "unknown_spec",
-                f"runs.{index}.spec={run.spec}: must be an instance of {board.suite_name}. "
-                f"`sme show {board.suite_name}` lists them.",
-            )
-        listed[instances[run.spec][0]] += 1
-    for name, count in listed.items():
-        if count == 0:
-            raise Rejection(
-                "missing_run",
-                f"runs: none of class {name!r}: each instance must have one. List failed runs "
-                "with artefact null.",
-            )
-    started = {
-        name: max(submission.runs_started.get(name, 0), count) for name, count in listed.items()
-    }
-    refuse_countless(started)
+    check_runs(board.suite, submission)
+    class_of = {digest: name for digest, (name, _) in board.instances.items()}
+    unlisted = Counter(submission.runs_started)
+    unlisted.subtract(class_of[run.spec] for run in submission.runs)
     return [
-        failed_run(board, name, None)
-        for name, count in listed.items()
-        for _ in range(started[name] - count)
+        failed_run(board, member.name, None)
+        for member in board.suite.classes
+        for _ in range(unlisted[member.name])
     ]
 
 
 def _evaluate(
-    board: BoardDocument,
-    spec: SMESpec,
-    data: bytes,
-    digest: str,
-    progress: Progress,
+    board: BoardDocument, spec: SMESpec, data: bytes, digest: str, progress: Progress
 ) -> EvaluationReport:
     """Evaluate a policy in the sandbox on the states of its own seed."""
     seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
@@ -233,6 +202,35 @@ def _evaluate(
             raise
 
 
+def run_metrics(
+    normalised_regret: Sequence[float], similarity: Sequence[float] | None, levels: Sequence[float]
+) -> dict[str, float]:
+    """The metrics of one run by name, as defined in `documents.result`.
+
+    Args:
+      normalised_regret: N_m of each region, WD first.
+      similarity: mean r̃ of each region, in [0, 1]; None without a policy.
+      levels: ε_m, 0 for WD.
+
+    Returns:
+      `wd_regret`, `ood_regret`, `ood_decay` and `regret_slope`, dimensionless, and
+      `similarity_loss`, in points (hundredths of r̃). Without a policy each is 1 (100 points), and
+      not what N_m = 1 everywhere gives: a decay of 0 would reward leaving out runs.
+    """
+    if similarity is None:
+        return {**dict.fromkeys(METRICS, 1.0), "similarity_loss": 100.0}
+    N, r = np.asarray(normalised_regret), np.asarray(similarity)
+    offset = np.asarray(levels) - np.mean(levels)
+    wd, ood = float(N[0]), float(N[1:].mean())
+    return {
+        "wd_regret": wd,
+        "ood_regret": ood,
+        "ood_decay": ood - wd,
+        "regret_slope": float(offset @ (N - wd) / (offset @ offset)),  # exactly 0 where N is flat
+        "similarity_loss": 100.0 * float(r[0] - r[1:].mean()),
+    }
+
+
 def _levels(board: BoardDocument) -> tuple[float, ...]:
     """ε_m of each region's outer face; 0 for WD."""
     return tuple(high for _, high in board.protocol.edges)
@@ -255,12 +253,9 @@ def _run_score(
 
 
 def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunScore:
-    """A run without a policy scores 1 in every region and every metric.
+    """A run without a policy: 1 in every region and every metric.
 
-    Args:
-      board: its protocol has the regions.
-      class_name: the class of the run.
-      spec: digest of the instance; None if the run is not listed.
+    `spec` is the digest of the instance, None if the run is not listed.
     """
     regrets = (1.0,) * len(board.protocol.edges)
     return RunScore(
@@ -289,19 +284,15 @@ def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Score
     """θ of each metric and each region, with intervals."""
     classes = {
         name: np.array(
-            [
-                [*(getattr(run, metric) for metric in METRICS), *run.normalised_regret]
-                for run in runs
-            ]
+            [[*(getattr(run, name) for name in METRICS), *run.normalised_regret] for run in runs]
         )
         for name, runs in by_class.items()
     }
     value = aggregate(classes)
     low, high = stratified_bootstrap(classes, draws, seed)
     # Regret is never negative, so a lower end below 0 carries no information.
-    not_negative = [metric in _NOT_NEGATIVE for metric in METRICS]
-    not_negative += [True] * (len(value) - len(METRICS))
-    low = np.where(not_negative, np.maximum(low, 0.0), low)
+    signed = [name in _SIGNED for name in METRICS] + [False] * (len(value) - len(METRICS))
+    low = np.where(signed, low, np.maximum(low, 0.0))
     estimates = [
         Estimate(value=value, low=low, high=high)
         for value, low, high in zip(value.tolist(), low.tolist(), high.tolist(), strict=True)

@@ -23,13 +23,13 @@ from leaderboard.documents.keys import verifies
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import Artefact, Run, SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.score import (
     Progress,
     evaluation_seed,
     failed_run,
     never_listed,
     result_of,
+    run_metrics,
     score_submission,
 )
 from leaderboard.store import (
@@ -353,7 +353,7 @@ def _check_runs(store: Store, result: Result) -> None:
     document, instances = store.document, store.document.instances
     submission = store.submission(result.submission).submission
     try:
-        unlisted = never_listed(document, submission, instances)
+        unlisted = never_listed(document, submission)
     except Rejection as error:
         _refuse_result(result.submission, f"its submission cannot be scored: {error}")
     pairs = itertools.zip_longest([*submission.runs, *unlisted], result.runs)

@@ -9,10 +9,11 @@ import pytest
 from scipy.stats import trim_mean
 
 from benchmarks.interval_coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
-from leaderboard.scoring.metrics import Array, rank_ranges, run_metrics
+from leaderboard.scoring.ranking import rank_ranges
+from leaderboard.scoring.score import run_metrics
 from sme_registry import statistics
+from sme_registry.statistics import Array, iqm
 from sme_registry.statistics import aggregate as theta
-from sme_registry.statistics import iqm
 from sme_registry.statistics import stratified_bootstrap as bootstrap
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)

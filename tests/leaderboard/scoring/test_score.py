@@ -19,12 +19,12 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
-from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.score import (
     _oracle_like,
     evaluation_seed,
     failed_run,
     result_of,
+    run_metrics,
     score_submission,
 )
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
@@ -92,8 +92,14 @@ def score(
             "submitter": {"name": "s", "key": KEY.public},
             "created": "2026-11-21T09:30:00Z",
             "runs": runs,
-            "runs_started": {},
             **fields,
+            "runs_started": {
+                member.name: sum(
+                    run["spec"] in {spec.digest for spec in member.instances} for run in runs
+                )
+                for member in SUITE.classes
+            }
+            | fields.get("runs_started", {}),
         }
     )
 
@@ -245,17 +251,21 @@ def test_ranking_needs_enough_runs_in_each_class() -> None:
     assert score(None, None, None, runs_started={"deep": 2}).enough_runs
 
 
-def test_a_policy_that_is_listed_twice_is_scored_once() -> None:
-    opened: list[str] = []
+def test_progress_counts_the_states_of_every_policy() -> None:
     calls: list[tuple[int, int]] = []
 
-    result = score(
-        *[LINEAR] * 6, opened=opened, progress=lambda done, total: calls.append((done, total))
-    )
+    score(LINEAR, None, LINEAR, progress=lambda done, total: calls.append((done, total)))
 
-    assert len(opened) == 3
-    assert result.runs[0] == result.runs[3]
-    assert calls == [(60 * region, 60 * 18) for region in range(1, 19)]
+    assert calls == [(60 * region, 60 * 12) for region in range(1, 13)]
+
+
+def test_a_policy_that_is_listed_twice_on_one_instance_is_rejected_before_scoring() -> None:
+    opened: list[str] = []
+
+    result = score(*[LINEAR] * 6, opened=opened)
+
+    assert (result.status, result.code) == ("rejected", "duplicate_run")
+    assert opened == []
 
 
 @pytest.mark.parametrize(
@@ -309,7 +319,7 @@ def test_a_class_without_runs_is_refused() -> None:
     result = score(None, None)
 
     assert result.code == "missing_run"
-    assert "'deep'" in result.message
+    assert "class deep" in result.message
 
 
 def test_too_many_started_runs_are_rejected_before_scoring() -> None:

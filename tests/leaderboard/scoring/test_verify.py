@@ -17,8 +17,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.scoring.metrics import run_metrics
-from leaderboard.scoring.score import result_of
+from leaderboard.scoring.score import result_of, run_metrics
 from leaderboard.scoring.verify import VerifyReport, verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import LogEntry, Store, digest_of

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.scoring.metrics import run_metrics
-from leaderboard.scoring.score import evaluation_seed, result_of
+from leaderboard.scoring.score import evaluation_seed, result_of, run_metrics
 from leaderboard.store import Store
 
 
