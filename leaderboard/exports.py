@@ -17,17 +17,16 @@ from leaderboard.scoring.ranking import RankedRow
 from sme_registry.io import to_json as plain_to_json
 from sme_registry.terminal import escape_latex, fixed
 
+Rows = list[RankedRow]
 Head = tuple[int, str]
 
+_METHOD_FIELDS = ("method", "version", "family", "knowledge", "submitter", "key")
+_RECORD_FIELDS = ("runs", "steps", "oracle_like", "received", "id")
 _FORMULA_STARTS = tuple("=+-@＝＋－＠|%")
 
 
 def to_json(
-    rows: list[RankedRow],
-    metric: Metric,
-    board: BoardDocument,
-    head: Head,
-    date: str | None = None,
+    rows: Rows, metric: Metric, board: BoardDocument, head: Head, date: str | None = None
 ) -> str:
     """A ranking as JSON.
 
@@ -55,11 +54,7 @@ def to_json(
 
 
 def to_csv(
-    rows: list[RankedRow],
-    metric: Metric,
-    board: BoardDocument,
-    head: Head,
-    date: str | None = None,
+    rows: Rows, metric: Metric, board: BoardDocument, head: Head, date: str | None = None
 ) -> str:
     """A ranking as CSV: a header, then one line per entry; the last cells repeat the provenance.
 
@@ -74,13 +69,10 @@ def to_csv(
         scores = row.entry.scores
         assert scores is not None  # every row of a ranking has scores
         estimates = [getattr(scores, name) for name in METRICS] + list(scores.normalised_regret)
-        cells: dict[str, Any] = {**_facts(row), "ranked_by": metric}
+        cells = {**_facts(row), "ranked_by": metric}
         for column, estimate in zip(columns, estimates, strict=True):
-            cells |= {
-                column: estimate.value,
-                f"{column}_low": estimate.low,
-                f"{column}_high": estimate.high,
-            }
+            cells[column] = estimate.value
+            cells[f"{column}_low"], cells[f"{column}_high"] = estimate.low, estimate.high
         cells |= _provenance(board, head, date)
         if index == 0:
             writer.writerow(cells)
@@ -89,11 +81,7 @@ def to_csv(
 
 
 def to_latex(
-    rows: list[RankedRow],
-    metric: Metric,
-    board: BoardDocument,
-    head: Head,
-    date: str | None = None,
+    rows: Rows, metric: Metric, board: BoardDocument, head: Head, date: str | None = None
 ) -> str:
     """A ranking as a LaTeX `tabular` (package booktabs), its provenance in comments above.
 
@@ -112,14 +100,9 @@ def to_latex(
     for row in rows:
         entry, scores = row.entry, row.entry.scores
         assert scores is not None  # every row of a ranking has scores
-        rank = "--" if row.first is None else str(row.first)
-        if row.first != row.last:
-            rank += f"--{row.last}"
+        rank = row.ranks.replace("–", "--") or "--"
         cells = [rank, _latex(f"{entry.method} {entry.version}"), _latex(entry.submitter)]
-        cells += [
-            _interval(estimate)
-            for estimate in (scores.wd_regret, scores.ood_regret, scores.ood_decay)
-        ]
+        cells += map(_interval, (scores.wd_regret, scores.ood_regret, scores.ood_decay))
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"
@@ -138,23 +121,13 @@ def _provenance(board: BoardDocument, head: Head, date: str | None) -> dict[str,
 
 
 def _facts(row: RankedRow) -> dict[str, Any]:
-    entry = row.entry
     return {
         "first": row.first,
         "last": row.last,
         "not_ranked": row.reason,
-        "method": entry.method,
-        "version": entry.version,
-        "family": entry.family,
-        "knowledge": entry.knowledge,
-        "submitter": entry.submitter,
-        "key": entry.key,
-        "code": entry.code_link or "",
-        "runs": entry.runs,
-        "steps": entry.steps,
-        "oracle_like": entry.oracle_like,
-        "received": entry.received,
-        "id": entry.id,
+        **{name: getattr(row.entry, name) for name in _METHOD_FIELDS},
+        "code": row.entry.code_link or "",
+        **{name: getattr(row.entry, name) for name in _RECORD_FIELDS},
     }
 
 

@@ -5,6 +5,7 @@ Colours come from `board.css`, for light, dark and print. All text is escaped.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,53 +59,64 @@ def number(value: float, digits: int = 3) -> str:
     return fixed(value, digits).replace("-", "\u2212")
 
 
-def reference_lines(scale: Scale, references: Mapping[str, float]) -> Markup:
-    """The lines of the reference rows in each bar of a table, by class name."""
-    return Markup("").join(
-        Markup('<line class="{}" x1="{}" x2="{}" y1="0" y2="100%"/>').format(name, at, at)
-        for name, value in references.items()
-        for at in [_percent(scale, value)]
-    )
+class Bars:
+    """The bars of a table on one scale, with lines at the reference rows.
 
-
-def interval_bar(estimate: Estimate, scale: Scale, lines: Markup) -> Markup:
-    """A 95 % interval as a bar with a dot at its value.
-
-    Hidden from screen readers, because the same numbers are in the next cell. The dot shows a bar
-    of no width.
+    Hidden from screen readers, because the same numbers are in the next cell.
 
     Args:
-      estimate: value and interval.
-      scale: of all bars of the table.
-      lines: `reference_lines` of that scale.
+      estimates: of all rows.
+      references: the value of each reference row, by class name.
     """
-    low, high, value = (_percent(scale, x) for x in (estimate.low, estimate.high, estimate.value))
-    return Markup(
-        f'<svg class="bar" aria-hidden="true" focusable="false">{lines}'
-        f'<line class="ci" x1="{low}" x2="{high}" y1="50%" y2="50%"/>'
-        f'<circle class="dot" cx="{value}" cy="50%" r="4"/></svg>'
-    )
+
+    def __init__(self, estimates: Sequence[Estimate], references: Mapping[str, float]) -> None:
+        ends = (end for each in estimates for end in (each.low, each.high))
+        self._scale = Scale.covering(*ends, *references.values())
+        self._references = references
+        self._lines = "".join(
+            f'<line class="{escape(name)}" x1="{at}" x2="{at}" y1="0" y2="100%"/>'
+            for name, at in zip(references, map(self._at, references.values()), strict=True)
+        )
+
+    def bar(self, estimate: Estimate) -> Markup:
+        """A 95 % interval as a bar with a dot at its value, visible even without width."""
+        low, high, value = map(self._at, (estimate.low, estimate.high, estimate.value))
+        return Markup(
+            f'<svg class="bar" aria-hidden="true" focusable="false">{self._lines}'
+            f'<line class="ci" x1="{low}" x2="{high}" y1="50%" y2="50%"/>'
+            f'<circle class="dot" cx="{value}" cy="50%" r="4"/></svg>'
+        )
+
+    def axis(self) -> Markup:
+        """The axis above the bars, with the names of the reference lines."""
+        ticks = self._scale.ticks
+        parts = [
+            f'<text x="{self._at(tick)}" y="30">{_short(tick)}</text>'
+            for tick in ticks[:: 1 + len(ticks) // 7]
+        ]
+        names: dict[float, list[str]] = {}
+        for name, value in self._references.items():
+            names.setdefault(value, []).append(name)
+        parts += [
+            f'<text class="name {_anchor(self._scale.part(value))}" x="{self._at(value)}" y="12">'
+            f"{escape(', '.join(group))}</text>"
+            for value, group in names.items()
+        ]
+        return Markup(
+            f'<svg class="axis" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
+        )
+
+    def _at(self, value: float) -> str:
+        return f"{_MARGIN + (100 - 2 * _MARGIN) * self._scale.part(value):.2f}%"
 
 
-def bar_axis(scale: Scale, references: Mapping[str, float]) -> Markup:
-    """The axis above a column of bars, with the names of the reference lines."""
-    ticks = "".join(
-        f'<text x="{_percent(scale, tick)}" y="30">{_short(tick)}</text>'
-        for tick in scale.ticks[:: 1 + len(scale.ticks) // 7]
-    )
-    names: dict[float, list[str]] = {}
-    for name, value in references.items():
-        names.setdefault(value, []).append(name)
-    labels = "".join(
-        f'<text class="name {_anchor(scale.part(value))}" x="{_percent(scale, value)}" y="12">'
-        f"{escape(', '.join(group))}</text>"
-        for value, group in names.items()
-    )
-    return Markup(f'<svg class="axis" aria-hidden="true" focusable="false">{labels}{ticks}</svg>')
+def sparklines(regrets: Sequence[Sequence[float]]) -> list[Markup]:
+    """Small curves of N_m over the regions, WD first, on one scale."""
+    scale = Scale.covering(0.0, 1.0, *itertools.chain.from_iterable(regrets))
+    return [_sparkline(regret, scale) for regret in regrets]
 
 
-def sparkline(regret: Sequence[float], scale: Scale) -> Markup:
-    """A small curve of N_m over the regions, WD first, on the scale of its table."""
+def _sparkline(regret: Sequence[float], scale: Scale) -> Markup:
     height = _SPARK_HEIGHT - 6
     step = (_SPARK_WIDTH - 6) / max(1, len(regret) - 1)
     optimal, constant, *ys = [
@@ -128,26 +140,22 @@ def region_labels(edges: Edges) -> list[str]:
 
 
 def regret_chart(regret: Sequence[Estimate], edges: Edges, name: str) -> Markup:
-    """Normalised regret over the regions, with intervals and the two reference lines.
-
-    Args:
-      regret: N_m of each region, WD first.
-      edges: ε_low and ε_high of each region.
-      name: of the entry; any text.
-    """
+    """Normalised regret of an entry over the regions, WD first, with intervals."""
     axes = _Axes.covering(regret, edges)
-    xs = [axes.x(index) for index in range(len(regret))]
-    upper = [f"{x:.1f},{axes.y(e.high):.1f}" for x, e in zip(xs, regret, strict=True)]
-    lower = [f"{x:.1f},{axes.y(e.low):.1f}" for x, e in zip(xs, regret, strict=True)]
-    line = [f"{x:.1f},{axes.y(e.value):.1f}" for x, e in zip(xs, regret, strict=True)]
+    points = [
+        (f"{axes.x(index):.1f}", *(f"{axes.y(value):.1f}" for value in (e.low, e.value, e.high)))
+        for index, e in enumerate(regret)
+    ]
+    band = [f"{x},{high}" for x, _, _, high in points]
+    band += [f"{x},{low}" for x, low, _, _ in reversed(points)]
+    line = [f"{x},{y}" for x, _, y, _ in points]
     marks = "".join(
-        f'<path class="whisker" d="M{x:.1f} {axes.y(e.low):.1f}V{axes.y(e.high):.1f}'
-        f'M{x - 5:.1f} {axes.y(e.low):.1f}h10M{x - 5:.1f} {axes.y(e.high):.1f}h10"/>'
-        f'<circle class="dot" cx="{x:.1f}" cy="{axes.y(e.value):.1f}" r="4.5"/>'
-        for x, e in zip(xs, regret, strict=True)
+        f'<path class="whisker" d="M{x} {low}V{high}m-5 0h10M{x} {low}m-5 0h10"/>'
+        f'<circle class="dot" cx="{x}" cy="{y}" r="4.5"/>'
+        for x, low, y, high in points
     )
     curve = (
-        f'<polygon class="band" points="{" ".join(upper + lower[::-1])}"/>'
+        f'<polygon class="band" points="{" ".join(band)}"/>'
         f'<polyline class="line" points="{" ".join(line)}"/>{marks}'
     )
     values = "; ".join(
@@ -159,14 +167,7 @@ def regret_chart(regret: Sequence[Estimate], edges: Edges, name: str) -> Markup:
 
 
 def comparison_chart(regret: Sequence[Estimate], edges: Edges) -> Markup:
-    """The axes of the comparison, into which `board.js` draws the chosen entries.
-
-    The scale covers all entries and does not depend on the choice.
-
-    Args:
-      regret: every N_m that may be drawn.
-      edges: ε_low and ε_high of each region.
-    """
+    """The axes of the comparison, which cover all entries and any choice of `board.js`."""
     return _Axes.covering(regret, edges).chart("Normalised regret by region", "", "")
 
 
@@ -226,10 +227,6 @@ class _Axes:
             f'<text class="tick middle" x="{(_LEFT + _RIGHT) / 2:.0f}" y="{_HEIGHT - 10:.0f}">'
             "expansion ε beyond the training cube</text>"
         )
-
-
-def _percent(scale: Scale, value: float) -> str:
-    return f"{_MARGIN + (100 - 2 * _MARGIN) * scale.part(value):.2f}%"
 
 
 def _anchor(part: float) -> str:

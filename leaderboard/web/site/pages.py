@@ -14,11 +14,12 @@ and text that they escape themselves.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterator
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from leaderboard import exports
 from leaderboard.documents.board import hex_of
@@ -27,18 +28,8 @@ from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
-from sme_registry.errors import MissingDependencyError
-
-try:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-except ImportError:
-    raise MissingDependencyError(
-        "The pages need Jinja2, which is not installed. "
-        "Install it with `pip install 'sme-registry[leaderboard]'`."
-    ) from None
-
 from leaderboard.web.site import charts
-from leaderboard.web.site.rows import SHORT, TABS, board_rows, https_only, run_rows, steps_text
+from leaderboard.web.site.rows import SHORT, TABS, https_only, run_rows, steps_text
 
 STATIC = Path(__file__).parent / "static"
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
@@ -53,7 +44,6 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _EXPORTS = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
-_LOG_PAGE = re.compile(r"log-(0|[1-9][0-9]{0,8})\.html")
 
 
 class Pages:
@@ -86,7 +76,9 @@ class Pages:
           NotPublishable: see `entries`; every other page raises it too.
         """
         tab = next(tab for tab in TABS if tab.key == metric)
-        rows, axis = board_rows(ranking.ranking(self.entries, metric), tab)
+        rows = ranking.ranking(self.entries, metric)
+        scores = [row.entry.scores for row in rows if row.entry.scores]
+        regrets = [[each.value for each in one.normalised_regret] for one in scores]
         submitted = [row for row in rows if not row.entry.reference]
         entrants = [entry for entry in self.entries if not entry.reference]
         not_scored = [entry for entry in reversed(entrants) if entry.status != "scored"]
@@ -99,13 +91,16 @@ class Pages:
             instances=sum(len(member.seeds) for member in self.document.suite.classes),
             entrants=len(entrants),
             references=[row for row in rows if row.entry.reference],
-            ranked=[row for row in submitted if row.rank],
-            listed=[row for row in submitted if not row.rank],
-            not_scored=[{"entry": entry, "hex": hex_of(entry.id)} for entry in not_scored],
+            ranked=[row for row in submitted if row.ranks],
+            listed=[row for row in submitted if not row.ranks],
+            not_scored=not_scored,
             families=sorted({row.entry.family for row in submitted}),
             knowledges=sorted({row.entry.knowledge for row in submitted}),
             reasons=ranking.REASONS,
-            axis=axis,
+            bars=charts.Bars([getattr(one, metric) for one in scores], tab.references),
+            sparks=dict(
+                zip((row.entry.id for row in rows), charts.sparklines(regrets), strict=True)
+            ),
         )
 
     def submission(self, id: str) -> str:
@@ -123,9 +118,7 @@ class Pages:
         if result is not None and result.scores is not None:
             name = submission.method.name
             chart = charts.regret_chart(result.scores.normalised_regret, edges, name)
-            regrets = [each.normalised_regret for each in result.classes]
-            scale = charts.Scale.covering(0.0, 1.0, *(N for regret in regrets for N in regret))
-            sparks = [charts.sparkline(regret, scale) for regret in regrets]
+            sparks = charts.sparklines([each.normalised_regret for each in result.classes])
             classes = list(zip(result.classes, sparks, strict=True))
         return self._render(
             "submission.html",
@@ -134,12 +127,10 @@ class Pages:
             title=f"{submission.method.name} {submission.method.version}",
             id=id,
             hex=hex_of(id),
-            short=hex_of(id)[:SHORT],
             s=submission,
             result=result,
             entry=entry,
             withdrawal=withdrawal and withdrawal.withdrawal,
-            code_link=https_only(submission.code),
             codes=CODES,
             chart=chart,
             classes=classes,
@@ -174,10 +165,7 @@ class Pages:
             here="log.html",
             title="Log and verification",
             head=self.store.head,
-            rows=[
-                {"entry": entry, "hex": hex_of(entry.subject) if entry.event != "opened" else ""}
-                for entry in self.store.log(page * LOG_ROWS, LOG_ROWS)
-            ],
+            entries=list(self.store.log(page * LOG_ROWS, LOG_ROWS)),
             page=page,
             pages=[
                 (n, _log_page(n), n * LOG_ROWS, min((n + 1) * LOG_ROWS - 1, last))
@@ -224,7 +212,8 @@ class Pages:
         self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
-        return None if folder else self._page(name)
+        render = None if folder else self._top.get(name)
+        return render().encode() if render is not None else None
 
     def paths(self) -> Iterator[str]:
         """The paths of all files of the site; `index.html` last, so that its links work."""
@@ -235,36 +224,31 @@ class Pages:
             if entry.scores is not None or entry.code:
                 yield f"results/{digits}.json"
             yield f"submissions/{digits}.html"
-        for number in range(self.store.head[0] // LOG_ROWS + 1):
-            yield _log_page(number)
-        yield from ("board-data.js", "log.html", "method.html", "compare.html")
-        yield from (f"{tab.stem}.{kind}" for tab in TABS for kind in _EXPORTS)
-        yield from (tab.page for tab in reversed(TABS))
+        yield from self._top
 
-    def _page(self, name: str) -> bytes | None:
-        renderers: dict[str, Callable[[], str]] = {
-            "compare.html": self.compare,
-            "method.html": self.method,
-            "log.html": self.log,
+    @cached_property
+    def _top(self) -> dict[str, Callable[[], str]]:
+        """The files of the top folder by name: functions that render them."""
+        logs = range(self.store.head[0] // LOG_ROWS + 1)
+        return {
+            **{_log_page(number): partial(self.log, number) for number in logs},
             "board-data.js": self.data_js,
+            "log.html": self.log,
+            "method.html": self.method,
+            "compare.html": self.compare,
+            **{
+                f"{tab.stem}.{kind}": partial(self._export, tab.key, kind)
+                for tab in TABS
+                for kind in _EXPORTS
+            },
+            **{tab.page: partial(self.board, tab.key) for tab in reversed(TABS)},
         }
-        if name in renderers:
-            return renderers[name]().encode()
-        for tab in TABS:
-            if tab.page == name:
-                return self.board(tab.key).encode()
-            stem, _, kind = name.rpartition(".")
-            if stem == tab.stem and kind in _EXPORTS:
-                rows = ranking.ranking(self.entries, tab.key)
-                # The date is the log's, not the clock's, so that the same board gives equal bytes.
-                (last,) = self.store.log(self.store.head[0], 1)
-                table = _EXPORTS[kind](rows, tab.key, self.document, self.store.head[:2], last.time)
-                return table.encode()
-        number = _LOG_PAGE.fullmatch(name)
-        try:
-            return self.log(int(number[1])).encode() if number else None
-        except KeyError:
-            return None
+
+    def _export(self, metric: Metric, kind: str) -> str:
+        rows = ranking.ranking(self.entries, metric)
+        # The date is the log's, not the clock's, so that the same board gives equal bytes.
+        (last,) = self.store.log(self.store.head[0], 1)
+        return _EXPORTS[kind](rows, metric, self.document, self.store.head[:2], last.time)
 
     def _document(self, folder: str, name: str) -> bytes | None:
         digits, _, kind = name.partition(".")
@@ -297,13 +281,20 @@ class Pages:
         return [entry for entry in self.entries if entry.scores and entry.status == "scored"]
 
     @cached_property
-    def _digests(self) -> dict[str, str]:
-        """Digests of the board's documents, which compute them on every access."""
+    def _common(self) -> dict[str, Any]:
+        """What every page needs. Documents compute their digests on each access."""
         document = self.document
         return {
-            "board": document.digest,
-            "suite": document.suite.digest,
-            "protocol": document.protocol.digest,
+            "root": "",
+            "document": document,
+            "digests": {
+                "board": document.digest,
+                "suite": document.suite.digest,
+                "protocol": document.protocol.digest,
+            },
+            "learned": ranking.LEARNED,
+            "address_digits": SHORT,
+            "metrics": TABS,
         }
 
     @cached_property
@@ -311,14 +302,7 @@ class Pages:
         return {digest: name for digest, (name, _) in self.document.instances.items()}
 
     def _render(self, template: str, **values: Any) -> str:
-        common = {
-            "root": "",
-            "document": self.document,
-            "digests": self._digests,
-            "learned": ranking.LEARNED,
-            "metrics": TABS,
-        }
-        return _environment().get_template(template).render({**common, **values})
+        return _environment().get_template(template).render({**self._common, **values})
 
 
 def content_type(path: str) -> str:
@@ -336,9 +320,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         auto_reload=False,
     )
-    environment.filters["number"] = charts.number
-    environment.filters["short"] = lambda digest: hex_of(digest)[:12]
-    environment.filters["steps"] = steps_text
+    environment.filters |= {
+        "hex": hex_of,
+        "https_only": https_only,
+        "number": charts.number,
+        "short": lambda digest, digits=12: hex_of(digest)[:digits],
+        "steps": steps_text,
+    }
     return environment
 
 

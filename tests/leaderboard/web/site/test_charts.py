@@ -35,11 +35,8 @@ def test_a_number_has_a_true_minus_and_no_negative_zero(value, text):
 
 
 def test_a_bar_spans_its_interval_and_marks_its_value():
-    scale = charts.Scale.covering(0.0, 1.0)
-    lines = charts.reference_lines(scale, REGRET)
-    bar = ElementTree.fromstring(
-        charts.interval_bar(Estimate(value=0.5, low=0.25, high=1.0), scale, lines)
-    )
+    estimate = Estimate(value=0.5, low=0.25, high=1.0)
+    bar = ElementTree.fromstring(charts.Bars([estimate], REGRET).bar(estimate))
     interval = bar.find("line[@class='ci']")
     assert (interval.get("x1"), interval.get("x2")) == ("26.50%", "97.00%")
     assert bar.find("circle").get("cx") == "50.00%"
@@ -48,7 +45,7 @@ def test_a_bar_spans_its_interval_and_marks_its_value():
 
 
 def test_a_sparkline_has_its_numbers_as_text():
-    spark = charts.sparkline([0.1, 0.25, 0.4], charts.Scale.covering(0.0, 1.0))
+    (spark,) = charts.sparklines([[0.1, 0.25, 0.4]])
     assert "0.10, 0.25, 0.40" in ElementTree.fromstring(spark).get("aria-label")
     assert len(re.search(r'points="([^"]*)"', spark)[1].split()) == 3
 

@@ -505,10 +505,10 @@ def test_contrast_is_enough_in_light_and_dark():
         return (high + 0.05) / (low + 0.05)
 
     css = (STATIC / "board.css").read_text()
-    blocks = re.findall(r":root \{(.*?)\}", css, re.DOTALL)[:2]
-    assert len(blocks) == 2
-    for block in blocks:
-        colour = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
+    pairs = re.findall(r"--([\w-]+): light-dark\((#[0-9a-f]{6}), (#[0-9a-f]{6})\);", css)
+    assert len(pairs) == 20
+    for scheme in (1, 2):
+        colour = {pair[0]: pair[scheme] for pair in pairs}
         for ground in ("page", "surface", "sunken", "accent-wash"):
             for text in ("ink", "muted", "accent"):
                 assert contrast(colour[text], colour[ground]) >= 4.5, (text, ground)
