@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 import struct
 import sys
+from typing import BinaryIO
 
 OK, REFUSED, FAILED, OUTPUT, MEMORY = range(5)
 MAX_TEXT = 500
@@ -30,7 +31,7 @@ def main() -> None:
     """Serve one model until the input ends."""
     memory, seconds, observation_dim, action_dim = map(int, sys.argv[1:5])
     sys.path += sys.argv[5:]
-    answers = os.dup(1)
+    messages, answers = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)  # output of a library must not be read as an answer
     os.dup2(nowhere, 2)
@@ -48,7 +49,7 @@ def main() -> None:
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     try:
         session = onnxruntime.InferenceSession(
-            _read(_length() or 0), options, providers=["CPUExecutionProvider"]
+            messages.read(_length(messages) or 0), options, providers=["CPUExecutionProvider"]
         )
         name = session.get_inputs()[0].name
     except Exception as error:
@@ -56,9 +57,9 @@ def main() -> None:
         return
     _answer(answers, OK)
 
-    while (rows := _length()) is not None:
+    while (rows := _length(messages)) is not None:
         try:
-            batch = np.frombuffer(_read(rows * observation_dim * 4), np.float32)
+            batch = np.frombuffer(messages.read(rows * observation_dim * 4), np.float32)
             a = session.run(None, {name: batch.reshape(rows, observation_dim)})[0]
             if getattr(a, "dtype", None) != np.float32 or a.shape != (rows, action_dim):
                 output = f"{getattr(a, 'dtype', type(a).__name__)} {list(np.shape(a)[:8])}"
@@ -99,28 +100,15 @@ def _error_answer(error: Exception, status: int) -> tuple[int, bytes]:
     return status, text.encode("utf-8", "replace")[:MAX_TEXT]
 
 
-def _answer(stream: int, status: int, payload: bytes = b"") -> None:
-    for part in (struct.pack("<BI", status, len(payload)), payload):
-        left = memoryview(part)
-        while left:
-            left = left[os.write(stream, left) :]
+def _answer(stream: BinaryIO, status: int, payload: bytes = b"") -> None:
+    stream.write(struct.pack("<BI", status, len(payload)) + payload)
+    stream.flush()
 
 
-def _length() -> int | None:
+def _length(stream: BinaryIO) -> int | None:
     """The first number of a message, or None at the end of the input."""
-    head = _read(4)
+    head = stream.read(4)
     return struct.unpack("<I", head)[0] if len(head) == 4 else None
-
-
-def _read(size: int) -> bytes:
-    """`size` bytes, or fewer at the end of the input."""
-    read = bytearray()
-    while len(read) < size:
-        part = os.read(0, min(size - len(read), 2**20))
-        if not part:
-            break
-        read += part
-    return bytes(read)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import io
 import os
 import pickle
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +25,9 @@ import numpy.typing as npt
 
 from leaderboard.artefact.gate import inspect
 from sme_registry import SMESpec
-from sme_registry.errors import MissingDependencyError, PolicyError, SMEError
+from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import load_sb3
-from sme_registry.io import write_atomically
+from sme_registry.io import require_packages, write_atomically
 from sme_registry.training import RunRecord
 
 if TYPE_CHECKING:
@@ -80,6 +79,10 @@ def export_sb3(
       OptionError: the file cannot be written.
       MissingDependencyError: Stable-Baselines3, PyTorch, onnx or ONNX Runtime is not installed.
     """
+    libraries = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
+    require_packages("exporting a model", libraries, "train")
+    libraries = {"onnx": "onnx", "onnxruntime": "ONNX Runtime"}
+    require_packages("exporting a model", libraries, "leaderboard")
     _refuse_team(model)
     if isinstance(model, str | os.PathLike):
         model = load_sb3(model)
@@ -88,8 +91,12 @@ def export_sb3(
     symmetric = _is_symmetric(network)
     normaliser = _normaliser(model, vec_normalize, S_2)
 
-    with _acting(network):
+    was_training = network.training
+    network.set_training_mode(False)  # as `predict` does
+    try:
         data = _to_onnx(_unit_policy(network, normaliser, symmetric), S_2)
+    finally:
+        network.set_training_mode(was_training)
     inspect(data, S_2, A)
     _refuse_difference(data, model, normaliser, symmetric, S_2)
     return write_atomically(path, data)
@@ -116,13 +123,8 @@ def _refuse_team(model: Any) -> None:
 
 def _network(model: Any) -> Any:
     """The model's policy, a PyTorch module with SB3's `_predict`."""
-    try:
-        from stable_baselines3.common.policies import BasePolicy
-    except ImportError:
-        raise MissingDependencyError(
-            "Exporting a model needs Stable-Baselines3, which is not installed. "
-            "Run `pip install 'sme-registry[train]'`."
-        ) from None
+    from stable_baselines3.common.policies import BasePolicy
+
     network = getattr(model, "policy", None)
     if not isinstance(network, BasePolicy):
         raise PolicyError(
@@ -200,7 +202,7 @@ def _normaliser(model: Any, vec_normalize: Any, width: int) -> Any:
 
 
 def _unit_policy(network: Any, normaliser: Any, symmetric: bool) -> torch.nn.Module:
-    """The module from observations to unit actions, as defined at the head of this file."""
+    """The PyTorch module from observations to unit actions."""
     import torch
 
     class UnitPolicy(torch.nn.Module):
@@ -240,17 +242,6 @@ def _deterministic(network: Any, x: torch.Tensor) -> torch.Tensor:
     return action
 
 
-@contextlib.contextmanager
-def _acting(network: Any) -> Iterator[None]:
-    """Set the network to evaluation mode, as `predict` does, and restore its mode."""
-    was_training = network.training
-    network.set_training_mode(False)
-    try:
-        yield
-    finally:
-        network.set_training_mode(was_training)
-
-
 def _to_onnx(policy: Any, width: int) -> bytes:
     """The module as ONNX bytes, traced."""
     import torch
@@ -277,13 +268,8 @@ def _refuse_difference(
     data: bytes, model: Any, normaliser: Any, symmetric: bool, width: int
 ) -> None:
     """Raise if the file's actions differ from the model's, inside or outside the cube."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise MissingDependencyError(
-            "Checking the exported file needs ONNX Runtime, which is not installed. "
-            "Run `pip install 'sme-registry[leaderboard]'`."
-        ) from None
+    import onnxruntime
+
     random = np.random.default_rng(0)
     inside = random.random((_CHECKED_ROWS, width), dtype=np.float32)
     observations: _Rows = np.concatenate([inside, 2.0 * inside[::-1] - np.float32(0.5)])

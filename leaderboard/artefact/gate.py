@@ -350,23 +350,15 @@ class _Inspection:
                 yield from varints(value, self._budget)
 
     def _names(self, where: str, *names: bytes | memoryview) -> None:
-        longest = max(map(len, names))
-        if longest > MAX_NAME:
-            _refuse(
-                "onnx_too_many_nodes",
-                f"a name of {longest:,} bytes in a {where}",
-                f"must be at most {MAX_NAME} bytes",
-                "Shorten it",
-            )
+        what = f"bytes of a name in a {where}"
+        self._limit(what, max(map(len, names)), MAX_NAME, "Shorten it")
 
-    def _limit(self, what: str, count: int, limit: int) -> None:
+    def _limit(
+        self, what: str, count: int, limit: int, remedy: str = "Submit a smaller network"
+    ) -> None:
         if count > limit:
-            _refuse(
-                "onnx_too_many_nodes",
-                f"{what}={count:,}",
-                f"must be at most {limit:,}",
-                "Submit a smaller network",
-            )
+            allowed = f"must be at most {limit:,}"
+            _refuse("onnx_too_many_nodes", f"{what}={count:,}", allowed, remedy)
 
 
 def _refuse(code: str, field: str, allowed: str, remedy: str) -> NoReturn:
@@ -382,7 +374,12 @@ def _refuse_type(field: str, value: int | None, where: str) -> NoReturn:
     )
 
 
+def printable(text: bytes | bytearray | memoryview) -> str:
+    """Untrusted text as messages show it: one line of printable characters."""
+    words = bytes(text).decode("utf-8", "replace").split()
+    return "".join(letter if letter.isprintable() else "�" for letter in " ".join(words))
+
+
 def _text(name: bytes | memoryview) -> str:
     """A name as messages show it: short and printable."""
-    text = bytes(name[:64]).decode("utf-8", "replace")
-    return "".join(letter if letter.isprintable() else "�" for letter in text)
+    return printable(name[:64])

@@ -28,7 +28,8 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from sme_registry import SMESpec, materialize
-from sme_registry.errors import MissingDependencyError, SpecError
+from sme_registry.errors import SpecError
+from sme_registry.io import require_packages
 from sme_registry.task import Layer
 
 OPSET = 17
@@ -55,8 +56,7 @@ def optimal_onnx(spec: SMESpec) -> bytes:
       ResourceLimitError: the task does not fit in memory.
       MissingDependencyError: the package `onnx` is not installed.
     """
-    _refuse_team(spec)
-    graph = _Graph()
+    graph = _Graph(spec)
     cells = np.arange(_LAST_CELL + 1)
     table = ndtr(np.concatenate([cells, -cells[:0:-1]]) * _h)
     graph.constant("table", table)
@@ -72,7 +72,7 @@ def optimal_onnx(spec: SMESpec) -> bytes:
         inputs = W if index > 0 else np.hstack([W, np.zeros((len(W), 2))])
         x = _uniform_layer(graph, f"layer_{index}", x, inputs, b)
     graph.node("Cast", [x], "actions", to="FLOAT")
-    return graph.to_bytes("optimal", spec)
+    return graph.to_bytes("optimal")
 
 
 def constant_onnx(spec: SMESpec) -> bytes:
@@ -88,12 +88,11 @@ def constant_onnx(spec: SMESpec) -> bytes:
       SpecError: the spec has a team.
       MissingDependencyError: the package `onnx` is not installed.
     """
-    _refuse_team(spec)
-    graph = _Graph()
+    graph = _Graph(spec)
     graph.constant("zero", np.zeros((spec.state_dim + 2, spec.action_dim), np.float32))
     graph.constant("half", np.full(spec.action_dim, 0.5, np.float32))
     graph.node("Gemm", ["observations", "zero", "half"], "actions")
-    return graph.to_bytes("constant", spec)
+    return graph.to_bytes("constant")
 
 
 def _uniform_layer(
@@ -120,15 +119,16 @@ def _uniform_layer(
 class _Graph:
     """An ONNX graph under construction. Values are referred to by name."""
 
-    def __init__(self) -> None:
-        try:
-            import onnx
-        except ImportError:
-            raise MissingDependencyError(
-                "Writing reference policies needs onnx, which is not installed. "
-                "Run `pip install 'sme-registry[leaderboard]'`."
-            ) from None
-        self._onnx = onnx
+    def __init__(self, spec: SMESpec) -> None:
+        if spec.team is not None:
+            raise SpecError(
+                f"team: {len(spec.team.agents)} agents: boards have single agents only. "
+                "Give a spec without a team."
+            )
+        require_packages("writing reference policies", {"onnx": "onnx"}, "leaderboard")
+        import onnx
+
+        self._onnx, self._spec = onnx, spec
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
@@ -143,14 +143,14 @@ class _Graph:
         self._nodes.append(self._onnx.helper.make_node(op, inputs, [output], **attributes))
         return output
 
-    def to_bytes(self, name: str, spec: SMESpec) -> bytes:
+    def to_bytes(self, name: str) -> bytes:
         """The model's bytes, from `observations` `[B, S + 2]` to `actions` `[B, A]`."""
         value, FLOAT = self._onnx.helper.make_tensor_value_info, self._onnx.TensorProto.FLOAT
         graph = self._onnx.helper.make_graph(
             self._nodes,
             name,
-            [value("observations", FLOAT, ["batch", spec.state_dim + 2])],
-            [value("actions", FLOAT, ["batch", spec.action_dim])],
+            [value("observations", FLOAT, ["batch", self._spec.state_dim + 2])],
+            [value("actions", FLOAT, ["batch", self._spec.action_dim])],
             self._constants,
         )
         model = self._onnx.helper.make_model(
@@ -160,11 +160,3 @@ class _Graph:
             producer_name="sme-registry",
         )
         return bytes(model.SerializeToString(deterministic=True))
-
-
-def _refuse_team(spec: SMESpec) -> None:
-    if spec.team is not None:
-        raise SpecError(
-            f"team: {len(spec.team.agents)} agents: boards have single agents only. "
-            "Give a spec without a team."
-        )

@@ -26,16 +26,16 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import NoReturn, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from leaderboard.artefact import child
-from leaderboard.artefact.gate import ModelFacts, inspect
+from leaderboard.artefact.gate import inspect, printable
 from leaderboard.errors import BoardError, Rejection
-from sme_registry.errors import MissingDependencyError, StateError
+from sme_registry.errors import StateError
+from sme_registry.io import require_packages
 
 Observations = npt.NDArray[np.float32]
 Actions = npt.NDArray[np.float32]
@@ -102,9 +102,6 @@ class Sandbox:
       isolation: "bwrap", or "process" if bwrap is missing or does not work.
     """
 
-    facts: ModelFacts
-    isolation: str
-
     def __init__(
         self,
         data: bytes,
@@ -113,16 +110,22 @@ class Sandbox:
         limits: SandboxLimits = SandboxLimits(),
     ) -> None:
         self.facts = inspect(data, observation_dim, action_dim)
-        _require_linux()
+        if sys.platform != "linux":
+            raise BoardError(
+                f"sys.platform={sys.platform!r}: policies run in a sandbox, which needs Linux. "
+                "Score on a Linux machine or in a Linux container."
+            )
         self._observation_dim, self._action_dim = observation_dim, action_dim
         self._limits = limits
         prefix = _bwrap()
         self.isolation = "bwrap" if prefix else "process"
         self._process = _start(prefix, limits, observation_dim, action_dim)
         self._starting = True
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            os.set_blocking(stream.fileno(), False)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._input, self._output = self._process.stdin, self._process.stdout
+        for pipe in (self._input, self._output):
+            os.set_blocking(pipe.fileno(), False)
         with self._closed_on_error():
             self._ask(limits.start_seconds)
             self._starting = False
@@ -192,19 +195,13 @@ class Sandbox:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                stream.close()
+        self._input.close()
+        self._output.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _refuse_difference(
@@ -236,17 +233,15 @@ class Sandbox:
                 "run_failed", f"answer={status}, {length} bytes: invalid. Submit another model."
             )
         code, allowed, remedy = _CODES[status]
-        text = _one_line(self._receive(length, deadline))
+        text = printable(self._receive(length, deadline))
         allowed = allowed.format(memory=self._limits.memory_bytes // 2**20)
         raise Rejection(code, f"artefact: {text}: {allowed}. {remedy}.")
 
     def _send(self, left: memoryview, deadline: float) -> None:
-        stream = self._process.stdin
-        assert stream is not None
         while left:
-            self._await(stream.fileno(), select.POLLOUT, deadline)
+            self._await(self._input.fileno(), select.POLLOUT, deadline)
             try:
-                left = left[os.write(stream.fileno(), left) :]
+                left = left[os.write(self._input.fileno(), left) :]
             except BlockingIOError:  # less room than the smallest write
                 continue
             except BrokenPipeError:
@@ -254,12 +249,10 @@ class Sandbox:
                 return
 
     def _receive(self, size: int, deadline: float) -> bytearray:
-        stream = self._process.stdout
-        assert stream is not None
         read = bytearray()
         while len(read) < size:
-            self._await(stream.fileno(), select.POLLIN, deadline)
-            part = os.read(stream.fileno(), min(size - len(read), 2**20))
+            self._await(self._output.fileno(), select.POLLIN, deadline)
+            part = os.read(self._output.fileno(), min(size - len(read), 2**20))
             if not part:
                 self._ended()
             read += part
@@ -315,14 +308,6 @@ class Sandbox:
             raise
 
 
-def _require_linux() -> None:
-    if sys.platform != "linux":
-        raise BoardError(
-            f"sys.platform={sys.platform!r}: policies run in a sandbox, which needs Linux. Score "
-            "on a Linux machine or in a Linux container."
-        )
-
-
 def _start(
     prefix: Sequence[str], limits: SandboxLimits, observation_dim: int, action_dim: int
 ) -> subprocess.Popen[bytes]:
@@ -360,16 +345,11 @@ def _environment() -> dict[str, str]:
 @functools.cache
 def _library_folders() -> tuple[str, ...]:
     """The folders of NumPy and onnxruntime."""
-    folders = []
-    for library in ("numpy", "onnxruntime"):
-        package = importlib.util.find_spec(library)
-        if package is None or not package.submodule_search_locations:
-            raise MissingDependencyError(
-                f"Running a policy's ONNX file needs {library}, which is not installed. "
-                "Run `pip install 'sme-registry[leaderboard]'`."
-            )
-        folders.append(os.path.dirname(next(iter(package.submodule_search_locations))))
-    return tuple(dict.fromkeys(folders))
+    libraries = {"numpy": "NumPy", "onnxruntime": "ONNX Runtime"}
+    require_packages("running a policy's ONNX file", libraries, "leaderboard")
+    packages = map(importlib.util.find_spec, libraries)
+    files = [package.origin for package in packages if package and package.origin]
+    return tuple(dict.fromkeys(str(Path(file).parents[1]) for file in files))
 
 
 @functools.cache
@@ -401,9 +381,3 @@ def _bwrap() -> tuple[str, ...]:
             os.killpg(process.pid, signal.SIGKILL)
             return ()
     return command if answer.startswith(_ANSWER.pack(child.OK, 0)) else ()
-
-
-def _one_line(text: bytes | bytearray) -> str:
-    """Untrusted text as messages show it: one line, printable."""
-    words = text.decode("utf-8", "replace").split()
-    return "".join(letter if letter.isprintable() else "�" for letter in " ".join(words))

@@ -11,7 +11,7 @@ from leaderboard.artefact.wire import FIXED32, FIXED64, LENGTH, VARINT
 
 
 class Field(NamedTuple):
-    """A known field of a message: name, allowed wire types, and whether it may repeat."""
+    """A known field: name, allowed wire types, and whether it may repeat."""
 
     name: str
     types: tuple[int, ...]

@@ -16,7 +16,6 @@ Source: Protocol Buffers, "Encoding".
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5
 
@@ -32,47 +31,25 @@ class BudgetError(ValueError):
     """The message has more fields than the budget allows."""
 
 
-class Field(NamedTuple):
-    """One field of a message.
-
-    Attributes:
-      number: which field.
-      type: `VARINT`, `FIXED64`, `LENGTH` or `FIXED32`.
-      value: the number of a varint, in [0, 2⁶⁴); otherwise a view of the bytes.
-    """
-
-    number: int
-    type: int
-    value: int | memoryview
+Field = tuple[int, int, int | memoryview]
+"""Number, wire type and value: a varint's number, in [0, 2⁶⁴), or else a view of the bytes."""
 
 
 class Budget:
-    """The number of fields and packed numbers that may still be read.
-
-    Args:
-      left: the number.
-    """
+    """The number of fields and packed numbers that may still be read."""
 
     def __init__(self, left: int) -> None:
         self.left = left
 
     def spend(self) -> None:
-        """Use one.
-
-        Raises:
-          BudgetError: none is left.
-        """
+        """Use one, or raise a `BudgetError` if none is left."""
         self.left -= 1
         if self.left < 0:
             raise BudgetError("more fields than the limit")
 
 
 def fields(message: memoryview, budget: Budget) -> Iterator[Field]:
-    """The fields of a message, in order.
-
-    Args:
-      message: its bytes.
-      budget: shared by all messages of a file.
+    """The fields of a message, in order. All messages of a file share a budget.
 
     Raises:
       WireError: the message is truncated, a number is not in its shortest form or exceeds 64 bits,
@@ -88,7 +65,7 @@ def fields(message: memoryview, budget: Budget) -> Iterator[Field]:
             raise WireError(f"field number {number}")
         if type == VARINT:
             value, at = _varint(message, at)
-            yield Field(number, type, value)
+            yield number, type, value
             continue
         if type == LENGTH:
             length, at = _varint(message, at)
@@ -98,16 +75,12 @@ def fields(message: memoryview, budget: Budget) -> Iterator[Field]:
             raise WireError(f"wire type {type} in field {number}")
         if length > end - at:
             raise WireError(f"field {number} ends {length - (end - at)} bytes after its message")
-        yield Field(number, type, message[at : at + length])
+        yield number, type, message[at : at + length]
         at += length
 
 
 def varints(packed: memoryview, budget: Budget) -> Iterator[int]:
-    """Packed varints, each in [0, 2⁶⁴).
-
-    Raises:
-      WireError, BudgetError: see `fields`.
-    """
+    """Packed varints, each in [0, 2⁶⁴). It raises what `fields` raises."""
     at = 0
     while at < len(packed):
         budget.spend()

@@ -206,11 +206,10 @@ def _policy_bytes(run: SubmittedRun, policy: Path, bundle: Path) -> bytes:
 def _refuse_existing(folder: Path, force: bool) -> None:
     """Raise if the folder exists, unless `force` is set and it contains nothing but a bundle."""
     refuse_existing(folder, force=force)
-    if not os.path.lexists(folder):
-        return
-    others = {folder.name}
     if folder.is_dir() and not folder.is_symlink():
         others = {path.name for path in folder.iterdir()} - {FILE, ARTEFACTS}
+    else:
+        others = {folder.name} if os.path.lexists(folder) else set()
     if others:
         raise OptionError(
             f"{folder}: is not a bundle, or contains other files, such as {min(others)!r}, and is "

@@ -105,9 +105,6 @@ def _read_regular(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | N
     Each part of the path is opened relative to the one before and links are not followed, so that
     nothing outside the folder is read even if the folder changes meanwhile. Opening never blocks,
     so that a pipe is rejected. Systems without these calls (Windows) check the path instead.
-
-    Raises:
-      Rejection: `artefact_path` if a part is a link or not regular.
     """
     name = "/".join(parts)
     refused = Rejection(

@@ -24,28 +24,18 @@ _RECORD, _MODEL = "run.json", "model.zip"
 
 @dataclass(frozen=True)
 class SubmittedRun:
-    """A run to submit.
+    """A run to submit."""
 
-    Attributes:
-      source: its name in errors.
-      policy: an .onnx or a .zip; None if the run failed.
-      record: of a run of `sme train`.
-    """
-
-    source: str
+    source: str  # its name in errors
     spec: SMESpec
     seed: int
     steps: int
-    policy: Path | None
-    record: RunRecord | None = None
+    policy: Path | None  # an .onnx or a .zip; None if the run failed
+    record: RunRecord | None = None  # of a run of `sme train`
 
 
 def runs_of(path: Path, suite: SuiteFile) -> list[SubmittedRun]:
-    """The runs of a folder or a table.
-
-    Raises:
-      OptionError: the path is neither.
-    """
+    """The runs of a folder or a table; `OptionError` if the path is neither."""
     if path.is_dir():
         folders = sorted(record.parent for record in path.rglob(_RECORD))
         if folders:
