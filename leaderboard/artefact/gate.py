@@ -19,7 +19,6 @@ Source: onnx.proto, the definition of the format. `S` state_dim, `A` action_dim.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from math import prod
 from typing import Any, NoReturn
 
@@ -57,37 +56,13 @@ _STANDARD = "Export the network to standard operators only"
 _FLOAT = 1
 
 
-@dataclass(frozen=True)
-class ModelFacts:
-    """Contents of an accepted file.
-
-    Attributes:
-      size: of the file, in bytes.
-      ir_version, opset: versions of the format and of its operators.
-      nodes, tensors: their numbers.
-      parameters: total number of entries of all tensors.
-      operators: names of the operators used, sorted.
-    """
-
-    size: int
-    ir_version: int
-    opset: int
-    nodes: int
-    tensors: int
-    parameters: int
-    operators: tuple[str, ...]
-
-
-def inspect(data: bytes, observation_dim: int, action_dim: int) -> ModelFacts:
+def inspect(data: bytes, observation_dim: int, action_dim: int) -> None:
     """Reject a file that is not a feed-forward network of the right widths.
 
     Args:
       data: the bytes of the file.
       observation_dim: S + 2, the width of its input.
       action_dim: A, the width of its output.
-
-    Returns:
-      The contents of the file.
 
     Raises:
       Rejection: `too_large`, `onnx_malformed`, `onnx_version`, `onnx_domain`, `onnx_op`,
@@ -101,7 +76,7 @@ def inspect(data: bytes, observation_dim: int, action_dim: int) -> ModelFacts:
             "Submit a smaller network.",
         )
     try:
-        return _Inspection().model(memoryview(data), observation_dim, action_dim)
+        _Inspection().model(memoryview(data), observation_dim, action_dim)
     except WireError as error:
         raise Rejection(
             "onnx_malformed",
@@ -123,10 +98,8 @@ class _Inspection:
         self._budget = Budget(MAX_FIELDS)
         self._attributes = 0
         self._tensors = 0
-        self._parameters = 0
-        self._operators: set[str] = set()
 
-    def model(self, data: memoryview, observation_dim: int, action_dim: int) -> ModelFacts:
+    def model(self, data: memoryview, observation_dim: int, action_dim: int) -> None:
         model = self._read(data, schema.MODEL, "model")
         ir_version = model.get("ir_version", 0)
         if ir_version not in IR_VERSIONS:
@@ -136,7 +109,7 @@ class _Inspection:
                 f"must be in [{IR_VERSIONS[0]}, {IR_VERSIONS[-1]}]",
                 "Export it with an opset from 13 to 23 and the matching IR version",
             )
-        opset = self._opset(model["opset_import"])
+        self._opset(model["opset_import"])
         if "graph" not in model:
             raise WireError("no graph")
         graph = self._read(model["graph"], schema.GRAPH, "graph")
@@ -150,17 +123,8 @@ class _Inspection:
             self._value(value)
         self._interface("input", graph["input"], observation_dim, exact=True)
         self._interface("output", graph["output"], action_dim, exact=False)
-        return ModelFacts(
-            size=len(data),
-            ir_version=ir_version,
-            opset=opset,
-            nodes=len(graph["node"]),
-            tensors=self._tensors,
-            parameters=self._parameters,
-            operators=tuple(sorted(self._operators)),
-        )
 
-    def _opset(self, imports: list[memoryview]) -> int:
+    def _opset(self, imports: list[memoryview]) -> None:
         opsets = [self._read(each, schema.OPSET, "opset_import") for each in imports]
         domains = [bytes(each.get("domain", b"")) for each in opsets]
         if len(opsets) != 1 or domains[0] not in _ONNX_DOMAINS:
@@ -178,7 +142,6 @@ class _Inspection:
                 f"must be in [{OPSETS[0]}, {OPSETS[-1]}]",
                 "Export it with opset_version=17",
             )
-        return version
 
     def _node(self, message: memoryview) -> None:
         node = self._read(message, schema.NODE, "node")
@@ -197,7 +160,6 @@ class _Inspection:
                 "must be an operator of a feed-forward network (`gate.OPERATORS`)",
                 "Export the deterministic actor alone, or rewrite it with those operators",
             )
-        self._operators.add(operator)
         self._names("node", node.get("name", b""), *node["input"], *node["output"])
         self._attributes += len(node["attribute"])
         self._limit("attributes", self._attributes, MAX_ATTRIBUTES)
@@ -261,7 +223,6 @@ class _Inspection:
                 "Export it again",
             )
         self._tensors += 1
-        self._parameters += entries
 
     def _entries(self, tensor: dict[str, Any], type: schema.Type, name: str) -> int:
         """Number of entries in a tensor's data."""

@@ -98,7 +98,6 @@ class Sandbox:
       MissingDependencyError: onnxruntime is not installed.
 
     Attributes:
-      facts: contents of the file.
       isolation: "bwrap", or "process" if bwrap is missing or does not work.
     """
 
@@ -109,7 +108,7 @@ class Sandbox:
         action_dim: int,
         limits: SandboxLimits = SandboxLimits(),
     ) -> None:
-        self.facts = inspect(data, observation_dim, action_dim)
+        inspect(data, observation_dim, action_dim)
         if sys.platform != "linux":
             raise BoardError(
                 f"sys.platform={sys.platform!r}: policies run in a sandbox, which needs Linux. "

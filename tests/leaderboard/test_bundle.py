@@ -339,7 +339,7 @@ def test_runs_on_other_specs_are_named(tmp_path, table):
         (
             [row(A0, "a0.onnx"), row(A0, "a0.onnx", 1), row(A1, None), row(B0, None)],
             Rejection,
-            "duplicate_run: .*same policy",
+            "duplicate_run: .*same spec and policy",
         ),
         ([row(A0, "a0.onnx")], Rejection, "missing_run: runs: none on"),
         ([], SpecError, "runs"),

@@ -15,22 +15,14 @@ SHORT = 16  # hex digits of an id in an address: too many for a deliberate colli
 
 @dataclass(frozen=True)
 class MetricTab:
-    """A metric as the pages show it.
-
-    Attributes:
-      key: the metric.
-      page: file name of its page.
-      stem: of the files with the same data.
-      symbol, label: its names.
-      references: the value of each reference row, by class name in the drawings.
-    """
+    """A metric as the pages show it."""
 
     key: Metric
     page: str
-    stem: str
+    stem: str  # of the files with the same data
     symbol: str
     label: str
-    references: Mapping[str, float]
+    references: Mapping[str, float]  # the value of each reference row
 
 
 _NO_DECAY = dict.fromkeys(REFERENCES, 0.0)
@@ -49,12 +41,8 @@ def run_rows(
 ) -> list[RunRow]:
     """The submitted runs with their scores, then the runs that were started and not listed.
 
-    A result lists the runs in the order of the submission.
-
-    Args:
-      submission: the submission.
-      result: None before scoring.
-      class_of: class name by the digest of an instance.
+    A result, None before scoring, lists the runs in the order of the submission. `class_of` has
+    the class name by the digest of an instance.
     """
     pairs = itertools.zip_longest(submission.runs, result.runs if result else ())
     return [

@@ -114,14 +114,7 @@ function enhanceComparison(place) {
         .map((entry) => make("option", { value: entry.id }, label(entry))),
     );
     add.disabled = chosen.length >= MAX_ENTRIES;
-    part("status").textContent =
-      chosen.length === 0
-        ? "No entry is selected. Add entries here, or select them on the board."
-        : chosen.length >= MAX_ENTRIES
-          ? `${MAX_ENTRIES} entries, the maximum. Remove one to add another.`
-          : chosen.length === 1
-            ? "One entry. Add another to compare them."
-            : `${chosen.length} entries, compared with the first.`;
+    part("status").textContent = status(chosen.length);
     part("legend").replaceChildren(...chosen.map(legendItem));
     part("figure").hidden = chosen.length === 0;
     drawCurves(part("figure").querySelector("svg"), chosen, label);
@@ -144,6 +137,13 @@ function enhanceComparison(place) {
   draw();
   place.hidden = false;
   document.querySelector("[data-without]").hidden = true;
+}
+
+function status(count) {
+  if (count === 0) return "No entry is selected. Add entries here, or select them on the board.";
+  if (count === 1) return "One entry. Add another to compare them.";
+  if (count < MAX_ENTRIES) return `${count} entries, compared with the first.`;
+  return `${count} entries, the maximum. Remove one to add another.`;
 }
 
 function idsOf(address) {
@@ -199,10 +199,10 @@ function drawCurves(svg, chosen, label) {
 }
 
 function table(chosen, regions, metrics) {
-  const head = make("tr", {}, make("th", { scope: "col" }, "Score"));
-  chosen.forEach((entry, index) => {
-    head.append(make("th", { scope: "col", class: `n series-${index}` }, key(index), make("bdi", {}, entry.name)));
-  });
+  const names = chosen.map((entry, index) =>
+    make("th", { scope: "col", class: `n series-${index}` }, key(index), make("bdi", {}, entry.name)),
+  );
+  const head = make("tr", {}, make("th", { scope: "col" }, "Score"), ...names);
   const row = (name, estimates, digits) => {
     const [base] = estimates;
     const cells = estimates.map(([value, low, high], index) => {
@@ -219,20 +219,14 @@ function table(chosen, regions, metrics) {
     });
     return make("tr", {}, make("th", { scope: "row" }, name), ...cells);
   };
-  const body = make("tbody", {});
-  metrics.forEach((name, index) => {
-    body.append(row(name, chosen.map((entry) => entry.scores[index]), name === "Similarity loss" ? 2 : 3));
-  });
-  regions.forEach((name, index) => {
-    const text = index === 0 ? "N, WD" : `N, ε ${name}`;
-    body.append(row(text, chosen.map((entry) => entry.normalised_regret[index]), 3));
-  });
-  const caption = make(
-    "caption",
-    {},
-    make("span", {}, "Value, 95 % interval, and the difference Δ to the first entry."),
+  const scores = metrics.map((name, index) =>
+    row(name, chosen.map((entry) => entry.scores[index]), name === "Similarity loss" ? 2 : 3),
   );
-  return [caption, make("thead", {}, head), body];
+  const regrets = regions.map((name, index) =>
+    row(index === 0 ? "N, WD" : `N, ε ${name}`, chosen.map((entry) => entry.normalised_regret[index]), 3),
+  );
+  const caption = make("span", {}, "Value, 95 % interval, and the difference Δ to the first entry.");
+  return [make("caption", {}, caption), make("thead", {}, head), make("tbody", {}, ...scores, ...regrets)];
 }
 
 const boardTable = document.querySelector("[data-board]");
