@@ -336,9 +336,9 @@ def _refuse_type(field: str, value: int | None, where: str) -> NoReturn:
 
 
 def printable(text: bytes | bytearray | memoryview) -> str:
-    """Untrusted text as messages show it: one line of printable characters."""
-    words = bytes(text).decode("utf-8", "replace").split()
-    return "".join(letter if letter.isprintable() else "�" for letter in " ".join(words))
+    """Untrusted text as messages show it, without control characters."""
+    letters = bytes(text).decode("utf-8", "replace")
+    return "".join(letter if letter.isprintable() else "�" for letter in letters)
 
 
 def _text(name: bytes | memoryview) -> str:

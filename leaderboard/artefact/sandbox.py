@@ -232,7 +232,7 @@ class Sandbox:
                 "run_failed", f"answer={status}, {length} bytes: invalid. Submit another model."
             )
         code, allowed, remedy = _CODES[status]
-        text = printable(self._receive(length, deadline))
+        text = printable(b" ".join(self._receive(length, deadline).split()))
         allowed = allowed.format(memory=self._limits.memory_bytes // 2**20)
         raise Rejection(code, f"artefact: {text}: {allowed}. {remedy}.")
 

@@ -229,6 +229,7 @@ BAD = {
     "an operator of ONNX's name in another domain": (
         squashed([node("Tanh", "y", "a", domain="com.microsoft")]), "onnx_domain"
     ),
+    "an operator's name with a space": (squashed([node("Tanh ", "y", "a")]), "onnx_op"),
     "a memory bomb": (models.memory_bomb(), "onnx_op"),
     "an endless loop": (models.looping(), "onnx_op"),
     "a subgraph in an operator of the list": (attributed(g=GRAPH), "onnx_subgraph"),
