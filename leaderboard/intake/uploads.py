@@ -38,9 +38,6 @@ def uploader(header: str | None, digest: str, at: datetime.datetime | None = Non
       digest: of the object.
       at: time of arrival; now by default.
 
-    Returns:
-      The public key.
-
     Raises:
       Rejection: `bad_signature` or `stale_time`.
     """

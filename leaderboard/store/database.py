@@ -20,9 +20,8 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store.files import digest_of, unwritable, write_document
+from leaderboard.store.files import FolderLock, digest_of, unwritable, write_document
 from leaderboard.store.index import Index, IndexUnusable
-from leaderboard.store.lock import FolderLock
 from leaderboard.store.log import EMPTY, Event, Head, Log
 from leaderboard.store.objects import Objects
 from sme_registry.io import sync_folder, temporary_beside

@@ -23,8 +23,7 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import METRICS, Estimate, Result, Scores
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.store.files import digest_of, read_document
-from leaderboard.store.lock import BUSY_SECONDS
+from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
 from leaderboard.store.log import EMPTY, Head, LogEntry
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]

@@ -19,19 +19,12 @@ class Objects:
         self.folder = folder
 
     def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> int | None:
-        """Write an artefact while its bytes arrive; it exists only once all of it is verified.
+        """Write an artefact of at most `limit` bytes; it exists only once all of it is verified.
 
-        Args:
-          digest: the expected digest of its bytes.
-          chunks: the bytes; not read if the artefact exists.
-          limit: the largest size allowed, in bytes.
+        Arguments and errors as for `Store.put_object`.
 
         Returns:
           Its size in bytes if it is new, otherwise None.
-
-        Raises:
-          Rejection: `too_large` or `artefact_digest`.
-          BoardError: it cannot be written.
         """
         path = self.folder.object(digest)
         try:

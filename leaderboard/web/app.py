@@ -17,11 +17,11 @@ server keeps no sessions and sets no cookies; every request that changes the boa
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import re
 import tempfile
-from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from typing import IO, Any, NamedTuple, get_args
 
@@ -38,7 +38,7 @@ from leaderboard.errors import Rejection
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
-from leaderboard.store import Store, unknown_submission
+from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import errors, limits
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
@@ -47,6 +47,7 @@ from sme_registry.errors import SMEError
 
 METRICS: tuple[Metric, ...] = get_args(Metric)
 PAGES_KEPT = 256
+_Render = Callable[[Pages, str], bytes]
 _CHUNK = 2**18  # bytes
 _LOG_ENTRIES = 100
 
@@ -194,19 +195,12 @@ class _Routes:
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:
-        text = request.query_params.get("metric", METRICS[0])
-        metric = next((name for name in METRICS if name == text), None)
-        if metric is None:
+        metric = request.query_params.get("metric", METRICS[0])
+        if metric not in METRICS:
             raise RequestError(
-                "bad_request", f"metric={text!r:.80}: must be one of {', '.join(METRICS)}."
+                "bad_request", f"metric={metric!r:.80}: must be one of {', '.join(METRICS)}."
             )
-
-        def render(pages: Pages) -> bytes:
-            rows = ranking.ranking(pages.entries, metric)
-            text = exports.to_json(rows, metric, pages.document, pages.store.head[:2])
-            return text.encode()
-
-        return await self._rendered(request, f"api/board/{metric}", "application/json", render)
+        return await self._cached(request, _ranking, metric, "application/json")
 
     async def get_log(self, request: Request) -> Response:
         text = request.query_params.get("start", "0")
@@ -224,25 +218,17 @@ class _Routes:
     async def get_page(self, request: Request, name: str) -> Response:
         name = name or "index"
         name = name if "." in name else f"{name}.html"
-        not_found = RequestError("not_found", f"{HTTP_CODES['not_found']}.")
-
-        def render(pages: Pages) -> bytes:
-            content = pages.read(name)
-            if content is None:
-                raise not_found
-            return content
-
         try:
             media_type = content_type(name)
         except KeyError:
-            raise not_found from None
-        return await self._rendered(request, name, media_type, render)
+            raise _not_found() from None
+        return await self._cached(request, _page, name, media_type)
 
-    async def _rendered(
-        self, request: Request, name: str, media_type: str, render: Callable[[Pages], bytes]
+    async def _cached(
+        self, request: Request, render: _Render, name: str, media_type: str
     ) -> Response:
         """A file, rendered once for each state of the board; 304 if the client has it."""
-        file = await to_thread.run_sync(self._pages.get, name, render, limiter=self._rendering)
+        file = await to_thread.run_sync(self._pages.get, render, name, limiter=self._rendering)
         headers = {"ETag": file.tag, "Cache-Control": "no-cache"}
         known = request.headers.get("If-None-Match", "").replace("W/", "")
         if file.tag in (tag.strip() for tag in known.split(",")):
@@ -258,34 +244,45 @@ class _CachedFile(NamedTuple):
 
 
 class _PageCache:
-    """Rendered files, discarded when the log grows.
+    """Rendered files, at most `kept`, discarded when the log grows.
 
     One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
-    page that is not cached wait for one rendering of it. It keeps at most `kept` files.
+    page that is not cached wait for one rendering of it.
     """
 
     def __init__(self, store: Store, kept: int) -> None:
         self._store = store
         self._kept = kept
-        self._head: object = None
-        self._pages = Pages(store)
-        self._files: OrderedDict[str, _CachedFile] = OrderedDict()
+        self._head: Head | None = None
 
-    def get(self, name: str, render: Callable[[Pages], bytes]) -> _CachedFile:
+    def get(self, render: _Render, name: str) -> _CachedFile:
         """The file of this name, rendered if it is not cached."""
         head = self._store.head
-        if head != self._head or not self._kept:
-            self._head, self._pages = head, Pages(self._store)
-            self._files.clear()
-        if name not in self._files:
-            content = render(self._pages)
-            tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
-            self._files[name] = _CachedFile(content, tag)
-        file = self._files[name]
-        self._files.move_to_end(name)
-        if len(self._files) > self._kept:
-            self._files.popitem(last=False)
-        return file
+        if head != self._head:
+            rendered = functools.partial(_rendered, Pages(self._store))
+            self._head, self._file = head, functools.lru_cache(self._kept)(rendered)
+        return self._file(render, name)
+
+
+def _rendered(pages: Pages, render: _Render, name: str) -> _CachedFile:
+    content = render(pages, name)
+    return _CachedFile(content, f'"{hashlib.sha256(content).hexdigest()[:32]}"')
+
+
+def _ranking(pages: Pages, metric: Any) -> bytes:
+    rows = ranking.ranking(pages.entries, metric)
+    return exports.to_json(rows, metric, pages.document, pages.store.head[:2]).encode()
+
+
+def _page(pages: Pages, name: str) -> bytes:
+    content = pages.read(name)
+    if content is None:
+        raise _not_found()
+    return content
+
+
+def _not_found() -> RequestError:
+    return RequestError("not_found", f"{HTTP_CODES['not_found']}.")
 
 
 def _digest(digits: str) -> str:

@@ -96,11 +96,10 @@ def withdraw(
     """Withdraw a submission from a board.
 
     Args:
-      url: of the board.
+      url, insecure: as for `submit`.
       id: the submission's.
       key: the key that signed the submission.
       reason: shown on the submission's page; up to 300 characters.
-      insecure: allow plain http to other machines.
 
     Raises:
       Rejection: the board rejects it.
@@ -142,17 +141,10 @@ class _Client:
         *,
         allowed: Collection[int] = (),
     ) -> tuple[int, Any]:
-        """Send a request, repeated after failures of the network.
+        """Status and JSON of the answer to a request, repeated after failures of the network.
 
-        Every request is safe to repeat, because digests identify objects and documents.
-
-        Args:
-          method, path, content: of the request.
-          sign: returns its `Authorization`, a new one for each attempt: it is valid for minutes.
-          allowed: statuses other than 2xx that are not errors.
-
-        Returns:
-          The status, and the JSON of the board's answer; None if it is not JSON.
+        Every request is safe to repeat, because digests identify objects and documents. `sign`
+        returns its `Authorization`, a new one for each attempt, because it is valid for minutes.
         """
         for wait in (*_WAITS, None):
             headers = {"Accept": "application/json"}

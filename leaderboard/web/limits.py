@@ -50,9 +50,7 @@ class UploadReservations:
         try:
             yield
         finally:
-            self._reserved[key] -= size
-            if not self._reserved[key]:
-                del self._reserved[key]
+            self._reserved -= Counter({key: size})  # drops a key without uploads
 
 
 async def read_document(request: Request, name: str) -> bytes:

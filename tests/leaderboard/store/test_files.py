@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from leaderboard.errors import BoardError
-from leaderboard.store import Store, lock
-from leaderboard.store.lock import FolderLock
+from leaderboard.store import Store, files
+from leaderboard.store.files import FolderLock
 
 WITHOUT_POSIX = """
 import sys
@@ -24,7 +24,7 @@ main()
 
 
 def test_readers_share_the_lock_and_a_writer_excludes_them(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(lock, "BUSY_SECONDS", 0.05)
+    monkeypatch.setattr(files, "BUSY_SECONDS", 0.05)
     one, other = FolderLock(tmp_path), FolderLock(tmp_path)
     with one.hold(exclusive=False), other.hold(exclusive=False):
         pass
@@ -44,7 +44,7 @@ def test_readers_share_the_lock_and_a_writer_excludes_them(tmp_path: Path, monke
 
 def test_a_board_is_read_but_not_written_without_flock(store: Store, submit, monkeypatch) -> None:
     signed = submit()
-    monkeypatch.setattr(lock, "fcntl", None)
+    monkeypatch.setattr(files, "fcntl", None)
     with Store.open(store.folder.path, read_only=True) as reader:
         assert [entry.id for entry in reader.entries()] == [signed.id]
     with pytest.raises(BoardError, match="only be written on Linux and macOS"):
