@@ -36,23 +36,19 @@ _TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating p
 class Behaviour(StrictModel):
     """A policy that collects part of a data set, and its share of the transitions.
 
-    Attributes:
-      kind: "mixture": a = (1 − α) π*(s) + α ã(s), with one α ~ U(0, ν) for each step and ã another
-        DUN of the same shape as π*; "policy": the user's, deterministic; "random":
-        a ~ U([0, 1]^A).
-      weight: its share, in (0, 1].
-      nu: ν of a mixture: 0 is the optimum, 1 the worst.
-      policy: name of a user's policy.
-      sha256: of the policy's file; null for a function, which only its author can run again.
-      action_range: of the policy's actions, if it differs from the policy's own.
+    A mixture acts by a = (1 − α) π*(s) + α ã(s), with one α ~ U(0, ν) for each step and ã another
+    DUN of the same shape as π*; ν = 0 is the optimum, 1 the worst. A random policy acts by
+    a ~ U([0, 1]^A).
     """
 
     kind: Literal["mixture", "policy", "random"]
     weight: Annotated[Real, Field(gt=0, le=1, description="share of the transitions")] = 1.0
     nu: Annotated[Real | None, Field(ge=0, le=1, description="ν of a mixture")] = None
+    # Of a user's deterministic policy: its name, and the digest of its file; null for a function,
+    # which only its author can run again.
     policy: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     sha256: Digest | None = None
-    action_range: Literal["unit", "symmetric"] | None = None
+    action_range: Literal["unit", "symmetric"] | None = None  # if it differs from the policy's own
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> Self:

@@ -99,7 +99,7 @@ def exact_return(
     rollouts: int = 1,
     action_range: str | None = None,
 ) -> ExactReturn:
-    """Run a policy from given states of a task to the end of the episode.
+    """Run a policy from states of a task to the end of the episode.
 
     Args:
       policy: anything that `evaluate` accepts: a callable `[B, S + 2] → [B, A]`, a model, or the

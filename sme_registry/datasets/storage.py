@@ -46,16 +46,10 @@ _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set on disk, with its metadata read and checked.
+    """A data set on disk, with its metadata read and checked."""
 
-    Attributes:
-      id: Minari's id, such as `sme/Default-v1-nu50-seed7-v0`.
-      path: its folder, which contains `data/`.
-      record: provenance, scores and digests.
-    """
-
-    id: str
-    path: Path
+    id: str  # Minari's, such as `sme/Default-v1-nu50-seed7-v0`
+    path: Path  # its folder, which contains `data/`
     record: DatasetRecord
 
     @property

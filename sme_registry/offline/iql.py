@@ -31,13 +31,7 @@ _HALF_LOG_2_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class IQL(Learner):
-    """A policy, two critics with their targets, a value function, and their optimiser.
-
-    Attributes:
-      critics, targets: from `[B, O + A]` to `[B, 1]` each.
-      value: from `[B, O]` to `[B, 1]`.
-      spread: `[A]`; its sigmoid is the position of log σ between −5 and 2.
-    """
+    """A policy, two critics with their targets, a value function, and their optimiser."""
 
     def __init__(
         self, observation_dim: int, action_dim: int, hyperparameters: IQLHyperparameters
@@ -45,6 +39,7 @@ class IQL(Learner):
         self._hyperparameters = hyperparameters
         hidden = hyperparameters.hidden
         self.actor = mlp(observation_dim, hidden, action_dim)
+        # Its sigmoid is the position of log σ between −5 and 2.
         self.spread = nn.Parameter(torch.zeros(action_dim))
         self.critics, self.targets = (
             nn.ModuleList(mlp(observation_dim + action_dim, hidden, 1) for _ in range(CRITICS))

@@ -51,19 +51,12 @@ ReportProgress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class OfflineResult:
-    """A finished offline training.
+    """A finished offline training."""
 
-    Attributes:
-      policy: from observations `[B, S + 2]` to actions `[B, A]`; `evaluate` accepts it.
-      record: the content of `offline.json`.
-      report: the final evaluation.
-      folder: of its files; None if nothing was written.
-    """
-
-    policy: OfflinePolicy
-    record: OfflineRecord
-    report: EvaluationReport
-    folder: Path | None
+    policy: OfflinePolicy  # from observations `[B, S + 2]` to actions `[B, A]`, for `evaluate`
+    record: OfflineRecord  # the content of `offline.json`
+    report: EvaluationReport  # of the policy
+    folder: Path | None  # None if nothing was written
 
 
 def train_offline(

@@ -24,11 +24,7 @@ class MonitoredVecEnv(LanesVecEnv):
     """One environment as an SB3 `VecEnv`, with its steps counted.
 
     The same numbers, bit for bit, as `SMEVecEnv` with one environment, without the overhead of a
-    batch: next to PPO's 0.5 ms a step that saves time worth having.
-
-    Args:
-      spec: a single-agent task.
-      action_range: "symmetric" or "unit".
+    batch, which counts compared with PPO's 0.5 ms a step.
 
     Attributes:
       steps: environment steps taken so far.

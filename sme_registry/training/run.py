@@ -57,21 +57,13 @@ _MIN_STEPS_BETWEEN_CHECKPOINTS = 1_000
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """A finished run.
-
-    Attributes:
-      folder: of its files.
-      record: the content of `run.json`.
-      episodes: the content of `episodes.csv`.
-      report: the evaluation of the final model.
-      figures: paths of the figures; empty if matplotlib is not installed.
-    """
+    """A finished run."""
 
     folder: Path
-    record: RunRecord
-    episodes: tuple[Episode, ...]
-    report: EvaluationReport
-    figures: tuple[Path, ...]
+    record: RunRecord  # the content of `run.json`
+    episodes: tuple[Episode, ...]  # the content of `episodes.csv`
+    report: EvaluationReport  # of the final model
+    figures: tuple[Path, ...]  # empty if matplotlib is not installed
 
     @property
     def model_path(self) -> Path:
