@@ -50,7 +50,7 @@ __all__ = [
 
 LEVEL = 0.95
 DRAWS = 2000
-_HELD = 2**21  # numbers held at once while drawing, 16 MiB
+_MAX_NUMBERS = 2**21  # in memory at once while drawing, 16 MiB
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def iqm(runs: npt.ArrayLike) -> Array:
     """
     ordered = np.sort(np.asarray(runs, dtype=np.float64), axis=0)
     cut = len(ordered) // 4
-    return np.asarray(ordered[cut : len(ordered) - cut].mean(axis=0))
+    return mean(ordered[cut : len(ordered) - cut])
 
 
 def mean(runs: npt.ArrayLike) -> Array:
@@ -144,7 +144,7 @@ def stratified_bootstrap(
         widened = math.sqrt(n / (n - 1)) / len(classes)
         centre = statistic(runs)[:, None]
         bits = _stream(seed, name)
-        rows = max(1, _HELD // runs.size)
+        rows = max(1, _MAX_NUMBERS // runs.size)
         for first in range(0, draws, rows):
             part = deviation[:, first : first + rows]
             chosen = _resampled(bits, n, part.shape[1])
@@ -164,8 +164,7 @@ def performance_profile(
     Args:
       classes: by name, `[n]` scores of its runs, higher is better.
       thresholds: `[K]` τ.
-      draws: see `stratified_bootstrap`.
-      seed: see `stratified_bootstrap`.
+      draws, seed: see `stratified_bootstrap`.
 
     Returns:
       `[K]` shares in [0, 1], which never rise with τ, with pointwise intervals.
@@ -247,17 +246,10 @@ def _counts(chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _weighted_iqm(runs: Array, counts: npt.NDArray[np.int64]) -> Array:
-    """IQM of samples given by the count of each run, without sorting each sample.
+    """IQM `[K, draws]` of samples of runs `[n, K]` by their counts `[n, draws]`, without sorting.
 
     The runs in order of their values occupy the ranks of a sample according to their counts; the
     mean is over the ranks between the cuts.
-
-    Args:
-      runs: `[n, K]`.
-      counts: `[n, draws]`, n in each column.
-
-    Returns:
-      `[K, draws]`.
     """
     n = len(runs)
     cut = n // 4

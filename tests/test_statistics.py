@@ -96,7 +96,7 @@ def test_an_interval_does_not_depend_on_the_order_of_runs_or_classes():
 
 def test_drawing_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     whole = statistics.stratified_bootstrap(CLASSES, 300, "s")
-    monkeypatch.setattr(statistics, "_HELD", 70)
+    monkeypatch.setattr(statistics, "_MAX_NUMBERS", 70)
     assert np.array_equal(whole, statistics.stratified_bootstrap(CLASSES, 300, "s"))
 
 

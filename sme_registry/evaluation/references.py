@@ -11,8 +11,8 @@ The two fitted ones are fitted on the states of WD, at most `FIT_STATES` of them
 paper-v1), and used unchanged in every other region. In WD they are evaluated on the states they
 were fitted on, which flatters them unless there are many times more states than state_dim.
 
-An agent's reference uses only what the agent observes: a linear map of the whole state is another
-policy, which no agent that observes a part of the state could execute.
+An agent's reference uses only what the agent observes: no agent that observes a part of the state
+could execute a linear map of the whole state.
 """
 
 from __future__ import annotations
@@ -61,15 +61,10 @@ class References:
         return (s - 0.5) @ self.slope + self.intercept
 
     def actions(self, s: Array, optimal: Array, random: Array) -> dict[str, Array]:
-        """The actions of every reference policy, by name.
+        """The actions of every reference policy in states `[B, S]`, by name.
 
-        Args:
-          s: `[B, S]` states.
-          optimal: `[B, A]` π*(s).
-          random: `[B, A]` uniform numbers in (0, 1).
-
-        Returns:
-          `[B, A]` each, or `[A]` for a constant action; all in [0, 1].
+        They are `[B, A]`, as π*(s) `optimal` and numbers `random` uniform in (0, 1) are, or `[A]`
+        if constant; all in [0, 1].
         """
         return {
             "optimal": optimal,

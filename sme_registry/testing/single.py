@@ -120,31 +120,25 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
     for episode in range(3):
         env = single(spec)
         observation, _ = env.reset(seed=seed + episode)
-        s, accumulated, terminated, truncated = env.state, 0.0, False, False
+        s, accumulated, tolerance = env.state, 0.0, spec.k * TOLERANCE
         expect_equal("the first observation", observation, _expected_observation(spec, s, 0, 0.0))
         for t in range(1, min(spec.horizon, MAX_STEPS) + 1):
             action = next_action(env, rng)
             observation, reward, terminated, truncated, info = env.step(action)
+            similarity, step_reward = info["similarity"], info["step_reward"]
             expect_near("optimal_action", info["optimal_action"], definition.optimal_action(s))
-            expect_near("similarity", info["similarity"], definition.similarity(s, action))
-            expect_near(
-                "step_reward", info["step_reward"], definition.reward_of(info["similarity"])
-            )
-            expect_equal("regret", info["regret"], 1.0 - info["step_reward"])
+            expect_near("similarity", similarity, definition.similarity(s, action))
+            expect_near("step_reward", step_reward, definition.reward_of(similarity))
+            expect_equal("regret", info["regret"], 1.0 - step_reward)
             s = definition.transition(s, action)
             expect_equal("the next state", env.state, s)
 
-            accumulated += info["step_reward"]
+            accumulated += step_reward
             pays = t % spec.k == 0 or t == spec.horizon
-            expect_near("the reward", reward, accumulated if pays else 0.0, spec.k * TOLERANCE)
+            expect_near("the reward", reward, accumulated if pays else 0.0, tolerance)
             accumulated = 0.0 if pays else accumulated
-            expect_near(
-                "accumulated_reward",
-                info["accumulated_reward"],
-                accumulated,
-                spec.k * TOLERANCE,
-            )
-            expect_equal("terminated", terminated, info["step_reward"] < spec.D)
+            expect_near("accumulated_reward", info["accumulated_reward"], accumulated, tolerance)
+            expect_equal("terminated", terminated, step_reward < spec.D)
             expect_equal("truncated", truncated, t == spec.horizon)
             expect_equal("the observation", observation, _expected_observation(
                 spec, s, t, info["accumulated_reward"]))  # fmt: skip
@@ -211,17 +205,17 @@ def check_env_spec(task: SpecLike) -> None:
     """`gymnasium.make` recreates the task from its `EnvSpec` as JSON."""
     spec = load_spec(task)
     for action_range in ACTION_RANGES:
-        text = env_spec(spec, action_range=action_range).to_json()
-        env: Any = gymnasium.make(EnvSpec.from_json(text))
+        env = _recreated(env_spec(spec, action_range=action_range))
         expect_equal("the digest after EnvSpec.to_json", env.unwrapped.sme_spec.digest, spec.digest)
-        again: Any = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
-        expect_equal(
-            "the digest after a second EnvSpec.to_json",
-            again.unwrapped.sme_spec.digest,
-            spec.digest,
-        )
+        again = _recreated(env.spec)
+        digest = again.unwrapped.sme_spec.digest
+        expect_equal("the digest after a second EnvSpec.to_json", digest, spec.digest)
         expect_equal("the action space after EnvSpec.to_json", again.action_space, env.action_space)
         expect_equal("the id after EnvSpec.to_json", again.spec.id, env.spec.id)
+
+
+def _recreated(created_from: EnvSpec) -> Any:
+    return gymnasium.make(EnvSpec.from_json(created_from.to_json()))
 
 
 def _expected_observation(

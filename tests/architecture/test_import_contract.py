@@ -52,7 +52,7 @@ def test_the_import_contract_holds() -> None:
         ("envs/single.py", "import pygame"),
         ("evaluation/references.py", "def _late():\n    import torch"),
         ("plots.py", "import stable_baselines3"),
-        ("evaluation/policies/team.py", "def _late():\n    import onnxruntime"),
+        ("evaluation/policies/policy.py", "def _late():\n    import onnxruntime"),
         ("evaluation/evaluate.py", "def _late():\n    import pandas"),
         ("studies/engine/runner.py", "import pandas"),
         ("teams.py", "import sme_registry.registration"),

@@ -28,7 +28,7 @@ def constant(*action):
     return lambda observations: np.tile(action, (len(observations), 1))
 
 
-def judged(policy, **kw):
+def evaluated(policy, **kw):
     return evaluate(policy, SPEC, PROTOCOL, **kw)
 
 
@@ -49,13 +49,13 @@ def judged(policy, **kw):
 )
 def test_unusable_actions_are_refused_by_what_is_wrong_with_them(returned, message):
     with pytest.raises(PolicyError, match=message):
-        judged(returned)
+        evaluated(returned)
 
 
 @pytest.mark.parametrize("policy", [None, 3, [0.5, 0.5], {"a": 1}])
 def test_what_is_no_policy_is_refused(policy):
     with pytest.raises(PolicyError, match=r"must be a callable from observations \[B, 5\]"):
-        judged(policy)
+        evaluated(policy)
 
 
 def test_a_policy_is_given_float32_observations_of_its_task():
@@ -65,7 +65,7 @@ def test_a_policy_is_given_float32_observations_of_its_task():
         seen.append((observations.dtype, observations.shape))
         return np.full((len(observations), 2), 0.5)
 
-    judged(policy)
+    evaluated(policy)
     assert seen == [(np.float32, (200, 5))] * 3
 
 
@@ -75,23 +75,23 @@ def test_a_policy_that_overwrites_its_observations_changes_nothing():
         observations[:] = 7.0
         return actions
 
-    honest = judged(lambda o: o[:, :2], name="overwriting")
-    assert judged(overwriting) == honest
+    honest = evaluated(lambda o: o[:, :2], name="overwriting")
+    assert evaluated(overwriting) == honest
 
 
 def test_actions_are_clipped_and_the_clipped_share_is_counted():
-    report = judged(constant(-0.2, 1.0))
+    report = evaluated(constant(-0.2, 1.0))
     assert [region.clipped_share for region in report.regions] == [0.5] * 3
     assert report.regions == tuple(
         region.model_copy(update={"clipped_share": 0.5})
-        for region in judged(constant(0.0, 1.0)).regions
+        for region in evaluated(constant(0.0, 1.0)).regions
     )
 
 
 def test_symmetric_actions_are_rescaled():
     unit, symmetric = (
-        judged(constant(0.25, 1.0)),
-        judged(constant(-0.5, 1.0), action_range="symmetric"),
+        evaluated(constant(0.25, 1.0)),
+        evaluated(constant(-0.5, 1.0), action_range="symmetric"),
     )
     assert symmetric.action_range == "symmetric"
     assert symmetric.regions == unit.regions
@@ -99,12 +99,12 @@ def test_symmetric_actions_are_rescaled():
 
 def test_an_unknown_action_range_is_refused():
     with pytest.raises(OptionError, match="action_range='wide': must be 'unit' or 'symmetric'"):
-        judged(constant(0.5, 0.5), action_range="wide")
+        evaluated(constant(0.5, 0.5), action_range="wide")
 
 
 @pytest.mark.parametrize("reference", references.NAMES)
 def test_a_reference_policy_goes_by_the_name_that_reports_use(reference):
-    report = judged(reference)
+    report = evaluated(reference)
     assert report.policy == reference
     for row, expected in zip(report.regions, report.references[reference], strict=True):
         assert row.similarity == pytest.approx(expected.similarity, abs=0.05)
@@ -113,33 +113,33 @@ def test_a_reference_policy_goes_by_the_name_that_reports_use(reference):
 def test_the_short_name_of_a_reference_is_the_same_policy():
     assert set(references.SHORT_NAMES.values()) < set(references.NAMES)
     for short, full in references.SHORT_NAMES.items():
-        assert judged(short).regions == judged(full).regions
+        assert evaluated(short).regions == evaluated(full).regions
 
 
 def test_a_function_goes_by_its_module_and_name(tmp_path, monkeypatch):
     (tmp_path / "policies_for_a_test.py").write_text("def act(o):\n    return o[:, :2]\nx = 3\n")
     monkeypatch.chdir(tmp_path)
-    report = judged("policies_for_a_test:act")
+    report = evaluated("policies_for_a_test:act")
     assert report.policy == "policies_for_a_test:act"
-    assert report.regions == judged(lambda o: o[:, :2]).regions
+    assert report.regions == evaluated(lambda o: o[:, :2]).regions
     with pytest.raises(PolicyError, match="is a int: must be a function"):
-        judged("policies_for_a_test:x")
+        evaluated("policies_for_a_test:x")
     with pytest.raises(PolicyError, match="cannot be imported"):
-        judged("no_such_module:act")
+        evaluated("no_such_module:act")
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_one(tmp_path):
     with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):
-        judged("liner")
+        evaluated("liner")
     with pytest.raises(PolicyError, match="is a folder"):
-        judged(str(tmp_path))
+        evaluated(str(tmp_path))
 
 
 def test_an_offline_policy_scores_as_its_file(tmp_path):
     layers = [(np.full((2, 5), 0.3, np.float32), np.zeros(2, np.float32))]
     policy = OfflinePolicy(layers, {"algorithm": "bc"})
     path = policy.save(tmp_path / "policy.npz")
-    live, saved = judged(policy), judged(str(path))
+    live, saved = evaluated(policy), evaluated(str(path))
     assert (live.policy, saved.policy) == ("bc", "policy")
     assert saved.regions == live.regions
     with pytest.raises(PolicyError, match=r"its observations have shape \(5,\): must be \(10,\)"):
@@ -150,7 +150,9 @@ def test_a_prepared_policy_is_accepted_as_it_is():
     prepared = as_policy(constant(-0.5, 1.0), SPEC, action_range="symmetric", name="mine")
     again = as_policy(prepared, SPEC)
     assert (again.name, again.action_range) == ("mine", "symmetric")
-    assert judged(prepared) == judged(constant(-0.5, 1.0), action_range="symmetric", name="mine")
+    assert evaluated(prepared) == evaluated(
+        constant(-0.5, 1.0), action_range="symmetric", name="mine"
+    )
     assert as_policy(prepared, SPEC, name="other").name == "other"
     with pytest.raises(PolicyError, match=r"its actions have shape \(2,\): must be \(1,\)"):
         evaluate(prepared, SPEC.derive(action_dim=1), PROTOCOL)
@@ -178,7 +180,7 @@ def test_a_file_that_is_no_model_is_refused(tmp_path, name, content, message):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(PolicyError, match=message):
-        judged(tmp_path / name)
+        evaluated(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +197,7 @@ def test_an_archive_that_holds_no_known_model_is_refused(tmp_path, data, message
     with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
         archive.writestr("data", data)
     with pytest.raises(PolicyError, match=message):
-        judged(str(tmp_path / "model.zip"))
+        evaluated(str(tmp_path / "model.zip"))
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +214,7 @@ def untrained(sb3, algorithm, action_range="unit", **kw):
 def test_a_saved_model_scores_as_the_model_itself(sb3, algorithm, tmp_path):
     model = untrained(sb3, algorithm, "symmetric")
     model.save(tmp_path / "agent.zip")
-    live, saved = judged(model), judged(tmp_path / "agent.zip")
+    live, saved = evaluated(model), evaluated(tmp_path / "agent.zip")
     assert (live.policy, saved.policy) == (algorithm, "agent")
     assert saved.regions == live.regions
     assert live.action_range == saved.action_range == "symmetric"
@@ -222,24 +224,28 @@ def test_a_saved_model_scores_as_the_model_itself(sb3, algorithm, tmp_path):
 @pytest.mark.parametrize("algorithm", ["PPO", "TD3"])
 def test_a_model_scores_as_its_deterministic_predictions(sb3, algorithm, action_range):
     model = untrained(sb3, algorithm, action_range)
-    own = judged(model)
+    own = evaluated(model)
     assert own.action_range == action_range
-    predicted = judged(lambda o: model.predict(o, deterministic=True)[0], action_range=action_range)
+    predicted = evaluated(
+        lambda o: model.predict(o, deterministic=True)[0], action_range=action_range
+    )
     for mine, theirs in zip(own.regions, predicted.regions, strict=True):
         assert mine.similarity == pytest.approx(theirs.similarity, abs=1e-12)
 
 
 def test_the_clipped_share_of_an_unsquashed_model_is_that_of_its_raw_actions(sb3):
     model = untrained(sb3, "PPO", "unit")
-    assert judged(lambda o: model.predict(o, deterministic=True)[0]).regions[0].clipped_share == 0
-    assert 0.05 < judged(model).regions[0].clipped_share < 0.95
+    assert (
+        evaluated(lambda o: model.predict(o, deterministic=True)[0]).regions[0].clipped_share == 0
+    )
+    assert 0.05 < evaluated(model).regions[0].clipped_share < 0.95
 
 
 def test_evaluating_a_model_leaves_its_training_mode_alone(sb3):
     model = untrained(sb3, "PPO")
     for mode in (True, False):
         model.policy.set_training_mode(mode)
-        judged(model)
+        evaluated(model)
         assert model.policy.training is mode
 
 
@@ -255,8 +261,8 @@ def test_a_model_with_an_action_space_of_its_own_needs_its_range_said(sb3):
     model = untrained(sb3, "PPO")
     model.action_space = type(model.action_space)(-2.0, 2.0, (2,))
     with pytest.raises(PolicyError, match=r"must be \[0, 1\] or \[-1, 1\] in every channel"):
-        judged(model)
-    assert judged(model, action_range="unit").action_range == "unit"
+        evaluated(model)
+    assert evaluated(model, action_range="unit").action_range == "unit"
 
 
 def test_a_model_behind_vec_normalize_is_refused(sb3):
@@ -265,7 +271,7 @@ def test_a_model_behind_vec_normalize_is_refused(sb3):
     env = VecNormalize(DummyVecEnv([lambda: sme_registry.make(SPEC)]))
     model = sb3.PPO("MlpPolicy", env, device="cpu")
     with pytest.raises(PolicyError, match="VecNormalize"):
-        judged(model)
+        evaluated(model)
 
 
 @pytest.fixture(scope="module")
@@ -294,8 +300,8 @@ def network(onnx, path, o=5, a=2, dtype="FLOAT", batch="batch", operator="MatMul
 @pytest.mark.parametrize("action_range", [None, "unit", "symmetric"])
 def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_range):
     W = network(onnx, tmp_path / "actor.onnx")
-    report = judged(tmp_path / "actor.onnx", action_range=action_range)
-    same = judged(lambda o: o @ W, action_range=action_range)
+    report = evaluated(tmp_path / "actor.onnx", action_range=action_range)
+    same = evaluated(lambda o: o @ W, action_range=action_range)
     assert (report.policy, report.action_range) == ("actor", action_range or "unit")
     assert "onnxruntime" in report.versions
     for mine, theirs in zip(report.regions, same.regions, strict=True):
@@ -316,21 +322,21 @@ def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_rang
 def test_an_onnx_file_that_does_not_fit_is_refused(onnx, tmp_path, made, message):
     network(onnx, tmp_path / "actor.onnx", **made)
     with pytest.raises(PolicyError, match=message):
-        judged(tmp_path / "actor.onnx")
+        evaluated(tmp_path / "actor.onnx")
 
 
 @pytest.mark.parametrize("content", [b"", b"\x08\x07", b"hello"])
 def test_bytes_that_are_no_onnx_file_are_refused(onnx, tmp_path, content):
     (tmp_path / "actor.onnx").write_bytes(content)
     with pytest.raises(PolicyError, match="not a network that onnxruntime can load"):
-        judged(str(tmp_path / "actor.onnx"))
+        evaluated(str(tmp_path / "actor.onnx"))
 
 
 def test_without_onnxruntime_an_onnx_file_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (tmp_path / "actor.onnx").write_bytes(b"")
     with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[onnx\]'"):
-        judged(tmp_path / "actor.onnx")
+        evaluated(tmp_path / "actor.onnx")
 
 
 def test_onnx_files_play_as_a_team_apart_and_together(onnx, tmp_path):

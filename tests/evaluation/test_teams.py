@@ -1,4 +1,4 @@
-"""Teams: each agent is judged over its own channels, by what it alone observes."""
+"""Teams: each agent is evaluated over its own channels, from what it alone observes."""
 
 from __future__ import annotations
 

@@ -61,13 +61,7 @@ class OfflinePolicy:
         return int(self.layers[-1][0].shape[0])
 
     def __call__(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Actions.
-
-        Args:
-          observations: `[B, O]`.
-
-        Returns:
-          `[B, A]` float32 in [0, 1].
+        """Actions `[B, A]` float32 in [0, 1] for observations `[B, O]`.
 
         Raises:
           PolicyError: they have another width.
@@ -113,14 +107,14 @@ class OfflinePolicy:
         Raises:
           PolicyError: it does not exist, or is not such a file.
         """
-        refused = f"{os.fspath(path)}: not a policy that `sme offline train` wrote"
+        problem = f"{os.fspath(path)}: not a policy that `sme offline train` wrote"
         try:
             if os.path.getsize(path) > _MAX_BYTES:
-                raise PolicyError(f"{refused}: larger than {_MAX_BYTES // 2**20} MiB.")
+                raise PolicyError(f"{problem}: larger than {_MAX_BYTES // 2**20} MiB.")
             with zipfile.ZipFile(path) as members:
                 unpacked = sum(member.file_size for member in members.infolist())
             if unpacked > _MAX_BYTES:
-                raise PolicyError(f"{refused}: larger than {_MAX_BYTES // 2**20} MiB unpacked.")
+                raise PolicyError(f"{problem}: larger than {_MAX_BYTES // 2**20} MiB unpacked.")
             with np.load(path, allow_pickle=False) as stored:
                 about = parse_json(stored["about"].tobytes())
                 count = sum(name.startswith("W") for name in stored.files)
@@ -132,23 +126,23 @@ class OfflinePolicy:
         except PolicyError:
             raise
         except (OSError, zipfile.BadZipFile, KeyError, ValueError, EOFError, SMEError) as error:
-            raise PolicyError(f"{refused}: {type(error).__name__}: {error}.") from None
+            raise PolicyError(f"{problem}: {type(error).__name__}: {error}.") from None
         if not isinstance(about, dict) or about.pop("kind", None) != KIND:
-            raise PolicyError(f"{refused}: its `about` does not name its kind.")
-        _refuse_other_layers(layers, refused)
+            raise PolicyError(f"{problem}: its `about` does not name its kind.")
+        _check_layers(layers, problem)
         return cls(layers, about)
 
 
-def _refuse_other_layers(layers: Sequence[Layer], refused: str) -> None:
+def _check_layers(layers: Sequence[Layer], problem: str) -> None:
     if not 1 <= len(layers) <= _MAX_LAYERS:
-        raise PolicyError(f"{refused}: it has {len(layers)} layers.")
+        raise PolicyError(f"{problem}: it has {len(layers)} layers.")
     width = None
     for index, (W, b) in enumerate(layers):
         fits = W.ndim == 2 and W.size > 0 and b.shape == W.shape[:1]
         if not fits or (width is not None and W.shape[1] != width):
-            raise PolicyError(f"{refused}: layer {index} has shapes {W.shape} and {b.shape}.")
+            raise PolicyError(f"{problem}: layer {index} has shapes {W.shape} and {b.shape}.")
         if W.dtype != np.float32 or b.dtype != np.float32:
-            raise PolicyError(f"{refused}: layer {index} is {W.dtype} and {b.dtype}, not float32.")
+            raise PolicyError(f"{problem}: layer {index} is {W.dtype} and {b.dtype}, not float32.")
         if not (np.isfinite(W).all() and np.isfinite(b).all()):
-            raise PolicyError(f"{refused}: layer {index} has entries that are not finite.")
+            raise PolicyError(f"{problem}: layer {index} has entries that are not finite.")
         width = W.shape[0]

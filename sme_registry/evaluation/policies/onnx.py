@@ -19,9 +19,7 @@ from sme_registry.io import require_packages
 def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[Observation], Any]:
     """Load an ONNX file's network, on one thread of the CPU: a function of observations.
 
-    Args:
-      path: an .onnx file with one float32 input `[B, O]` and one output `[B, A]`.
-      interface: O, A, and what they belong to.
+    The file has one float32 input `[B, O]` and one output `[B, A]`.
 
     Raises:
       PolicyError: it does not exist, onnxruntime rejects it, or its interface differs.

@@ -23,11 +23,9 @@ from sme_registry.task import draw
 
 
 class Interface(NamedTuple):
-    """What a policy must map from and to.
+    """The widths of observations and actions that a task needs of a policy.
 
     Attributes:
-      observation_dim: entries of an observation.
-      action_dim: entries of an action.
       description: what these widths belong to, such as "state_dim=3, action_dim=2".
       alternatives: other forms that are allowed, for the error message.
       hint: see `Policy`.
@@ -40,11 +38,7 @@ class Interface(NamedTuple):
     hint: str = ""
 
     def check(self, policy: str, **shapes: tuple[int, ...] | None) -> None:
-        """Check the shapes of one observation and one action, those that are known.
-
-        Raises:
-          PolicyError: they differ from the task's.
-        """
+        """Raise `PolicyError` if a known shape of `observations` or `actions` is another."""
         widths = {"observations": self.observation_dim, "actions": self.action_dim}
         for what, shape in shapes.items():
             if shape not in (None, (widths[what],)):
@@ -148,11 +142,7 @@ class TeamPolicy:
         return np.concatenate(joint, axis=1)
 
     def check_team(self, spec: SMESpec) -> None:
-        """Check that a task has the agents that this policy was prepared for.
-
-        Raises:
-          PolicyError: it has other agents, or none.
-        """
+        """Raise `PolicyError` if a task has other agents than this policy was prepared for."""
         prepared = [(member.agent, member.action_dim) for member in self.members]
         agents = [] if spec.team is None else draw.agents(spec)
         if prepared != [(agent.name, agent.action_dim) for agent in agents]:

@@ -98,11 +98,7 @@ def predictor(model: Any) -> Callable[[Observation], Any]:
 
 
 def check_not_normalised(model: Any) -> None:
-    """Check that a model takes observations as they are.
-
-    Raises:
-      PolicyError: it was trained on normalised observations.
-    """
+    """Raise `PolicyError` if a model was trained on observations normalised by VecNormalize."""
     normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
     if getattr(normaliser, "norm_obs", False):
         raise PolicyError(
@@ -113,11 +109,7 @@ def check_not_normalised(model: Any) -> None:
 
 
 def action_range_of(model: Any) -> ActionRange:
-    """The action range of a model's action space; "unit" if it has no space.
-
-    Raises:
-      PolicyError: the space is neither [0, 1] nor [−1, 1] in every channel.
-    """
+    """The action range of a model's action space; "unit" if it has no space."""
     space = getattr(model, "action_space", None)
     if space is None:
         return "unit"
