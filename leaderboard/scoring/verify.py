@@ -118,12 +118,7 @@ def verify(
             with store.locked():
                 verifier.follow_log()  # entries logged in the meantime
                 verifier.check_numbering()
-                if digest is not None and digest not in verifier.digests:
-                    raise TamperedError(
-                        "log",
-                        f"has no entry with the digest {digest}. If it was an entry of this board, "
-                        "the log was cut or rewritten since",
-                    )
+                verifier.check_contains(digest)
                 unlogged = verifier.count_unlogged()
                 rows = verifier.check_index()
             verifier.check_signatures()
@@ -206,6 +201,15 @@ class _Verifier:
                 self._refuse(
                     self.folder.log_entry(following), "is missing, but later entries exist"
                 )
+
+    def check_contains(self, digest: str | None) -> None:
+        """Check that the log has the entry with this digest."""
+        if digest is not None and digest not in self.digests:
+            raise TamperedError(
+                "log",
+                f"has no entry with the digest {digest}. If it was an entry of this board, the log "
+                "was cut or rewritten since",
+            )
 
     def count_unlogged(self) -> int:
         """Check that no file passes for a logged one; count those about to be logged."""
