@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, TypeVar
-
-from pydantic import Field
+from typing import Any, Literal
 
 from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
-from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel
+from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel, TupleOf
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.classes import ALL, AXES
+from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.offline_findings import THRESHOLDS as OFFLINE
 from sme_registry.studies.report.offline_findings import OfflineFindings, offline_findings
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
@@ -46,185 +44,126 @@ THRESHOLDS = {
 _WD, _OOD = "wd_regret", "ood_regret"
 _CHANCE = 0.05  # share of 95 % intervals that exclude 0 without an effect
 
-_Part = TypeVar("_Part")
-_Tuple = Annotated[tuple[_Part, ...], Field(strict=False)]
+Severity = Literal["broken", "hurt", "slightly_hurt"]
+Certainty = Literal["indication", "rivals", "only_axis", "certain"]
+Position = Literal[
+    "worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"
+]
 
 
 class Contrast(StrictModel):
-    """The change of normalised regret from the first class to another.
+    """The change of normalised regret from the first class to another; a row of `contrasts`.
 
-    Attributes:
-      class_name: the other class.
-      axis: the field in which the classes differ; `SEVERAL`; or "".
-      setting: the class's values of the fields that differ, such as "k = 25".
-      base, level: IQM of the normalised regret on the first class and on this one.
-      change: IQM of the differences between runs of equal number.
-      low, high: ends of its 95 % interval; None for a single pair of runs.
-      pairs: pairs of runs.
-      enough_pairs: whether there are at least `ENOUGH_RUNS`.
-      verdict: "open" unless the interval excludes 0.
+    The change is the IQM of the differences between runs of equal number, with its 95 % interval
+    (None for a single pair of runs).
     """
 
     class_name: str
-    axis: str
-    setting: str
-    base: Real
-    level: Real
+    axis: str  # the field in which the classes differ; `SEVERAL`; or ""
+    setting: str  # the class's values of the fields that differ, such as "k = 25"
+    base: Real  # IQM of the normalised regret on the first class
+    level: Real  # and on this one
     change: Real
     low: Real | None
     high: Real | None
-    pairs: Integer
-    enough_pairs: bool
-    verdict: Literal["worse", "better", "open"]
+    pairs: Integer  # of runs
+    enough_pairs: bool  # at least `ENOUGH_RUNS`
+    verdict: Literal["worse", "better", "open"]  # "open" unless the interval excludes 0
 
 
 class OutOfDistribution(StrictModel):
     """The class that costs most regret out of distribution, and larger changes that are open."""
 
     worst: Contrast
-    larger: _Tuple[Contrast]
+    larger: TupleOf[Contrast]
 
 
 class AlgorithmFinding(StrictModel):
     """Which property of the task breaks an algorithm.
 
-    Lists hold one contrast an axis, its largest; the largest of them is first.
-
-    Attributes:
-      algorithm: its name.
-      verdict: by the largest change for the worse; "none_shown" if there is none, and
-        "no_contrasts" if no run on the first class has a partner on another.
-      base_wd_regret: normalised regret on the first class; None if it has no run there.
-      base_unlearnt: whether almost nothing was learnt on the first class.
-      worst: the largest change for the worse.
-      larger: larger changes that are open.
-      certainty: whether `worst` is certainly the worst: "indication" with few pairs; "rivals" if
-        the intervals of other axes allow a larger change; "only_axis" if no other was varied.
-      rivals: those other axes.
-      position: of the level on `worst.class_name` among the references; None without a linear one.
-      linear_wd_regret, base_linear_wd_regret: WD regret of the linear policy there and on the
-        first class.
-      harder_to_fit: whether the linear policy's regret rises by more than the threshold "hurt".
-      also_worse: changes for the worse on other axes.
-      better: changes for the better.
-      open: axes without a change for the worse, apart from `larger`.
-      out_of_distribution: likewise for the mean over the shells; None if no change is certain.
-      highest_change: the highest end of an interval; None if no contrast has an interval.
-      largest_single: the largest change of a single pair of runs.
+    Lists of contrasts hold one an axis, its largest; the largest of them is first.
     """
 
     algorithm: str
-    verdict: Literal["broken", "hurt", "slightly_hurt", "none_shown", "no_contrasts"]
-    base_wd_regret: Real | None = None
-    base_unlearnt: bool = False
-    worst: Contrast | None = None
-    larger: _Tuple[Contrast] = ()
-    certainty: Literal["indication", "rivals", "only_axis", "certain"] | None = None
-    rivals: _Tuple[Contrast] = ()
-    position: (
-        Literal["worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"]
-        | None
-    ) = None
-    linear_wd_regret: Real | None = None
-    base_linear_wd_regret: Real | None = None
-    harder_to_fit: bool = False
-    also_worse: _Tuple[Contrast] = ()
-    better: _Tuple[Contrast] = ()
-    open: _Tuple[Contrast] = ()
-    out_of_distribution: OutOfDistribution | None = None
-    highest_change: Real | None = None
-    largest_single: Contrast | None = None
+    # By the largest change for the worse; "none_shown" if there is none, and "no_contrasts" if no
+    # run on the first class has a partner on another.
+    verdict: Severity | Literal["none_shown", "no_contrasts"]
+    base_wd_regret: Real | None = None  # on the first class; None if it has no run there
+    base_unlearnt: bool = False  # whether almost nothing was learnt on the first class
+    worst: Contrast | None = None  # the largest change for the worse
+    larger: TupleOf[Contrast] = ()  # larger changes that are open
+    # Whether `worst` is certainly the worst: "indication" with few pairs; "rivals" if the intervals
+    # of other axes allow a larger change; "only_axis" if no other was varied.
+    certainty: Certainty | None = None
+    rivals: TupleOf[Contrast] = ()  # those other axes
+    position: Position | None = None  # of the level on `worst`; None without a linear policy
+    linear_wd_regret: Real | None = None  # WD regret of the linear policy on `worst`
+    base_linear_wd_regret: Real | None = None  # and on the first class
+    harder_to_fit: bool = False  # whether it rises by more than the threshold "hurt"
+    also_worse: TupleOf[Contrast] = ()  # changes for the worse on other axes
+    better: TupleOf[Contrast] = ()  # changes for the better
+    open: TupleOf[Contrast] = ()  # axes without a change for the worse, apart from `larger`
+    out_of_distribution: OutOfDistribution | None = None  # over the shells; None if none is certain
+    highest_change: Real | None = None  # the highest end of an interval
+    largest_single: Contrast | None = None  # the largest change of a single pair of runs
 
 
 class Rival(StrictModel):
-    """An algorithm compared with the best one.
-
-    Attributes:
-      algorithm: its name.
-      probability: that a run of the best algorithm beats one of this algorithm.
-      low, high: ends of its 95 % interval; None if a class has a single run.
-      verdict: "open" if the interval reaches down to 0.5; "indication" with few runs.
-    """
+    """An algorithm compared with the best one."""
 
     algorithm: str
-    probability: Real
-    low: Real | None
+    probability: Real  # that a run of the best algorithm beats one of this algorithm
+    low: Real | None  # of its 95 % interval; None if a class has a single run
     high: Real | None
+    # "open" if the interval reaches down to 0.5; "indication" with few runs.
     verdict: Literal["better", "indication", "open"]
 
 
 class Best(StrictModel):
-    """The best algorithm over all classes, among those with equal data.
-
-    Attributes:
-      algorithm: its name.
-      nu, transitions: of the data that all of them learnt from; None for online algorithms.
-      classes: on which all algorithms have runs.
-      iqm: of 1 − WD regret, mean over classes: 1 is the optimum, 0 the constant ½.
-      low, high: ends of its 95 % interval; None if a class has a single run.
-      rivals: the other algorithms.
-    """
+    """The best algorithm over all classes, among those with equal data."""
 
     algorithm: str
-    nu: Real | None
+    nu: Real | None  # of the data that all of them learnt from; None for online algorithms
     transitions: Integer | None
-    classes: Integer
-    iqm: Real
-    low: Real | None
+    classes: Integer  # on which all algorithms have runs
+    iqm: Real  # of 1 − WD regret, mean over classes: 1 is the optimum, 0 the constant ½
+    low: Real | None  # of its 95 % interval; None if a class has a single run
     high: Real | None
-    rivals: _Tuple[Rival]
+    rivals: TupleOf[Rival]  # the other algorithms
 
 
 class Caveats(StrictModel):
-    """What limits all findings.
+    """What limits all findings."""
 
-    Attributes:
-      planned, missing, failed: runs of the plan; failed ones are missing, too.
-      fewest_pairs: of a contrast; None without contrasts.
-      intervals: of contrasts within distribution.
-      false_findings: how many of them exclude 0 by chance if nothing has an effect.
-      other_policy_init: classes whose policy_init also differs from the first class's.
-    """
-
-    planned: Integer
+    planned: Integer  # runs
     missing: Integer
-    failed: Integer
-    fewest_pairs: Integer | None
-    intervals: Integer
-    false_findings: Integer
-    other_policy_init: _Tuple[str]
+    failed: Integer  # of those missing
+    fewest_pairs: Integer | None  # of a contrast; None without contrasts
+    intervals: Integer  # of contrasts within distribution
+    false_findings: Integer  # how many of them exclude 0 by chance if nothing has an effect
+    other_policy_init: TupleOf[str]  # classes whose policy_init also differs from the first's
 
 
 class Findings(StrictModel):
-    """What a study found, as data.
-
-    Attributes:
-      study: name and version of the plan.
-      digest: of the plan.
-      base: the plan's first class, with which the others are contrasted.
-      thresholds: see `THRESHOLDS`.
-      algorithms: those that learn.
-      steps: training steps of each algorithm that is compared, if they differ; otherwise empty.
-      best: one for each data set that algorithms share.
-      caveats: what limits all findings.
-      offline: what learning from data adds; None without such runs.
-    """
+    """What a study found, as data."""
 
     schema_version: SchemaVersion = 1
-    study: str
-    digest: Digest
-    base: str
-    thresholds: dict[str, Real]
-    algorithms: _Tuple[AlgorithmFinding]
-    steps: dict[str, Integer]
-    best: _Tuple[Best]
+    study: str  # name and version of the plan
+    digest: Digest  # of the plan
+    base: str  # the plan's first class, with which the others are contrasted
+    thresholds: dict[str, Real]  # see `THRESHOLDS`
+    algorithms: TupleOf[AlgorithmFinding]  # those that learn
+    steps: dict[str, Integer]  # training steps of those compared, if they differ
+    best: TupleOf[Best]  # one for each data set that algorithms share
     caveats: Caveats
-    offline: OfflineFindings | None
+    offline: OfflineFindings | None  # what learning from data adds; None without such runs
 
 
 def findings(analysis: Analysis) -> Findings:
     """The findings of a study, from its tables."""
-    compared = _aggregates(analysis)
+    rows = analysis.aggregates
+    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
+    compared = list(rows[rows.algorithm.isin(analysis.learners)].itertuples())
     return Findings(
         study=analysis.file.versioned_name,
         digest=analysis.file.digest,
@@ -278,7 +217,7 @@ def _algorithm(analysis: Analysis, algorithm: str) -> AlgorithmFinding:
     )
 
 
-def _severity(change: float) -> Literal["broken", "hurt", "slightly_hurt"]:
+def _severity(change: float) -> Severity:
     if change >= THRESHOLDS["broken"]:
         return "broken"
     return "hurt" if change >= THRESHOLDS["hurt"] else "slightly_hurt"
@@ -286,7 +225,7 @@ def _severity(change: float) -> Literal["broken", "hurt", "slightly_hurt"]:
 
 def _certainty(
     contrasts: Sequence[Contrast], worst: Contrast, rivals: Sequence[Contrast]
-) -> Literal["indication", "rivals", "only_axis", "certain"]:
+) -> Certainty:
     if not worst.enough_pairs:
         return "indication"
     if rivals:
@@ -294,12 +233,7 @@ def _certainty(
     return "only_axis" if len({c.axis for c in contrasts}) == 1 else "certain"
 
 
-def _position(
-    level: float, linear: float | None
-) -> (
-    Literal["worse_than_constant", "like_constant", "worse_than_linear", "better_than_linear"]
-    | None
-):
+def _position(level: float, linear: float | None) -> Position | None:
     """Where a normalised regret is among the constant's, which is 1, and the linear policy's."""
     if level > 2.0 - THRESHOLDS["unlearnt"]:
         return "worse_than_constant"
@@ -321,21 +255,13 @@ def _out_of_distribution(analysis: Analysis, algorithm: str) -> OutOfDistributio
 def _contrasts(analysis: Analysis, algorithm: str, metric: str) -> list[Contrast]:
     rows = analysis.contrasts
     rows = rows[(rows.algorithm == algorithm) & (rows.metric == metric)]
+    rows = rows.drop(columns=["algorithm", "metric"]).astype(object)
     return [
         Contrast(
-            class_name=row.class_name,
-            axis=row.axis,
-            setting=analysis.classes[row.class_name].label,
-            base=row.base,
-            level=row.level,
-            change=row.change,
-            low=_known(row.low),
-            high=_known(row.high),
-            pairs=row.pairs,
-            enough_pairs=bool(row.enough_pairs),
-            verdict=row.verdict,
+            **{**row, "low": _known(row["low"]), "high": _known(row["high"])},
+            setting=analysis.classes[row["class_name"]].label,
         )
-        for row in rows.itertuples()
+        for row in rows.to_dict("records")
     ]
 
 
@@ -376,13 +302,6 @@ def _rivals(contrasts: Iterable[Contrast], worst: Contrast) -> tuple[Contrast, .
     return _largest_of_each_axis(
         c for c in contrasts if c.axis != worst.axis and (c.high is None or c.high >= low)
     )
-
-
-def _aggregates(analysis: Analysis) -> list[Any]:
-    """The rows of learners over all classes."""
-    rows = analysis.aggregates
-    rows = rows[(rows.group == ALL) & (rows.metric == _WD) & (rows.statistic == "iqm")]
-    return [row for row in rows.itertuples() if row.algorithm in analysis.learners]
 
 
 def _steps(analysis: Analysis, algorithms: Sequence[str]) -> dict[str, int]:
@@ -431,6 +350,7 @@ def _improvements(analysis: Analysis, best: str, among: set[str]) -> Iterable[Ri
 def _caveats(analysis: Analysis) -> Caveats:
     rows, missing = analysis.contrasts, analysis.missing
     rows = rows[rows.algorithm.isin(analysis.learners)]
+    policy_init = analysis.classes[analysis.base].setting["policy_init"]
     intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
     return Caveats(
         planned=len(analysis.runs) + len(missing),
@@ -440,12 +360,8 @@ def _caveats(analysis: Analysis) -> Caveats:
         intervals=intervals,
         false_findings=max(1, round(_CHANCE * intervals)),
         other_policy_init=tuple(
-            name for name in analysis.classes if "policy_init" in _also_differing(analysis, name)
+            name
+            for name, info in analysis.classes.items()
+            if info.axis != "policy_init" and info.setting["policy_init"] != policy_init
         ),
     )
-
-
-def _also_differing(analysis: Analysis, class_name: str) -> list[str]:
-    """Fields in which a class differs from the first, besides the one it is contrasted by."""
-    info, base = analysis.classes[class_name], analysis.classes[analysis.base]
-    return [name for name in AXES if info.setting[name] != base.setting[name] and name != info.axis]

@@ -7,11 +7,9 @@ The improvement of a run is its mean similarity r̃ minus that of the behaviour 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal
 
-from pydantic import Field
-
-from sme_registry.spec import Integer, Real, StrictModel
+from sme_registry.spec import Integer, Real, StrictModel, TupleOf
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
 
@@ -31,100 +29,60 @@ THRESHOLDS = {
 }
 _NEAR, _COLLAPSE = THRESHOLDS["near"], THRESHOLDS["collapse"]
 
-_Part = TypeVar("_Part")
-_Tuple = Annotated[tuple[_Part, ...], Field(strict=False)]
-Verdict = Literal["above", "above_few", "below", "below_few", "open"]
+Verdict = Literal["above", "above_few", "below", "below_few", "open", "single_above"]
+"""Above or below its data from `ENOUGH_RUNS` runs on; with "_few" an indication; "single_above" is a
+single run that is further above its data than "near"."""
 
 
 class Place(StrictModel):
-    """A class and a ν, with a difference of similarity there.
-
-    Attributes:
-      class_name, nu: the place.
-      difference: of r̃, from the behaviour policy; for a behaviour policy, from 1 − ν/6.
-    """
+    """A class and a ν, with a difference of similarity there."""
 
     class_name: str
     nu: Real
-    difference: Real
+    difference: Real  # of r̃, from the behaviour policy; for a behaviour policy, from 1 − ν/6
 
 
 class Behaviour(StrictModel):
-    """The behaviour policies compared with 1 − ν/6, which independent uniform actions give.
+    """The behaviour policies compared with 1 − ν/6, which independent uniform actions give."""
 
-    Attributes:
-      places: every class and ν.
-      farthest: where the difference is largest.
-      far: where it is larger than the threshold "near".
-    """
-
-    places: _Tuple[Place]
-    farthest: Place
-    far: _Tuple[Place]
+    places: TupleOf[Place]  # every class and ν
+    farthest: Place  # where the difference is largest
+    far: TupleOf[Place]  # where it is larger than the threshold "near"
 
 
 class Depth(StrictModel):
-    """A learner on the deepest class.
-
-    Attributes:
-      class_name: the class.
-      verdict: "collapses" if it is at the constant ½ or far below its data at any ν.
-      runs: of the learner there.
-      places: its values of ν, with the improvements there.
-      at_constant: those where r̃ is near that of the constant ½, or below it.
-      below_data: others where it is below the behaviour policy by the threshold "collapse".
-      few_runs: whether any of these has fewer than `ENOUGH_RUNS` runs.
-      lowest: the place with the lowest improvement; None without runs.
-    """
+    """A learner on the deepest class: it collapses if it is in `at_constant` or `below_data`."""
 
     class_name: str
     verdict: Literal["collapses", "holds", "no_runs"]
-    runs: Integer
-    places: _Tuple[Place] = ()
-    at_constant: _Tuple[Place] = ()
-    below_data: _Tuple[Place] = ()
-    few_runs: bool = False
-    lowest: Place | None = None
+    runs: Integer  # of the learner there
+    places: TupleOf[Place] = ()  # its values of ν, with the improvements there
+    at_constant: TupleOf[Place] = ()  # where r̃ is near that of the constant ½, or below it
+    below_data: TupleOf[Place] = ()  # others, below the behaviour policy by "collapse"
+    few_runs: bool = False  # whether any of these has fewer than `ENOUGH_RUNS` runs
+    lowest: Place | None = None  # with the lowest improvement; None without runs
 
 
 class Learner(StrictModel):
-    """A learner compared with the behaviour policies.
+    """A learner compared with the behaviour policies."""
 
-    Attributes:
-      name: such as "IQL (expectile = 0.9)".
-      verdict: "imitates" if it is near them everywhere, else "near_at_some" or "near_at_none".
-      surpasses: whether it is above its data anywhere, by enough runs or as an indication.
-      near: where its improvement is within the threshold "near".
-      farthest: where its improvement is largest, up or down.
-      places: by verdict: "above" or "below" from `ENOUGH_RUNS` runs on, with "_few" an indication;
-        "single_above" is a single run that is further above than "near".
-      depth: on the deepest class; None if all classes are equally deep.
-    """
-
-    name: str
-    verdict: Literal["imitates", "near_at_some", "near_at_none"]
-    surpasses: bool
-    near: _Tuple[Place]
-    farthest: Place
-    places: dict[Verdict | Literal["single_above"], _Tuple[Place]]
-    depth: Depth | None
+    name: str  # such as "IQL (expectile = 0.9)"
+    verdict: Literal["imitates", "near_at_some", "near_at_none"]  # near them everywhere: "imitates"
+    surpasses: bool  # whether it is above its data anywhere, by enough runs or as an indication
+    near: TupleOf[Place]  # where its improvement is within the threshold "near"
+    farthest: Place  # where its improvement is largest, up or down
+    places: dict[Verdict, TupleOf[Place]]
+    depth: Depth | None  # None if all classes are equally deep
 
 
 class OfflineFindings(StrictModel):
-    """What learning from data adds to a study.
+    """What learning from data adds to a study."""
 
-    Attributes:
-      example, nu: an algorithm of the plan and its ν; an algorithm is a learner with its data.
-      behaviour: the policies that made the data.
-      learners: those of the plan.
-      fewest_runs, most_runs: of a learner on a class at a ν.
-    """
-
-    example: str
-    nu: Real
-    behaviour: Behaviour
-    learners: _Tuple[Learner]
-    fewest_runs: Integer
+    example: str  # an algorithm of the plan, which is a learner with its data
+    nu: Real  # of the example
+    behaviour: Behaviour  # the policies that made the data
+    learners: TupleOf[Learner]  # those of the plan
+    fewest_runs: Integer  # of a learner on a class at a ν
     most_runs: Integer
 
 
@@ -132,13 +90,11 @@ def offline_findings(analysis: Analysis) -> OfflineFindings:
     """The findings of a study with offline learners."""
     rows = list(analysis.offline.itertuples())
     data = training_data(analysis.runs)
-    example = next(name for name, source in data.items() if source is not None)
-    source = data[example]
-    assert source is not None
+    example, nu = next((name, source[0]) for name, source in data.items() if source)
     runs = [row.runs for row in rows]
     return OfflineFindings(
         example=example,
-        nu=source[0],
+        nu=nu,
         behaviour=_behaviour(analysis),
         learners=tuple(
             _learner(analysis, name, [row for row in rows if row.learner == name])
@@ -163,29 +119,28 @@ def _behaviour(analysis: Analysis) -> Behaviour:
 
 def _learner(analysis: Analysis, name: str, rows: list[Any]) -> Learner:
     near = _places(row for row in rows if abs(row.improvement) <= _NEAR)
-    places: dict[Any, tuple[Place, ...]] = {
-        verdict: _places(
-            row
-            for row in rows
-            if row.verdict == verdict and not (verdict == "open" and row.runs == 1)
-        )
-        for verdict in ("above", "above_few", "below", "below_few", "open")
-    }
-    places["single_above"] = _places(
-        row for row in rows if row.runs == 1 and row.improvement > _NEAR
-    )
-    verdict: Literal["imitates", "near_at_some", "near_at_none"] = "near_at_none"
-    if near:
-        verdict = "imitates" if len(near) == len(rows) else "near_at_some"
+    places: dict[Any, tuple[Place, ...]] = {}
+    for row in rows:
+        verdict = row.verdict
+        if row.runs == 1:
+            verdict = "single_above" if row.improvement > _NEAR else None
+        if verdict is not None:
+            places[verdict] = (*places.get(verdict, ()), *_places([row]))
     return Learner(
         name=name,
-        verdict=verdict,
-        surpasses=bool(places["above"] or places["above_few"]),
+        verdict=_nearness(len(near), len(rows)),
+        surpasses=not places.keys().isdisjoint(("above", "above_few")),
         near=near,
         farthest=max(_places(rows), key=lambda place: abs(place.difference)),
-        places={verdict: found for verdict, found in places.items() if found},
+        places=places,
         depth=_depth(analysis, rows),
     )
+
+
+def _nearness(near: int, places: int) -> Literal["imitates", "near_at_some", "near_at_none"]:
+    if not near:
+        return "near_at_none"
+    return "imitates" if near == places else "near_at_some"
 
 
 def _depth(analysis: Analysis, rows: list[Any]) -> Depth | None:
