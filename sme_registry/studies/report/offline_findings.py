@@ -30,8 +30,8 @@ THRESHOLDS = {
 _NEAR, _COLLAPSE = THRESHOLDS["near"], THRESHOLDS["collapse"]
 
 Verdict = Literal["above", "above_few", "below", "below_few", "open", "single_above"]
-"""Above or below its data from `ENOUGH_RUNS` runs on; with "_few" an indication; "single_above" is a
-single run that is further above its data than "near"."""
+"""Above or below its data from `ENOUGH_RUNS` runs on; with "_few" an indication; "single_above" is
+one run that is further above its data than "near"."""
 
 
 class Place(StrictModel):
