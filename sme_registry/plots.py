@@ -296,11 +296,7 @@ def training_curve(
         window = max(1, len(step) // 20)
     window = integer_in("window", window, 1)
     with _figure_file(path, (6.2, 3.6)) as figure:
-        axes = figure.add_subplot()
-        axes.scatter(
-            step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True,
-            label="one episode",
-        )  # fmt: skip
+        axes = draw_training(figure, step, regret, "one episode")
         drawn, smooth = _running_median(step, regret, window)
         label = f"median of {window} episodes"
         axes.plot(drawn, smooth, color=COLOURS[0], linewidth=2.2, label=label)
@@ -309,14 +305,23 @@ def training_curve(
             "optimal", (1.0, 0.0), xycoords=("axes fraction", "data"), xytext=(0, 3),
             textcoords="offset points", ha="right", color="#555555", fontsize=8,
         )  # fmt: skip
-        axes.set_ylim(-0.04, 1.04)
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
-        axes.set_xlabel("environment steps")
-        axes.set_ylabel("mean regret per step  (1 − r)")
         axes.set_title(literal(title))
         axes.legend(loc="upper right")
     return Path(path)
+
+
+def draw_training(figure: Figure, step: Array, regret: Array, label: str) -> Axes:
+    """The axes of a figure, with a dot for each of `[N]` episodes or evaluations of a training."""
+    axes = figure.add_subplot()
+    axes.scatter(
+        step, regret, s=8, color=GREY, alpha=0.4, linewidths=0, rasterized=True, label=label
+    )
+    axes.set_ylim(-0.04, 1.04)
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    axes.set_xlabel("environment steps")
+    axes.set_ylabel("mean regret per step  (1 − r)")
+    return axes
 
 
 def _episodes(episodes: str | os.PathLike[str] | Iterable[Any]) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sme_registry.diagnosis import measure, rollouts, verdicts
+from sme_registry.diagnosis import measure, networks, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
 from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
 from sme_registry.diagnosis.questions import THRESHOLDS
@@ -95,8 +95,6 @@ def _measurements(
         constant = min(on_policy.scores[name].regret for name in rollouts.CONSTANTS)
         training = rollouts.training(subject.log, constant)
     if subject.explore is not None:
-        from sme_registry.diagnosis import networks
-
         exploration_sd = networks.exploration_sd(subject.explore, sample.observation, seed)
     return Measurements(
         uniform=uniform,
@@ -116,7 +114,6 @@ def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> Capaci
     network = subject.policy.act
     if not isinstance(network, Perceptron):
         return None
-    from sme_registry.diagnosis import networks
 
     def progress(done: int) -> None:
         total = networks.GRADIENT_STEPS

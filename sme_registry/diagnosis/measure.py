@@ -54,21 +54,13 @@ _TINY = 1e-12
 
 
 class Sample(NamedTuple):
-    """States, the actions in them, and the optimal actions.
+    """States, the actions in them, and the optimal actions."""
 
-    Attributes:
-      observation: `[N, S + 2]`.
-      s: `[N, S]` states.
-      a: `[N, A]` actions of the policy, in [0, 1].
-      optimal: `[N, A]` optimal actions.
-      references: `[N, A]` actions of each reference.
-    """
-
-    observation: Observation
-    s: Array
-    a: Array
-    optimal: Array
-    references: dict[str, Array]
+    observation: Observation  # `[N, S + 2]`
+    s: Array  # `[N, S]` states
+    a: Array  # `[N, A]` actions of the policy, in [0, 1]
+    optimal: Array  # `[N, A]` optimal actions
+    references: dict[str, Array]  # `[N, A]` actions of each reference
 
     @property
     def absolute_error(self) -> Array:
@@ -185,33 +177,25 @@ def _partition(state_channel: int | None, values: Array, mae: Array, regret: Arr
 
 
 def shells(
-    policy: Policy,
-    task: Task,
-    fitted: references.References,
-    seed: int,
-    wd_scores: dict[str, Score],
+    policy: Policy, task: Task, fitted: references.References, seed: int, wd: dict[str, Score]
 ) -> tuple[Shell, ...]:
-    """WD, with its scores from the caller, and the five shells around it."""
+    """The cube, whose scores the caller has, and the five shells around it."""
     protocol = EvaluationProtocol(states_per_region=affordable(task, _SHELL_STATES), seed=seed)
-    around = [
+    return tuple(
         Shell(
             region=region_name(region),
-            epsilon=protocol.edges[region][1],
-            scores=scores(task, sample(policy, task, fitted, protocol, region)),
+            epsilon=epsilon,
+            scores=scores(task, sample(policy, task, fitted, protocol, region)) if region else wd,
         )
-        for region in range(1, len(protocol.edges))
-    ]
-    return (Shell(region=region_name(0), epsilon=0.0, scores=wd_scores), *around)
+        for region, (_, epsilon) in enumerate(protocol.edges)
+    )
 
 
 def squared_error(policy: Policy, task: Task, states: Sample, time_variance: float) -> SquaredError:
-    """Decompose the squared error.
+    """Decompose the squared error in uniform states.
 
-    Args:
-      policy: acts again in the same states, for the noise.
-      task: the task.
-      states: uniform.
-      time_variance: mean over states and channels of the variance of a over t/T.
+    `time_variance` is the mean over states and channels of the variance of a over t/T. The policy
+    acts again in the same states, for the noise.
     """
     difference = states.a - states.optimal
     total = float((difference**2).mean())

@@ -38,13 +38,11 @@ _PROGRESS = 1000  # gradient steps
 
 
 def exploration(model: Any, policy: Policy) -> Callable[[Observation], Array] | None:
-    """The stochastic actions of a Stable-Baselines3 model during training, in the unit range.
+    """The stochastic actions of a Stable-Baselines3 model during training; None of another model.
 
-    Returns:
-      From observations `[B, S + 2]` to clipped actions `[B, A]`, sampled at each call; None if the
-      model is no Stable-Baselines3 model.
+    They are sampled at each call, clipped and in the unit range.
     """
-    if not hasattr(model, "policy") or not hasattr(model.policy, "squash_output"):
+    if not hasattr(getattr(model, "policy", None), "squash_output"):
         return None
     noise = getattr(model, "action_noise", None)
 

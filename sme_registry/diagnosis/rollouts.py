@@ -22,7 +22,7 @@ from sme_registry.evaluation import Policy, references
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
-__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "training"]
+__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "running_median", "training"]
 
 CONSTANTS = ("best_constant", "constant_half")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
@@ -31,27 +31,16 @@ _TINY = 1e-12
 
 
 class Trajectories(NamedTuple):
-    """Episodes side by side, up to the end of the longest.
+    """Episodes side by side, up to the end of the longest."""
 
-    Attributes:
-      s: `[T, n, S]` states.
-      mae: `[T, n]` mean |a − a*| over channels.
-      constant_mae: `[T, n]` the same of the constant ½.
-      reward: `[T, n]` step reward r.
-      payout: `[T, n]` payout R.
-      alive: `[T, n]` whether the episode was still running.
-      payout_due: `[T, n]` whether a payout was due after the step.
-      terminated: `[n]` whether D terminated the episode.
-    """
-
-    s: Array
-    mae: Array
-    constant_mae: Array
-    reward: Array
-    payout: Array
-    alive: Mask
-    payout_due: Mask
-    terminated: Mask
+    s: Array  # `[T, n, S]` states
+    mae: Array  # `[T, n]` mean |a − a*| over channels
+    constant_mae: Array  # `[T, n]` the same of the constant ½
+    reward: Array  # `[T, n]` step reward r
+    payout: Array  # `[T, n]` payout R
+    alive: Mask  # `[T, n]` whether the episode was still running
+    payout_due: Mask  # `[T, n]` whether a payout was due after the step
+    terminated: Mask  # `[n]` whether D terminated the episode
 
     def mean(self, values: Array | Mask) -> float:
         """Over all steps of all episodes."""
@@ -69,13 +58,7 @@ class Trajectories(NamedTuple):
 
 
 def rollout(act: Callable[[Observation], Array], task: Task, initial_states: Array) -> Trajectories:
-    """Whole episodes of a policy.
-
-    Args:
-      act: from observations `[n, S + 2]` float32 to actions `[n, A]` of the unit range.
-      task: the task.
-      initial_states: `[n, S]`.
-    """
+    """Whole episodes of a policy in the unit range, from initial states `[n, S]`."""
     n = len(initial_states)
     batch = Batch(task, n)
     observation = batch.observe()
@@ -184,17 +167,17 @@ def _coverage(values: Array) -> float:
     return float(len(np.unique(bins)) / _COVERAGE_BINS)
 
 
-def training(log: Log, constant_regret: float) -> Training:
-    """Summarise a training log.
+def running_median(log: Log, window: int) -> tuple[Array, Array]:
+    """`[N − window + 1]` steps at the end of each window of rows, and the median regrets in it."""
+    windows = np.lib.stride_tricks.sliding_window_view(log.regret, window)
+    return log.step[window - 1 :], np.median(windows, axis=1)
 
-    Args:
-      log: at least one row.
-      constant_regret: of the better constant policy.
-    """
+
+def training(log: Log, constant_regret: float) -> Training:
+    """Summarise a training log of one or more rows, next to the regret of a constant policy."""
     rows = len(log.regret)
     window = max(1, min(50, rows // 10))
-    median = np.array([np.median(log.regret[i : i + window]) for i in range(rows - window + 1)])
-    steps = log.step[window - 1 :]
+    steps, median = running_median(log, window)
     improved = np.flatnonzero(median < constant_regret - _MARGIN)
     recent = median[-max(1, len(median) // 3) :]
     best = int(np.argmin(median))

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import JsonValue
 
+from sme_registry.diagnosis import networks
 from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, load_sb3
@@ -33,44 +34,28 @@ _MIN_DIGITS = 6
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """The regret of a training over its steps, `[N]` each.
-
-    Attributes:
-      source: "episodes" or "evaluations".
-      step: environment steps.
-      regret: mean regret of an episode, or of an evaluation.
-      unrewarded: which episodes had no reward at all; None for evaluations.
-      terminated: which episodes D terminated; None for evaluations.
-    """
+    """The regret of a training over its steps, `[N]` each; None in a log of evaluations."""
 
     source: Literal["episodes", "evaluations"]
-    step: Array
-    regret: Array
-    unrewarded: Array | None = None
-    terminated: Array | None = None
+    step: Array  # environment steps
+    regret: Array  # mean regret of an episode, or of an evaluation
+    unrewarded: Array | None = None  # which episodes had no reward at all
+    terminated: Array | None = None  # which episodes D terminated
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A policy and what is known about its training.
+    """A policy and what is known about its training."""
 
-    Attributes:
-      name: of the run or policy.
-      spec: the task, for a single agent.
-      policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, unclipped.
-      plan: algorithm, seed, steps and so on; empty for a policy without a run.
-      log: of its training; None if there is none.
-      explore: the algorithm's stochastic actions at observations; None if unknown.
-      checkpoint_step: of an unfinished run, the steps done at its checkpoint; None otherwise.
-    """
-
-    name: str
-    spec: SMESpec
-    policy: Policy
-    plan: dict[str, JsonValue]
+    name: str  # of the run or policy
+    spec: SMESpec  # of a single agent
+    policy: (
+        Policy  # from observations `[B, S + 2]` to actions `[B, A]` in the unit range, unclipped
+    )
+    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
     log: Log | None = None
-    explore: Callable[[Observation], Any] | None = None
-    checkpoint_step: int | None = None
+    explore: Callable[[Observation], Any] | None = None  # the algorithm's stochastic actions
+    checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
 
 
 def load_policy(
@@ -86,7 +71,7 @@ def load_policy(
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         policy, name = load_sb3(policy), name or Path(policy).stem
     act = numpy_policy(policy, spec, action_range=action_range)
-    return Subject(name or act.name, spec, act, {}, explore=_exploration(policy, act))
+    return Subject(name or act.name, spec, act, {}, explore=networks.exploration(policy, act))
 
 
 def load_run(folder: str | Path) -> Subject:
@@ -98,7 +83,14 @@ def load_run(folder: str | Path) -> Subject:
       PolicyError, MissingDependencyError: its model cannot be loaded.
     """
     folder = Path(folder)
-    record = _run_record(folder)
+    if not folder.is_dir():
+        raise OptionError(f"run={str(folder)!r}: no such folder. Give a folder of `sme train`.")
+    record = RunRecord.read(folder)
+    if record is None:
+        advice = "Give a folder of `sme train`."
+        if (folder / "cells").is_dir():
+            advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
+        raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
     _require_single_agent(record.spec)
     path, checkpoint_step = folder / MODEL, None
     if not path.exists():
@@ -117,21 +109,9 @@ def load_run(folder: str | Path) -> Subject:
         policy,
         {field: getattr(record, field) for field in fields},
         _episode_log(folder / episode_files.FILE),
-        _exploration(model, policy),
+        networks.exploration(model, policy),
         checkpoint_step,
     )
-
-
-def _run_record(folder: Path) -> RunRecord:
-    if not folder.is_dir():
-        raise OptionError(f"run={str(folder)!r}: no such folder. Give a folder of `sme train`.")
-    record = RunRecord.read(folder)
-    if record is None:
-        advice = "Give a folder of `sme train`."
-        if (folder / "cells").is_dir():
-            advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
-        raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
-    return record
 
 
 def load_cell(study: str | Path, key: str) -> Subject:
@@ -154,15 +134,10 @@ def load_cell(study: str | Path, key: str) -> Subject:
     policy = numpy_policy(
         model, cell.spec, action_range=None if callable(model) else cell.action_range
     )
-    plan: dict[str, JsonValue] = {
-        "algorithm": cell.uses,
-        "hyperparameters": cell.hyperparameters,
-        "seed": cell.seed,
-        "action_range": cell.action_range,
-        "steps": cell.steps,
-    }
+    fields = ("hyperparameters", "seed", "action_range", "steps")
+    plan = {"algorithm": cell.uses, **{field: getattr(cell, field) for field in fields}}
     name = f"{cell.uses}, cell {path.stem[:12]}"
-    return Subject(name, cell.spec, policy, plan, log, _exploration(model, policy))
+    return Subject(name, cell.spec, policy, plan, log, networks.exploration(model, policy))
 
 
 def _cell_path(study: Path, key: str) -> Path:
@@ -230,11 +205,3 @@ def _episode_log(path: Path) -> Log | None:
         return None
     step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T
     return Log("episodes", step, regret, (regret >= 1.0).astype(float), ended)
-
-
-def _exploration(model: Any, policy: Policy) -> Callable[[Observation], Any] | None:
-    if not hasattr(model, "predict") or not hasattr(model, "get_env"):
-        return None
-    from sme_registry.diagnosis.networks import exploration
-
-    return exploration(model, policy)
