@@ -73,7 +73,7 @@ def _reference(axes: Axes, value: float, name: str) -> None:
 def _legend(axes: Axes, *, from_zero: bool = True, **options: Any) -> None:
     """A legend in free space above what is drawn."""
     low, high = axes.get_ylim()
-    axes.set_ylim(min(0.0, low) if from_zero else low, high * 1.4)
+    axes.set_ylim(min(0.0, low) if from_zero else low, high * 1.45)
     axes.legend(loc="upper left", fontsize=8, **options)
 
 

@@ -70,12 +70,12 @@ def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
     yield f"[bold]{escape(title(diagnosis))}[/]"
     yield escape(headline(diagnosis))
     yield ""
-    for kind, heading in _HEADINGS.items():
+    for heading, rows in _rows(diagnosis).items():
         table = Table(title=heading, title_justify="left", show_header=False, box=None)
         table.add_column(style="cyan", no_wrap=True, min_width=19)
         table.add_column(no_wrap=True, min_width=11)
         table.add_column(overflow="fold")
-        for question, answer, text in _rows(diagnosis, kind):
+        for question, answer, text in rows:
             table.add_row(question, f"[{_COLOURS[answer]}]{answer}[/]", escape(text))
         yield table
     if diagnosis.comparison is not None:
@@ -102,7 +102,7 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
             measured=diagnosis.measurements,
             title=title(diagnosis),
             headline=headline(diagnosis),
-            verdicts={heading: list(_rows(diagnosis, kind)) for kind, heading in _HEADINGS.items()},
+            verdicts=_rows(diagnosis),
             comparison_title=comparison and _words("comparison", comparison),
             policies={POLICY: "**this policy**", **LABELS},
             figures=figures,
@@ -110,7 +110,11 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
     )
 
 
-def _rows(diagnosis: Diagnosis, kind: str) -> Iterator[tuple[str, str, str]]:
-    for verdict in diagnosis.verdicts:
-        if verdict.kind == kind:
-            yield label(verdict.question), verdict.answer, sentence(verdict)
+def _rows(diagnosis: Diagnosis) -> dict[str, list[tuple[str, str, str]]]:
+    """The question, answer and sentence of each verdict, by heading."""
+    return {
+        heading: [
+            (label(v.question), v.answer, sentence(v)) for v in diagnosis.verdicts if v.kind == kind
+        ]
+        for kind, heading in _HEADINGS.items()
+    }

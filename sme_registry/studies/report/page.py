@@ -12,7 +12,6 @@ import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -47,15 +46,7 @@ def page(
     absent: Sequence[str],
     tables: Sequence[TextTable],
 ) -> str:
-    """The whole page.
-
-    Args:
-      analysis: the study's tables.
-      findings: the study's findings.
-      figures: with their SVG.
-      absent: a sentence for each figure that could not be drawn.
-      tables: those to show.
-    """
+    """The whole page; `absent` has a sentence for each figure that could not be drawn."""
     folder = Path(__file__).parent
     templates = environment(folder / "templates", autoescape=True)
     templates.filters |= {
@@ -86,14 +77,9 @@ def page(
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
         absent=absent,
         origin=_origin(analysis),
-        missing=[_missing(row) for row in analysis.missing.itertuples()],
+        missing=list(analysis.missing.itertuples()),
         max_missing=_MAX_MISSING,
     )
-
-
-def _missing(row: Any) -> str:
-    place = f"{row.algorithm} on {row.class_name}, run {row.run}"
-    return f"{place}: failed: {row.error}" if row.error else place
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
