@@ -1,4 +1,4 @@
-"""The conformance kit sees faults: each check turns red at an environment that earns it."""
+"""The conformance kit detects faults: each check fails for an environment that has its fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The conformance kit of teams sees faults: each check turns red at a team that earns it."""
+"""The conformance kit of teams detects faults: each check fails for a team that has its fault."""
 
 from __future__ import annotations
 
@@ -100,12 +100,12 @@ class NewSpaces(SMETeamEnv):
 class RewardsInTurn(SMETeamEnv):
     """In turns, a second environment would be seen: each is paid by the number of its instance."""
 
-    made = 0
+    instances = 0
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        RewardsInTurn.made += 1
-        self.number = RewardsInTurn.made
+        RewardsInTurn.instances += 1
+        self.number = RewardsInTurn.instances
 
     def step(self, actions: Any) -> Any:
         observations, rewards, *rest = super().step(actions)
@@ -135,7 +135,7 @@ def test_a_faulty_team_is_seen(check: Any, faulty: type[SMETeamEnv], words: str)
 
 
 def test_pettingzoos_parallel_seed_test_passes_a_team_that_is_random_from_step_two_on() -> None:
-    # Why there is a check of whole episodes beside it.
+    # This is why the kit also checks whole episodes.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from pettingzoo.test import parallel_seed_test

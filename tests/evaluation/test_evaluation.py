@@ -155,16 +155,19 @@ def test_progress_runs_from_the_first_batch_to_all_states(monkeypatch):
     assert seen == [(done, 18_000) for done in range(1_000, 18_001, 1_000)]
 
 
-def test_memory_does_not_grow_with_the_number_of_states(monkeypatch):
+@pytest.mark.parametrize("team", [None, {"agents": [{"action_dim": 3}] * 2}])
+def test_memory_does_not_grow_with_the_number_of_states(monkeypatch, team):
     import tracemalloc
+
+    spec = SPEC if team is None else SPEC.derive(action_dim=6, team=team)
 
     def peak(states):
         protocol = EvaluationProtocol(states_per_region=states, epsilons=(0.5,))
         tracemalloc.start()
-        evaluate(half, SPEC, protocol)
-        found = tracemalloc.get_traced_memory()[1]
+        evaluate(half, spec, protocol)
+        most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return found
+        return most
 
     monkeypatch.setattr(regions, "BATCH_ROWS", 500)
     monkeypatch.setattr(references, "FIT_STATES", 500)
@@ -172,10 +175,10 @@ def test_memory_does_not_grow_with_the_number_of_states(monkeypatch):
     assert peak(20_000) < 1.1 * peak(2_000)
 
 
-@pytest.mark.parametrize("given", ["quick-v1", "quick", "specs/protocols/quick-v1.json"])
-def test_a_protocol_goes_by_its_name_or_its_path(given):
+@pytest.mark.parametrize("protocol", ["quick-v1", "quick", "specs/protocols/quick-v1.json"])
+def test_a_protocol_goes_by_its_name_or_its_path(protocol):
     quick = ProtocolFile.read("specs/protocols/quick-v1.json").protocol
-    assert evaluate(half, SPEC, given).protocol == quick
+    assert evaluate(half, SPEC, protocol).protocol == quick
 
 
 def test_the_default_protocol_is_the_papers():
@@ -194,7 +197,7 @@ def test_an_unknown_protocol_is_refused_with_the_nearest_name():
 
 
 def test_a_report_survives_being_written_and_read(report, tmp_path):
-    path = report.write(tmp_path / "made" / "report.json")
+    path = report.write(tmp_path / "new" / "report.json")
     again = EvaluationReport.read(path)
     assert again == report
     assert again.to_dict() == report.to_dict()

@@ -37,9 +37,9 @@ def test_it_answers_as_the_network_it_was_taken_from() -> None:
     observations = np.random.default_rng(0).random((50, 4), dtype=np.float32)
     with torch.no_grad():
         expected = (1 + torch.tanh(network(torch.from_numpy(observations)))) / 2
-    found = OfflinePolicy(weights(network))(observations)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    actions = OfflinePolicy(weights(network))(observations)
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
 def test_a_saved_policy_is_read_again_to_the_bit(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_the_files_of_these_tests_are_read_where_nothing_is_wrong(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (lambda: b"", "not a policy"),
         (lambda: b"PK\x03\x04 cut", "not a policy"),
@@ -99,11 +99,11 @@ def test_the_files_of_these_tests_are_read_where_nothing_is_wrong(tmp_path: Path
     ids=["empty", "no zip", "cut", "unsaid", "other", "gap", "shapes", "type", "nan", "pickle"],
 )
 def test_what_is_no_policy_is_refused(
-    tmp_path: Path, content: Callable[[], bytes], said: str
+    tmp_path: Path, content: Callable[[], bytes], message: str
 ) -> None:
     path = tmp_path / "policy.npz"
     path.write_bytes(content())
-    with pytest.raises(PolicyError, match=said):
+    with pytest.raises(PolicyError, match=message):
         OfflinePolicy.load(path)
 
 

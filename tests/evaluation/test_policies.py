@@ -309,7 +309,7 @@ def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_rang
 
 
 @pytest.mark.parametrize(
-    ("made", "message"),
+    ("changes", "message"),
     [
         ({"o": 4}, r"its inputs are o tensor\(float\) \['batch', 4\]: must be .* \[batch, 5\]"),
         ({"a": 3}, r"its outputs are a tensor\(float\) \['batch', 3\]: must be .* \[batch, 2\]"),
@@ -319,8 +319,8 @@ def test_an_onnx_file_scores_as_its_network_in_numpy(onnx, tmp_path, action_rang
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_an_onnx_file_that_does_not_fit_is_refused(onnx, tmp_path, made, message):
-    network(onnx, tmp_path / "actor.onnx", **made)
+def test_an_onnx_file_that_does_not_fit_is_refused(onnx, tmp_path, changes, message):
+    network(onnx, tmp_path / "actor.onnx", **changes)
     with pytest.raises(PolicyError, match=message):
         evaluated(tmp_path / "actor.onnx")
 

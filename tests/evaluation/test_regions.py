@@ -92,8 +92,8 @@ def test_shell_states_are_distributed_as_by_rejection(state_dim):
     s = states(2, state_dim)
     directions = np.vstack([np.eye(state_dim), np.ones(state_dim), np.arange(state_dim) - 0.7])
     for direction in directions:
-        found = stats.ks_2samp(s @ direction, rejected @ direction)
-        assert found.pvalue > SIGNIFICANCE
+        test = stats.ks_2samp(s @ direction, rejected @ direction)
+        assert test.pvalue > SIGNIFICANCE
     smaller, of_rejected = (np.sort(np.abs(x - 0.5), axis=1)[:, 0] for x in (s, rejected))
     assert stats.ks_2samp(smaller, of_rejected).pvalue > SIGNIFICANCE
 

@@ -83,8 +83,8 @@ def test_every_agent_attains_its_optimum_from_what_it_observes(monkeypatch, back
     monkeypatch.setenv("SME_BACKEND", backend)
     spec = SPEC.derive(complexity=complexity)
     monkeypatch.setitem(globals(), "TASK", materialize(spec))
-    found = evaluate({name: optimal(i) for i, name in enumerate(NAMES)}, spec, PROTOCOL)
-    for scope in (found, *found.agents.values()):
+    result = evaluate({name: optimal(i) for i, name in enumerate(NAMES)}, spec, PROTOCOL)
+    for scope in (result, *result.agents.values()):
         for region in scope.regions:
             assert region.normalised_regret == pytest.approx(0.0, abs=1e-9)
             assert region.similarity == pytest.approx(1.0, abs=1e-9)
@@ -93,8 +93,8 @@ def test_every_agent_attains_its_optimum_from_what_it_observes(monkeypatch, back
 @pytest.mark.parametrize("policy", [{n: half(a) for n, a in zip(NAMES, (1, 3, 2), strict=True)},
                                     half(3)], ids=["separate", "shared"])  # fmt: skip
 def test_constant_half_has_normalised_regret_of_exactly_1_for_every_agent(policy):
-    found = evaluate(policy, SPEC, PROTOCOL)
-    for scope in (found, *found.agents.values()):
+    result = evaluate(policy, SPEC, PROTOCOL)
+    for scope in (result, *result.agents.values()):
         for region in scope.regions:
             assert region.normalised_regret == 1.0
             assert {channel.normalised_regret for channel in region.channels} == {1.0}
@@ -177,10 +177,10 @@ def test_a_team_of_one_has_the_numbers_of_its_single_agent_task(complexity):
         return observations[:, :3] ** 2 * 1.1
 
     alone = evaluate(policy, single, PROTOCOL)
-    for given in ({"agent_0": policy}, policy):
-        found = evaluate(given, team, PROTOCOL)
-        assert list(numbers(found)) == list(numbers(alone))
-        assert list(numbers(found.agents["agent_0"])) == list(numbers(alone))
+    for policies in ({"agent_0": policy}, policy):
+        result = evaluate(policies, team, PROTOCOL)
+        assert list(numbers(result)) == list(numbers(alone))
+        assert list(numbers(result.agents["agent_0"])) == list(numbers(alone))
 
 
 def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report():
@@ -195,8 +195,8 @@ def test_reference_policies_by_name_act_for_teams_as_the_references_of_a_report(
         ("random", "uniform_random", 0.3),
     ):
         for agent in inside(name).values():
-            found, expected = agent.regions[0], agent.references[same][0]
-            assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
+            region, expected = agent.regions[0], agent.references[same][0]
+            assert region.normalised_regret == pytest.approx(expected.normalised_regret, abs=near)
 
 
 def test_agents_of_a_team_may_have_policies_by_name():
@@ -269,34 +269,17 @@ def test_the_oracle_answers_once_for_each_state_however_many_agents(monkeypatch)
     asked = []
 
     def counting(task):
-        made = engine(task)
+        original = engine(task)
 
         def counted(s):
             asked.append(len(s))
-            return made.optimal_action(s)
+            return original.optimal_action(s)
 
-        return dataclasses.replace(made, optimal_action=counted)
+        return dataclasses.replace(original, optimal_action=counted)
 
     monkeypatch.setattr(import_module("sme_registry.evaluation.evaluate"), "engine", counting)
     evaluate(half(3), SPEC, SMALL)
     assert sum(asked) == 2 * 200
-
-
-def test_memory_does_not_grow_with_the_number_of_states(monkeypatch):
-    import tracemalloc
-
-    def peak(states):
-        protocol = EvaluationProtocol(states_per_region=states, epsilons=(0.5,))
-        tracemalloc.start()
-        evaluate(half(3), SPEC, protocol)
-        found = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return found
-
-    monkeypatch.setattr(regions, "BATCH_ROWS", 500)
-    monkeypatch.setattr(references, "FIT_STATES", 500)
-    peak(2_000)  # what is allocated once
-    assert peak(20_000) < 1.1 * peak(2_000)
 
 
 def test_a_batch_of_a_large_team_is_kept_small():
@@ -306,8 +289,8 @@ def test_a_batch_of_a_large_team_is_kept_small():
 
 
 def with_(**changed):
-    given = {**SLANTED, **changed}
-    return {name: policy for name, policy in given.items() if policy != "left out"}
+    policies = {**SLANTED, **changed}
+    return {name: policy for name, policy in policies.items() if policy != "left out"}
 
 
 @pytest.mark.parametrize(
@@ -348,9 +331,9 @@ def test_policies_are_named_alike_or_counted():
 
 def test_symmetric_actions_of_all_agents_are_rescaled(report):
     doubled = {name: (lambda o, act=act: 2.0 * act(o) - 1.0) for name, act in SLANTED.items()}
-    found = evaluate(doubled, SPEC, PROTOCOL, action_range="symmetric")
-    assert found.action_range == "symmetric"
-    assert all_numbers(found) == pytest.approx(all_numbers(report), abs=1e-6)
+    result = evaluate(doubled, SPEC, PROTOCOL, action_range="symmetric")
+    assert result.action_range == "symmetric"
+    assert all_numbers(result) == pytest.approx(all_numbers(report), abs=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -379,20 +362,20 @@ def test_a_shared_model_scores_as_its_file(sb3, tmp_path):
 
 
 def test_models_of_each_agents_own_are_taken_with_their_own_action_ranges(sb3):
-    given = {
+    policies = {
         "left_0": model(sb3, 4, 1, low=-1.0),
         "right_0": model(sb3, 5, 3),
         "right_1": half(2),
     }
-    found = evaluate(given, SPEC, SMALL)
-    assert found.action_range == "mixed"
+    result = evaluate(policies, SPEC, SMALL)
+    assert result.action_range == "mixed"
 
     def predicted(observations):
-        action = given["left_0"].predict(observations, deterministic=True)[0]
+        action = policies["left_0"].predict(observations, deterministic=True)[0]
         return (action.astype(np.float64) + 1.0) / 2.0
 
-    again = evaluate({**given, "left_0": predicted}, SPEC, SMALL)
-    mine, theirs = found.agents["left_0"].regions, again.agents["left_0"].regions
+    again = evaluate({**policies, "left_0": predicted}, SPEC, SMALL)
+    mine, theirs = result.agents["left_0"].regions, again.agents["left_0"].regions
     assert [r.mae for r in mine] == pytest.approx([r.mae for r in theirs], abs=1e-6)
 
 
