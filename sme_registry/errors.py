@@ -87,16 +87,7 @@ class MissingDependencyError(SMEError, ImportError):
 
 
 def near_misses(name: str, known: Iterable[str], count: int = 3) -> list[str]:
-    """The known names most similar to a mistyped one, best first; case is ignored.
-
-    Args:
-      name: the mistyped name.
-      known: the names that exist.
-      count: the largest number of names to return.
-
-    Returns:
-      Up to `count` names; empty if none is similar.
-    """
+    """Up to `count` known names similar to a mistyped one, best first; case is ignored."""
     by_fold = {candidate.casefold(): candidate for candidate in known}
     close = difflib.get_close_matches(name.casefold(), by_fold, n=count, cutoff=0.6)
     return [by_fold[fold] for fold in close]

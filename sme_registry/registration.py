@@ -19,26 +19,20 @@ if TYPE_CHECKING:
     from sme_registry.envs.team import SMETeamEnv
     from sme_registry.spec import SMESpec, SpecLike
 
-_ENTRY_POINT = "sme_registry.envs:SMEEnv"
-_VECTOR_ENTRY_POINT = "sme_registry.envs:SMEVectorEnv"
-_TEAM_ENTRY_POINTS = {
-    "parallel": "sme_registry.teams:parallel_env",
-    "aec": "sme_registry.teams:env",
+_ENTRY_POINTS: dict[str, Any] = {
+    "entry_point": "sme_registry.envs:SMEEnv",
+    "vector_entry_point": "sme_registry.envs:SMEVectorEnv",
 }
 
 
 def _register(env_id: str, spec: dict[str, Any] | str, team: bool) -> None:
     """Register an id with Gymnasium or, for a team, with PettingZoo."""
+    kwargs = {"spec": spec}
     if team:
-        for kind, entry_point in _TEAM_ENTRY_POINTS.items():
-            pettingzoo.register(kind, env_id, entry_point, kwargs={"spec": spec})
-        return
-    gymnasium.register(
-        env_id,
-        entry_point=_ENTRY_POINT,
-        vector_entry_point=_VECTOR_ENTRY_POINT,
-        kwargs={"spec": spec},
-    )
+        pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
+        pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
+    else:
+        gymnasium.register(env_id, **_ENTRY_POINTS, kwargs=kwargs)
 
 
 def _is_registered(env_id: str) -> bool:
@@ -100,7 +94,7 @@ def register(spec: SMESpec, name: str) -> str:
 
 
 def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec:
-    """The spec of an id, a file's path, or a digest; see `sme_registry.spec.resolve.resolve`.
+    """The spec of an id, a file's path, or a digest.
 
     The task of a file is drawn here, to check that this machine draws its published numbers.
 
@@ -183,12 +177,8 @@ def env_spec(spec: SpecLike, **kwargs: Any) -> EnvSpec:
 
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
     derived = load_spec(spec).derive(**overrides)
-    return EnvSpec(
-        id=content_id(derived),
-        entry_point=_ENTRY_POINT,
-        vector_entry_point=_VECTOR_ENTRY_POINT,
-        kwargs={"spec": derived.to_dict(), **kwargs},
-    )
+    kwargs = {"spec": derived.to_dict(), **kwargs}
+    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS, kwargs=kwargs)
 
 
 def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:

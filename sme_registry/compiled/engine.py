@@ -7,7 +7,6 @@ are bit-equal between them; oracle and rewards agree to 1e-12.
 from __future__ import annotations
 
 import functools
-import importlib.util
 import os
 import weakref
 from collections.abc import Callable
@@ -25,7 +24,8 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
-from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.errors import MissingDependencyError
+from sme_registry.io import choice, is_installed
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array
 
@@ -84,9 +84,8 @@ def chosen_backend() -> Backend:
       MissingDependencyError: it asks for Numba, which is not installed.
     """
     asked = os.environ.get(BACKEND_VARIABLE, "auto")
-    if asked not in ("auto", "numba", "numpy"):
-        raise OptionError(f"{BACKEND_VARIABLE}={asked!r}: must be 'auto', 'numba' or 'numpy'.")
-    installed = importlib.util.find_spec("numba") is not None
+    choice(BACKEND_VARIABLE, asked, ("auto", "numba", "numpy"))
+    installed = is_installed("numba")
     if asked == "numba" and not installed:
         raise MissingDependencyError(
             f"{BACKEND_VARIABLE}='numba': Numba is not installed. "

@@ -21,11 +21,7 @@ from sme_registry.task import Task
 
 
 def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.Box, bool]:
-    """The action space `[A]` of a range, and whether its actions must be rescaled.
-
-    Raises:
-      OptionError: not "unit" or "symmetric".
-    """
+    """The action space `[A]` of a range, and whether its actions must be rescaled."""
     choice("action_range", action_range, ACTION_RANGES)
     low = 0.0 if action_range == "unit" else -1.0
     return gymnasium.spaces.Box(low, 1.0, (action_dim,), np.float32), low < 0.0
@@ -72,21 +68,13 @@ def not_finite_error() -> ActionError:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """A seed of an environment's generator: None, or an integer of at least 0.
-
-    Raises:
-      OptionError: neither.
-    """
+    """A seed of an environment's generator: None, or an integer of at least 0."""
     advice = "Leave it out to continue the generator's stream."
     return None if seed is None else integer_in("seed", seed, 0, advice=advice)
 
 
 def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
-    """Raise on an option that does not exist.
-
-    Raises:
-      OptionError: names the option and the nearest known one.
-    """
+    """Raise OptionError on an option that does not exist, with the nearest known one."""
     for name in options or {}:
         if name not in known:
             raise OptionError(
@@ -96,11 +84,7 @@ def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...
 
 
 def initial_states(state: Any, shape: tuple[int, ...]) -> Array:
-    """States at which episodes begin, as float64 of `shape`, each entry in [0, 1].
-
-    Raises:
-      StateError: not numbers, of another shape, or outside the cube.
-    """
+    """States at which episodes begin, as float64 of `shape`; StateError outside [0, 1]."""
     try:
         array = np.asarray(state, dtype=np.float64)
     except (TypeError, ValueError):
@@ -117,11 +101,7 @@ def initial_states(state: Any, shape: tuple[int, ...]) -> Array:
 
 
 def single_agent(task: Task) -> Task:
-    """The task, which must have a single agent.
-
-    Raises:
-      SpecError: it is for a team; the message says how to make that.
-    """
+    """The task; SpecError if it is for a team."""
     if len(task.policies) > 1:
         raise SpecError(
             f"team: this task is for {len(task.policies)} agents and Gymnasium's environments are "

@@ -68,7 +68,7 @@ class RenderMixin(TaskMixin):
             from sme_registry.envs.rendering import Renderer
 
             assert self.render_mode is not None
-            self._renderer = Renderer(self.sme_spec, self.render_mode, self.metadata)
+            self._renderer = Renderer(self._task, self.render_mode, self.metadata)
         self._renderer.record(env, last)
 
     def render(self) -> Any:
@@ -101,9 +101,6 @@ def refuse_short_time_limit(horizon: int) -> None:
     wrappers, which may be added at any time; but each calls the `reset` of the environment inside
     it, so the callers' frames up to the first that is no reset belong to the wrappers (and to
     Gymnasium's function that checks a first reset).
-
-    Raises:
-      WrapperError: says how to make the task itself shorter.
     """
     frame = sys._getframe(2)
     while frame is not None and "reset" in frame.f_code.co_name:
@@ -114,11 +111,7 @@ def refuse_short_time_limit(horizon: int) -> None:
 
 
 def check_time_limit(max_episode_steps: int, horizon: int) -> None:
-    """Raise on a time limit below the horizon.
-
-    Raises:
-      WrapperError: says how to make the task itself shorter.
-    """
+    """Raise WrapperError on a time limit below the horizon."""
     if max_episode_steps < horizon:
         raise WrapperError(
             f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "
@@ -137,10 +130,6 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
 
     `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
     from which it was derived.
-
-    Args:
-      env_spec: from which Gymnasium made the environment.
-      spec: the spec that is run.
     """
     if env_spec is None:
         return None

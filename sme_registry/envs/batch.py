@@ -143,12 +143,9 @@ class Batch:
         return observe(self.task.spec, self.state, self._t, self._accumulated.T)
 
     def begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
-        """Put lanes at the start of an episode, and write their observations.
+        """Put lanes at the start of an episode, and write their rows of `observation`.
 
-        Args:
-          lanes: indices of the lanes.
-          observation: `[B, S + 1 + n]`, written in the rows of these lanes.
-          states: `[len(lanes), S]` initial states; None draws from each lane's generator.
+        `states` are `[len(lanes), S]`; None draws from each lane's generator.
         """
         S = self.task.spec.state_dim
         if states is None:
@@ -162,10 +159,7 @@ class Batch:
     def place(self, states: Array, t: Lanes, accumulated: Array) -> None:
         """Put every lane at any point of an episode; `observe` gives the observations there.
 
-        Args:
-          states: `[B, S]` in [0, 1].
-          t: `[B]` steps completed, in [0, T).
-          accumulated: `[B, n]` each agent's r_cum.
+        States are `[B, S]`, completed steps t `[B]` in [0, T), and each agent's r_cum `[B, n]`.
         """
         self._s[:] = states.T
         self._t[:] = t

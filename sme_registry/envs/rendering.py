@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
+from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.io import require_packages
 from sme_registry.spec import SMESpec
+from sme_registry.task import Task
 
 if TYPE_CHECKING:
     import pygame
@@ -36,17 +38,12 @@ _OPTIMAL, _ACTION, _REGRET, _STATE = (0, 158, 115), (0, 114, 178), (213, 94, 0),
 
 
 def _import_pygame() -> Any:
-    try:
-        # With some versions of setuptools, importing pygame warns; the user cannot avoid that.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import pygame
-            import pygame.font
-    except ImportError:
-        raise MissingDependencyError(
-            "render_mode: pygame draws the frames and is not installed. "
-            "Run `pip install 'sme-registry[render]'`."
-        ) from None
+    require_packages("render_mode", {"pygame": "pygame"}, "render")
+    # With some versions of setuptools, importing pygame warns; the user cannot avoid that.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pygame
+        import pygame.font
     return pygame
 
 
@@ -54,7 +51,7 @@ class Renderer:
     """Draws the present episode. Recording is cheap; a frame is drawn on request.
 
     Args:
-      spec: the task.
+      task: the task.
       mode: "rgb_array" or "human" (a window, shown as each step is recorded).
       metadata: the environment's; `render_fps` paces the window.
 
@@ -62,9 +59,10 @@ class Renderer:
       MissingDependencyError: pygame is not installed.
     """
 
-    def __init__(self, spec: SMESpec, mode: str, metadata: dict[str, Any]) -> None:
+    def __init__(self, task: Task, mode: str, metadata: dict[str, Any]) -> None:
         self._pygame = _import_pygame()
-        self._spec, self._mode, self._fps = spec, mode, metadata["render_fps"]
+        self._spec, self._mode, self._fps = task.spec, mode, metadata["render_fps"]
+        self._owned = task.owned if task.spec.team else ()
         self._window: pygame.Surface | None = None
         self._begun = False
 
@@ -191,7 +189,7 @@ class Renderer:
         columns = _columns([0.0] * min(A, _CHANNELS_SHOWN), left, right)
         for x, width, _ in columns:
             self._rect(_TRACK, (x, bottom - height, width, height), 2)
-        for channels in _owned(self._spec):
+        for channels in self._owned:
             if owned := columns[channels]:
                 end = owned[-1][0] + owned[-1][1]
                 self._rect(_FAINT, (owned[0][0], bottom + 4, end - owned[0][0], 3))
@@ -286,12 +284,6 @@ def _title(spec: SMESpec) -> str:
     if spec.team is not None:
         parts.append(f"mean of {len(spec.team.agents)} agents")
     return "   ".join([*parts, spec.content_name])
-
-
-def _owned(spec: SMESpec) -> list[slice]:
-    """The action channels of each agent of a team; none to tell apart without one."""
-    ends = itertools.accumulate(agent.action_dim for agent in spec.team.agents) if spec.team else ()
-    return [slice(*ends) for ends in itertools.pairwise([0, *ends])]
 
 
 def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, int, float]]:

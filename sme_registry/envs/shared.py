@@ -31,14 +31,9 @@ def shared_action_dim(task: Task) -> int:
 
 
 def shared_observation(task: Task, joint: Observation) -> Observation:
-    """The shared observation of each agent.
+    """Each agent's shared observation, `[B, n, S + 2 + n]` float32, a fresh array.
 
-    Args:
-      task: the task; one without a team is a team of one.
-      joint: `[B, S + 1 + n]` float32 joint observations: s, t/T, and each agent's r_cum/k.
-
-    Returns:
-      `[B, n, S + 2 + n]` float32, a fresh array.
+    `joint` is `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
     """
     S, n = task.spec.state_dim, len(task.observed)
     shared = np.empty((len(joint), n, shared_observation_dim(task)), np.float32)
@@ -52,16 +47,9 @@ def shared_observation(task: Task, joint: Observation) -> Observation:
 def shared_observation_of(
     agent: int, agents: int, observed: Sequence[int], single: Observation
 ) -> Observation:
-    """The shared observation of one agent.
+    """The shared observation of one agent of `agents`, `[B, S + 2 + n]` float32, a fresh array.
 
-    Args:
-      agent: its index, in [0, n).
-      agents: n.
-      observed: the state channels that it observes.
-      single: `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
-
-    Returns:
-      `[B, S + 2 + n]` float32, a fresh array.
+    `single` is `[B, S + 2]` float32: s, t/T, and this agent's r_cum/k.
     """
     width = single.shape[1]
     visible = [*observed, width - 2, width - 1]

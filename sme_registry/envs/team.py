@@ -80,12 +80,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self.possible_agents = list(self._task.names)
         parts = [slice(*part) for part in pairwise([0, *ends])]
         self._observed_parts = list(zip(self.possible_agents, parts, strict=True))
-        self._parts = [
-            (agent, name, channels)
-            for agent, (name, channels) in enumerate(
-                zip(self.possible_agents, self._task.owned, strict=True)
-            )
-        ]
+        agents = range(len(self.possible_agents))
+        self._parts = list(zip(agents, self.possible_agents, self._task.owned, strict=True))
         self.agents: list[str] = []
         self._begun = False
 
@@ -253,16 +249,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             raise ActionError(f"{name}: {error}") from None
 
     def check_action(self, agent: str, action: npt.NDArray[Any]) -> None:
-        """Raise what `step` would raise for this action.
-
-        Args:
-          agent: whose action it is.
-          action: `[a_i]`, finite.
-
-        Raises:
-          ActionError: of the wrong shape, not numbers, or not finite.
-          OptionError: there is no such agent.
-        """
+        """Raise what `step` would raise for this action of an agent, `[a_i]`."""
         if not np.isfinite(self._checked(self._checked_agent(agent), action)).all():
             raise ActionError(f"{agent}: {arguments.not_finite_error()}")
 

@@ -147,11 +147,7 @@ class _Named(Protocol):
 
 
 def refuse_repeated_names(field: str, members: Sequence[_Named]) -> None:
-    """Raise where two members of a field have the same name.
-
-    Raises:
-      ValueError: for Pydantic, which reports it as an error of the document.
-    """
+    """Raise ValueError, which Pydantic reports, where two members have the same name."""
     names = [member.name for member in members]
     for name in names:
         if names.count(name) > 1:

@@ -32,17 +32,8 @@ class ResolvedSpec:
     spec: SMESpec
     fingerprint: Fingerprint | None = None
 
-    @classmethod
-    def of_file(cls, file: EnvFile) -> ResolvedSpec:
-        """A file's spec and fingerprint."""
-        return cls(file.spec, file.fingerprint)
-
     def derive(self, **overrides: Any) -> ResolvedSpec:
-        """The derived spec; it has no published numbers, unless nothing is overridden.
-
-        Raises:
-          SpecError: an unknown field, or a value outside its range.
-        """
+        """The derived spec; it has no published numbers, unless nothing is overridden."""
         return ResolvedSpec(self.spec.derive(**overrides)) if overrides else self
 
 
@@ -65,7 +56,7 @@ def resolve(task: SpecLike) -> ResolvedSpec:
         return ResolvedSpec(as_spec(task))
     name = str(task)
     if isinstance(task, os.PathLike) or is_path(name):
-        return ResolvedSpec.of_file(read_env_file(name))
+        return _of_file(read_env_file(name))
     short = name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
     full = f"{catalogue.NAMESPACE}/{short}"
     for env_id in registered:
@@ -74,7 +65,11 @@ def resolve(task: SpecLike) -> ResolvedSpec:
     if short.startswith(("sha256:", "sha256-")):
         return _by_content(short)
     registered_names = [env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered]
-    return ResolvedSpec.of_file(catalogue.find(EnvFile, short, registered_names))
+    return _of_file(catalogue.find(EnvFile, short, registered_names))
+
+
+def _of_file(file: EnvFile) -> ResolvedSpec:
+    return ResolvedSpec(file.spec, file.fingerprint)
 
 
 def is_path(name: str) -> bool:
@@ -95,11 +90,7 @@ def read_env_file(path: str | os.PathLike[str]) -> EnvFile:
 
 
 def refuse_bare_spec(data: Any, source: str) -> None:
-    """Raise where plain data is a spec alone, such as `SMESpec.model_dump_json` writes.
-
-    Raises:
-      MalformedDocumentError: says how to write the task's file.
-    """
+    """Raise MalformedDocumentError on a spec alone, such as `SMESpec.model_dump_json` writes."""
     if isinstance(data, dict) and data and data.keys() <= SMESpec.model_fields.keys():
         raise MalformedDocumentError(
             f"{source}: is a bare spec, without the digest and fingerprint of a task's file. "
@@ -111,7 +102,7 @@ def known_specs() -> dict[str, ResolvedSpec]:
     """Digest → spec: of the catalogue, of specs registered here, and of suites' instances."""
     known: dict[str, ResolvedSpec] = {}
     for file in catalogue.entries(EnvFile):
-        known.setdefault(file.digest, ResolvedSpec.of_file(file))
+        known.setdefault(file.digest, _of_file(file))
     for spec in registered.values():
         known.setdefault(spec.digest, ResolvedSpec(spec))
     for suite in catalogue.entries(SuiteFile):

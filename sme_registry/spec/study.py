@@ -7,7 +7,7 @@ class (modulo the number of instances); in the paper, too, a seed determines bot
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, JsonValue, model_validator
 
@@ -20,7 +20,7 @@ from sme_registry.spec.document import (
     refuse_repeated_names,
 )
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.sme_spec import Setting, SMESpec
+from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
 from sme_registry.spec.suite import SuiteClass
 
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
@@ -50,7 +50,7 @@ class StudyAlgorithm(StrictModel):
     name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
     uses: Annotated[str, Field(min_length=1, max_length=200)]
     hyperparameters: dict[str, JsonValue] = Field(default_factory=dict)
-    action_range: Literal["symmetric", "unit"] = "symmetric"
+    action_range: ActionRange = "symmetric"
     steps: Steps | None = None
 
 
@@ -65,7 +65,7 @@ class Cell(Document):
     spec: SMESpec
     uses: str
     hyperparameters: dict[str, JsonValue]
-    action_range: Literal["symmetric", "unit"]
+    action_range: ActionRange
     seed: Annotated[Integer, Field(ge=0, lt=2**32)]
     steps: Steps
     evaluations: Integer

@@ -11,7 +11,7 @@ import functools
 from typing import Any
 
 from sme_registry.spec import Fingerprint, SMESpec, SpecLike, as_spec
-from sme_registry.spec.resolve import ResolvedSpec, resolve
+from sme_registry.spec.resolve import resolve
 from sme_registry.task import draw, memory
 from sme_registry.task.fingerprint import check_fingerprint
 from sme_registry.task.task import Task
@@ -60,7 +60,8 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
       UnknownNameError, SpecError: no such task, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize`.
     """
-    return _materialize_resolved(resolve(task).derive(**overrides))
+    resolved = resolve(task).derive(**overrides)
+    return materialize(resolved.spec, resolved.fingerprint)
 
 
 def load_spec(task: SpecLike) -> SMESpec:
@@ -75,12 +76,8 @@ def load_spec(task: SpecLike) -> SMESpec:
     """
     resolved = resolve(task)
     if resolved.fingerprint is not None:
-        _materialize_resolved(resolved)
+        materialize(resolved.spec, resolved.fingerprint)
     return resolved.spec
-
-
-def _materialize_resolved(resolved: ResolvedSpec) -> Task:
-    return materialize(resolved.spec, resolved.fingerprint)
 
 
 def _draw(spec: SMESpec) -> Task:

@@ -44,11 +44,7 @@ def limit_bytes() -> int:
 
 
 def refuse_above_limit(needed: int, what: str, remedy: str) -> None:
-    """Raise if something needs more memory than the limit.
-
-    Raises:
-      ResourceLimitError: `needed` bytes exceed the limit; the message has both.
-    """
+    """Raise ResourceLimitError, with both sizes, if `needed` bytes exceed the limit."""
     limit = limit_bytes()
     if needed > limit:
         raise ResourceLimitError(

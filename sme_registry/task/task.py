@@ -9,7 +9,8 @@ Source: METHOD, section 1. Axis letters: `B` batch, `S` state_dim, `A` action_di
     r(s, a)  = r̂ if r̂ > r_min, else 0                   step reward; regret = 1 − r
 
 Every method takes one state `[S]` or a batch `[B, S]`, and returns one value or a batch. States may
-lie outside the unit cube. Actions are clipped to [0, 1], as the environment clips them.
+lie outside the unit cube. Actions are clipped to [0, 1], as the environment clips them. States of
+the wrong shape or not finite raise StateError, and such actions ActionError.
 """
 
 from __future__ import annotations
@@ -84,9 +85,6 @@ class Task:
 
         Returns:
           `[B, S]` or `[S]` next states in [0, 1].
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
         """
         s, a = self._pairs(s, a)
         y = s + self.b
@@ -102,35 +100,20 @@ class Task:
 
         Returns:
           `[B, A]` or `[A]` actions in [0, 1].
-
-        Raises:
-          StateError: wrong shape or not finite.
         """
         return self.policy(self._states(s))
 
     def similarity(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """r̃ = 1 − ‖a − π*(s)‖₁ / A, `[B]` or a scalar, in [0, 1]; exactly 1 at the optimum.
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
-        """
+        """r̃ = 1 − ‖a − π*(s)‖₁ / A, `[B]` or a scalar, in [0, 1]; exactly 1 at the optimum."""
         s, a = self._pairs(s, a)
         return self.similarity_of(a, self.policy(s))
 
     def step_reward(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """r, `[B]` or a scalar, in [0, 1]: the step reward after the threshold r_min.
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
-        """
+        """r, `[B]` or a scalar, in [0, 1]: the step reward after the threshold r_min."""
         return self.reward_of(self.similarity(s, a))
 
     def regret(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
-        """1 − r, `[B]` or a scalar, in [0, 1]: by how much the optimal step reward exceeds r.
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
-        """
+        """1 − r, `[B]` or a scalar, in [0, 1]: by how much the optimal step reward exceeds r."""
         return 1.0 - self.step_reward(s, a)
 
     def reward_of(self, similarity: npt.ArrayLike) -> Array:
@@ -145,10 +128,7 @@ class Task:
     def similarities_of(self, a: Array, optimal: Array) -> Array:
         """Each agent's r̃ over its own channels, `[..., n]` of actions `[..., A]`."""
         distance = np.abs(a - optimal)
-        means = [
-            distance[..., channels].sum(axis=-1) / (channels.stop - channels.start)
-            for channels in self.owned
-        ]
+        means = [distance[..., own].sum(axis=-1) / (own.stop - own.start) for own in self.owned]
         return 1.0 - np.stack(means, axis=-1)
 
     def regret_shares(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
@@ -157,16 +137,11 @@ class Task:
         regret · d_i / Σ_j d_j, with d_i the L1 distance of agent i's action from its optimal one.
         The team's 1 − r̃ is the sum of all d_i / A, so each is charged in proportion to its
         contribution. All are 0 at the optimum.
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
         distance = np.abs(a - optimal)
-        distances = np.stack(
-            [distance[..., channels].sum(axis=-1) for channels in self.owned], axis=-1
-        )
+        distances = np.stack([distance[..., own].sum(axis=-1) for own in self.owned], axis=-1)
         total = distances.sum(axis=-1, keepdims=True)
         shares = np.divide(distances, total, out=np.zeros_like(distances), where=total > 0)
         regret = 1.0 - self.reward_of(self.similarity_of(a, optimal))
@@ -177,9 +152,6 @@ class Task:
 
         The team's step reward with agent i's action replaced by its optimal one and all others as
         they are, minus the team's step reward as it is.
-
-        Raises:
-          StateError, ActionError: wrong shape or not finite.
         """
         s, a = self._pairs(s, a)
         optimal = self.policy(s)
