@@ -221,16 +221,13 @@ class SignedWithdrawal(StrictModel):
         Raises:
           Rejection: `too_large`, `not_json` or `schema`.
         """
-        plain = _parse(text, "withdrawal", "Shorten the reason.")
+        plain = _parse(text, "withdrawal", f"It has {len(text):,}. Shorten the reason.")
         return _validate(cls, plain, "withdrawal")
 
 
 def _parse(text: bytes, name: str, remedy: str) -> Any:
     if len(text) > MAX_BYTES:
-        raise Rejection(
-            "too_large",
-            f"{name}: {len(text):,} bytes: must be at most {MAX_BYTES:,} bytes. {remedy}",
-        )
+        raise Rejection("too_large", f"{name}: must be at most {MAX_BYTES:,} bytes. {remedy}")
     try:
         return parse_json(text, name)
     except MalformedDocumentError as error:
