@@ -63,6 +63,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
 for _panel, _commands in _COMMANDS.items():
     for _name, _command in _commands.items():
         app.command(_name, rich_help_panel=_panel)(_command)
+app.command("export", hidden=True)(submissions.export_sb3)  # the name that scripts rely on
 
 
 def main() -> None:

@@ -346,3 +346,11 @@ def test_a_demonstration_replaces_an_earlier_one_and_nothing_else(trained: Path)
         assert f"{Path(folder) / name}: already exists" in " ".join(message.split())
         assert "Nothing was removed" in message
         assert {path: path.stat().st_mtime_ns for path in Path().rglob("*")} == before
+
+
+@pytest.mark.parametrize("name", ["submit", "verify", "score", "rank", "serve", "export"])
+def test_commands_that_scripts_rely_on_exist(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        app([name, "--help"])
+    assert ended.value.code == 0
+    assert f"sme-leaderboard {name}" in capsys.readouterr().out
