@@ -163,7 +163,7 @@ class _BatchVecEnv(LanesVecEnv):
     ) -> None:
         self.num_teams, self.agents = integer_in("num_envs", num_envs, 1), task.names
         self._task, self._batch, self._action_dim = task, Batch(task, self.num_teams), action_dim
-        self._begun = np.zeros(self.num_teams, bool)
+        self._begun, self._owned = np.zeros(self.num_teams, bool), task.owned
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
         observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
         shared = {
@@ -247,7 +247,7 @@ class _BatchVecEnv(LanesVecEnv):
         )
         optimal = arguments.from_unit(done.optimal, self._rescaled)
         columns: dict[str, list[Any]] = {
-            "optimal_action": [row[part] for row in optimal for part in self._task.owned],
+            "optimal_action": [row[part] for row in optimal for part in self._owned],
             "similarity": similarity.tolist(),
             "step_reward": step_reward.tolist(),
             "regret": regret.tolist(),
