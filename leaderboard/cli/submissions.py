@@ -125,7 +125,7 @@ def new(
     folders = _expanded(runs)
     file = find_suite(suite)
     with Progress("exporting", max(1, len(folders)), console=err(), unit="runs") as progress:
-        made = make_bundle(
+        new_bundle = make_bundle(
             bundle,
             suite=file,
             key=SigningKey.read(key),
@@ -141,7 +141,7 @@ def new(
             force=force,
             progress=progress.update_of,
         )
-    out().print(f"{made.signed.id}\n{len(made.signed.submission.runs)} runs", soft_wrap=True)
+    out().print(f"{new_bundle.signed.id}\n{len(new_bundle.signed.submission.runs)} runs", soft_wrap=True)
     out().print(f"Next: sme-leaderboard check {escape(str(bundle))}", soft_wrap=True)
 
 

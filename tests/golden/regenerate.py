@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
         for name, digest in names.items():
             if found[kind].get(name) != digest:
                 print(f"{name}: released as {digest}, now {found[kind].get(name, 'missing')}.")
-                print("A released name never changes. Restore its file, or name it anew.")
+                print("A released name never changes. Restore its file or choose a new name.")
                 return 1
     write_atomically(path, json.dumps(found, indent=1) + "\n")
 

@@ -332,8 +332,8 @@ def test_a_plan_is_written_where_the_learners_are_not_installed(
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     result = sme("new", "n.json", "-t", "Default", "-a", "PPO", "-a", "TD3")
     assert result.exit_code == 0
-    told = "cannot run here: training: Stable-Baselines3 is not installed"
-    assert result.stderr.count(told) == 1
+    note = "cannot run here: training: Stable-Baselines3 is not installed"
+    assert result.stderr.count(note) == 1
     assert [one.uses for one in StudyFile.read("n.json").plan.algorithms] == ["PPO", "TD3"]
 
 
@@ -368,8 +368,8 @@ class TestEdited:
         file = StudyFile.read("new.json")
         assert file.plan == plan
         assert file.plan.algorithms[0].hyperparameters == {"n_steps": 64}
-        told = ("new", "") if form == "bare" else ("small", "For tests.")
-        assert (file.name, file.description) == told
+        expected = ("new", "") if form == "bare" else ("small", "For tests.")
+        assert (file.name, file.description) == expected
         assert json.loads(good("plan", "new.json", "--json"))["digest"] == plan.digest
 
     def test_it_may_take_a_name_and_the_place_of_what_was_edited(self) -> None:
