@@ -141,7 +141,8 @@ def new(
             force=force,
             progress=progress.update_of,
         )
-    out().print(f"{new_bundle.signed.id}\n{len(new_bundle.signed.submission.runs)} runs", soft_wrap=True)
+    runs_listed = len(new_bundle.signed.submission.runs)
+    out().print(f"{new_bundle.signed.id}\n{runs_listed} runs", soft_wrap=True)
     out().print(f"Next: sme-leaderboard check {escape(str(bundle))}", soft_wrap=True)
 
 
