@@ -89,7 +89,7 @@ def register(spec: SMESpec, name: str) -> str:
             "name: a released id never changes its numbers."
         )
     _register(env_id, spec.to_dict(), spec.team is not None)
-    registered[env_id] = spec
+    registered[env_id] = spec.named(env_id)
     return env_id
 
 

@@ -262,7 +262,7 @@ def _print(dataset: Dataset, json: bool) -> None:
         return
     record, recipe = dataset.record, dataset.recipe
     pairs: dict[str, object] = {
-        "task": f"{catalogue.title(recipe.spec)}  {record.spec_digest}",
+        "task": f"{catalogue.title(recipe.spec.named(record.task))}  {record.spec_digest}",
         "transitions": f"{recipe.transitions:,} in {record.trajectories:,} trajectories",
         "states": "all" if recipe.coverage is None else f"E(s) ≤ {recipe.coverage:g}",
         "seeds": f"task {record.seeds.task}, data {record.seeds.data}",

@@ -153,8 +153,8 @@ def _env_id(spec: SMESpec) -> str:
     """The environment's id: its released name, or its name by content."""
     from sme_registry.envs.base import content_id
 
-    title = catalogue.title(spec)
-    return content_id(spec) if title.endswith(spec.content_name) else title
+    name = catalogue.unique_name(spec)
+    return content_id(spec) if name == spec.content_name else f"{catalogue.NAMESPACE}/{name}"
 
 
 def _spaces(spec: SMESpec) -> dict[str, str]:

@@ -136,7 +136,8 @@ def _classes(suite: str | None, tasks: Sequence[str]) -> list[dict[str, Any]]:
         setting = spec.to_dict()
         seed = setting.pop("seed")
         title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
-        classes.append({"name": title, "setting": setting, "seeds": [seed]})
+        name = title.replace(" (", "-").removesuffix(")")  # as a document's name
+        classes.append({"name": name, "setting": setting, "seeds": [seed]})
     if not classes:
         raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
     return classes

@@ -107,6 +107,7 @@ def make_dataset(
         recipe=recipe,
         recipe_digest=recipe.digest,
         spec_digest=recipe.spec.digest,
+        task=recipe.spec.name,
         protocol_digest=recipe.protocol.digest,
         seeds=Seeds(task=recipe.spec.seed, data=recipe.seed),
         nu=behaviours[0].nu if len(behaviours) == 1 else None,
@@ -120,7 +121,7 @@ def make_dataset(
 
 def default_id(recipe: DatasetRecipe) -> str:
     """`sme/Default-v1-nu50-side80-seed7-v0`: task, behaviour, the sub-cube's side, data seed."""
-    title = catalogue.title(recipe.spec).rpartition("/")[2]
+    title = catalogue.unique_name(recipe.spec)
     behaviour = recipe.behaviours[0]
     if len(recipe.behaviours) > 1:
         acting = f"mix-{recipe.digest.removeprefix('sha256:')[:8]}"

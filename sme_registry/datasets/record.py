@@ -29,6 +29,7 @@ class DatasetRecord(StrictModel):
     recipe: DatasetRecipe  # all that the data set was generated from
     recipe_digest: Digest
     spec_digest: Digest
+    task: str = ""  # what the task's file calls it
     protocol_digest: Digest
     seeds: Seeds
     nu: float | None  # ν if a single mixture acted; null for other or several behaviours

@@ -63,6 +63,7 @@ def diagnose(
         name=subject.name,
         spec=subject.spec,
         spec_digest=subject.spec.digest,
+        task=subject.spec.name,
         plan=subject.plan,
         checkpoint_step=subject.checkpoint_step,
         level=verdicts.level(measurements),

@@ -245,6 +245,7 @@ class Diagnosis(StrictModel):
     name: str  # of the run or policy
     spec: SMESpec
     spec_digest: Digest
+    task: str = ""  # what the task's file calls it
     plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
     checkpoint_step: Integer | None = None  # of an unfinished run, the steps at its checkpoint
     level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0

@@ -56,8 +56,9 @@ def headline(diagnosis: Diagnosis) -> str:
 def title(diagnosis: Diagnosis) -> str:
     """The run or policy, and its task."""
     spec = diagnosis.spec
+    task = catalogue.title(spec.named(diagnosis.task))
     return (
-        f"{diagnosis.name} on {catalogue.title(spec)} (S={spec.state_dim}, A={spec.action_dim}, "
+        f"{diagnosis.name} on {task} (S={spec.state_dim}, A={spec.action_dim}, "
         f"L={spec.complexity}, k={spec.k}, r_min={spec.r_min:g}, D={spec.D:g})"
     )
 

@@ -105,7 +105,7 @@ def load_run(folder: str | Path) -> Subject:
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
     return Subject(
         folder.name or str(folder),
-        record.spec,
+        record.spec.named(record.task),
         policy,
         {field: getattr(record, field) for field in fields},
         _episode_log(folder / episode_files.FILE),

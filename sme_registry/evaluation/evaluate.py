@@ -87,6 +87,7 @@ def evaluate(
         action_range=prepared.action_range,
         spec=spec,
         spec_digest=spec.digest,
+        task=spec.name,
         protocol=protocol,
         protocol_digest=protocol.digest,
         regions=whole.regions,

@@ -113,6 +113,7 @@ class EvaluationReport(StrictModel):
         team differ.
       spec: the task.
       spec_digest: its digest.
+      task: what the task's file calls it; empty, and left out of the JSON, without a name.
       protocol: the protocol.
       protocol_digest: its digest.
       regions: WD, then OOD 1, 2, …
@@ -126,6 +127,7 @@ class EvaluationReport(StrictModel):
     action_range: Literal["unit", "symmetric", "mixed"]
     spec: SMESpec
     spec_digest: str
+    task: str = ""
     protocol: EvaluationProtocol
     protocol_digest: str
     regions: _Regions
@@ -134,10 +136,11 @@ class EvaluationReport(StrictModel):
     versions: dict[str, str]
 
     @model_serializer(mode="wrap")
-    def _omit_no_agents(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
-        if not self.agents:
-            del plain["agents"]
+        for field in ("agents", "task"):
+            if not plain[field]:
+                del plain[field]
         return plain
 
     @classmethod
@@ -167,6 +170,11 @@ class EvaluationReport(StrictModel):
           OptionError: it cannot be written; an existing file is unchanged.
         """
         return write_atomically(path, to_json(self.to_dict()))
+
+    @property
+    def title(self) -> str:
+        """The task's name for people; see `catalogue.title`."""
+        return catalogue.title(self.spec.named(self.task))
 
     @property
     def wd_regret(self) -> float:
@@ -231,7 +239,7 @@ class EvaluationReport(StrictModel):
         spec, policy = self.spec, escape(self.policy)
         team = f", {len(self.agents)} agents" if self.agents else ""
         table = empty_table(
-            f"{policy} on {catalogue.title(spec)} (S={spec.state_dim}, "
+            f"{policy} on {escape(self.title)} (S={spec.state_dim}, "
             f"A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{spec.digest}\n{self.regions[0].states:,} states per region; "
             f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "

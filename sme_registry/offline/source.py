@@ -23,6 +23,7 @@ class DataSource(NamedTuple):
 
     transitions: Transitions
     task: Task  # of a single agent
+    name: str  # what the task's file calls it; may be empty
     protocol: EvaluationProtocol  # of the final evaluation
     ids: dict[str, str | None]  # the fields `dataset` and `recipe_digest` of an `OfflineRecord`
 
@@ -50,7 +51,8 @@ def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None)
             raise OptionError("spec=None: is required with arrays. Give the spec of their task.")
         chosen = resolve_protocol("paper-v1" if protocol is None else protocol)
         ids: dict[str, str | None] = {"dataset": None, "recipe_digest": None}
-        source = DataSource(data, _single_agent(load_spec(spec)), chosen, ids)
+        spec = load_spec(spec)
+        source = DataSource(data, _single_agent(spec), spec.name, chosen, ids)
     elif isinstance(data, Dataset | str | os.PathLike):
         dataset = data if isinstance(data, Dataset) else open_dataset(data)
         record, recipe = dataset.record, dataset.recipe
@@ -62,7 +64,7 @@ def data_source(data: Any, spec: SpecLike | None, protocol: ProtocolLike | None)
         task = _single_agent(recipe.spec)
         chosen = recipe.protocol if protocol is None else resolve_protocol(protocol)
         ids = {"dataset": dataset.id, "recipe_digest": record.recipe_digest}
-        source = DataSource(dataset.transitions(), task, chosen, ids)
+        source = DataSource(dataset.transitions(), task, record.task, chosen, ids)
     else:
         raise OptionError(
             f"data={data!r:.60}: must be a data set, its id, its path, or its Transitions."

@@ -164,7 +164,7 @@ def train_offline(
         cpu_ms_per_step=round(1e3 * learning / steps, 4),
         versions=versions(PACKAGES),
     )
-    report = evaluate(policy, task.spec, source.protocol, name=algorithm.upper())
+    report = evaluate(policy, task.spec.named(source.name), source.protocol, name=algorithm.upper())
     if target is not None:
         (target / RECORD).unlink(missing_ok=True)
         policy.save(target / POLICY)

@@ -89,10 +89,35 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     )
 
 
+def unique_name(spec: SMESpec) -> str:
+    """A task's name in the catalogue (`Default-v1`), else its name by content: only its own."""
+    released = {file.digest: file.versioned_name for file in entries(EnvFile)}
+    return released.get(spec.digest, spec.content_name)
+
+
 def title(spec: SMESpec) -> str:
-    """A task's name in the catalogue (`SME/Default-v1`), else its name by content."""
-    named = {file.digest: file.versioned_name for file in entries(EnvFile)}
-    return f"{NAMESPACE}/{named.get(spec.digest, spec.content_name)}"
+    """What tables and figures call a task.
+
+    `SME/Default-v1` in the catalogue; else the name of its file, or the id it is registered under;
+    else `SME/` and its name by content. A file that uses a name of the catalogue for another task
+    is followed by its name by content: `Default (sha256-…)`.
+    """
+    unique = unique_name(spec)
+    if unique != spec.content_name or not spec.name:
+        return f"{NAMESPACE}/{unique}"
+    released = {short for name in names(EnvFile) for short in (name, _VERSION.sub("", name))}
+    return f"{spec.name} ({unique})" if spec.name in released else spec.name
+
+
+def titles(specs: Iterable[SMESpec]) -> dict[str, str]:
+    """Digest → title; different tasks of one name are told apart by their names by content."""
+    tasks = {spec.digest: spec for spec in specs}
+    plain = {digest: title(spec) for digest, spec in tasks.items()}
+    shared = [*plain.values()]
+    return {
+        digest: text if shared.count(text) == 1 else f"{text} ({tasks[digest].content_name})"
+        for digest, text in plain.items()
+    }
 
 
 def released() -> Iterator[tuple[str, str, bool]]:

@@ -56,7 +56,8 @@ def resolve(task: SpecLike) -> ResolvedSpec:
         return ResolvedSpec(as_spec(task))
     name = str(task)
     if isinstance(task, os.PathLike) or is_path(name):
-        return _of_file(read_env_file(name))
+        file = read_env_file(name)
+        return ResolvedSpec(file.spec.named(file.name), file.fingerprint)
     short = name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
     full = f"{catalogue.NAMESPACE}/{short}"
     for env_id in registered:

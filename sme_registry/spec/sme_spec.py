@@ -14,6 +14,7 @@ from pydantic import (
     Field,
     PlainSerializer,
     PlainValidator,
+    PrivateAttr,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
@@ -200,10 +201,29 @@ class Setting(Document):
 class SMESpec(Setting):
     """A complete task: a setting of the axes and the seed of its draw.
 
-    Equal specs have equal digests, and equal digests are equal specs.
+    Equal specs have equal digests, and equal digests are equal specs. The name that a file or a
+    registration gives a spec is presentation: it is in no JSON and makes no two specs unequal.
     """
 
     seed: Seed = 0
+    _name: str = PrivateAttr("")
+
+    @property
+    def name(self) -> str:
+        """What its file or registration calls it, such as `MyTask`; empty if nothing does."""
+        return self._name
+
+    def named(self, name: str) -> SMESpec:
+        """This spec under another name."""
+        copy = self.model_copy()
+        copy._name = name
+        return copy
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are equal; the name is none of them."""
+        if not isinstance(other, SMESpec):
+            return NotImplemented
+        return self.__dict__ == other.__dict__
 
     @property
     def content_name(self) -> str:

@@ -30,6 +30,7 @@ class RunRecord(StrictModel):
     status: Literal["running", "finished"]  # "running" also after a kill
     spec: SMESpec
     spec_digest: str
+    task: str = ""  # what the task's file calls it
     algorithm: str
     hyperparameters: str = DEFAULTS  # whose defaults, and the changes to them
     seed: Integer

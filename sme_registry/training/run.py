@@ -23,7 +23,7 @@ from rich.console import Console
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.io import choice, claim_folder, integer_in, is_installed, versions
-from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike, catalogue
+from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
@@ -173,6 +173,7 @@ def _plan(
         hyperparameters=DEFAULTS if n_steps is None else f"{DEFAULTS}, but n_steps={n_steps}",
         spec=spec,
         spec_digest=spec.digest,
+        task=spec.name,
         algorithm=algorithm,
         seed=seed,
         action_range=action_range,
@@ -231,7 +232,7 @@ def _evaluate(
 
         log = folder / episode_files.FILE
         if record.episodes:
-            title = f"{report.policy} on {catalogue.title(report.spec)}"
+            title = f"{report.policy} on {report.title}"
             figures.insert(0, plots.training_curve(log, folder / TRAINING_CURVE, title=title))
         if report.spec.state_dim == 2 and report.spec.team is None:
             path = folder / SIMILARITY_MAP

@@ -1,0 +1,64 @@
+"""What tables and figures call a task, and that a name is never part of its identity."""
+
+import pickle
+
+import pytest
+
+from sme_registry import EvaluationReport, SMESpec, evaluate, load, register, save
+from sme_registry.spec import catalogue
+
+OTHER = SMESpec(state_dim=2, action_dim=2, k=2, seed=5)
+QUICK = {"states_per_region": 20, "epsilons": [0.5]}
+
+
+@pytest.fixture
+def named(tmp_path):
+    return load(save(OTHER, tmp_path / "k2.json"))
+
+
+def test_a_task_of_a_file_has_the_name_of_its_file(named):
+    assert named.name == catalogue.title(named) == "k2"
+    assert catalogue.title(pickle.loads(pickle.dumps(named))) == "k2"
+    assert catalogue.title(OTHER) == f"SME/{OTHER.content_name}"
+    assert catalogue.title(load("Default")) == "SME/Default-v1"
+
+
+def test_a_name_is_no_part_of_a_spec(named):
+    assert (named, hash(named), named.digest) == (OTHER, hash(OTHER), OTHER.digest)
+    assert OTHER.name == ""
+    assert named.to_dict() == OTHER.to_dict()
+    assert named != OTHER.derive(k=3)
+    assert named.derive(k=3).name == ""  # another task
+
+
+def test_a_registered_task_has_the_name_of_its_id():
+    spec = OTHER.derive(seed=6)
+    assert catalogue.title(load(register(spec, "Mine"))) == "SME/Mine-v1"
+
+
+@pytest.mark.parametrize("name", ["Default", "Default-v1"])
+def test_a_file_cannot_pose_as_a_task_of_the_catalogue(tmp_path, name):
+    spec = load(save(OTHER, tmp_path / "mine.json", name=name))
+    assert catalogue.title(spec) == f"{name} ({OTHER.content_name})"
+
+
+def test_a_file_of_the_catalogues_task_has_the_catalogues_name(tmp_path):
+    assert catalogue.title(load(save(SMESpec(), tmp_path / "mine.json"))) == "SME/Default-v1"
+
+
+def test_tasks_of_one_name_are_told_apart(named):
+    twin = OTHER.derive(seed=7).named("k2")
+    titles = catalogue.titles([named, SMESpec(), twin, named])
+    assert titles == {
+        OTHER.digest: f"k2 ({OTHER.content_name})",
+        SMESpec().digest: "SME/Default-v1",
+        twin.digest: f"k2 ({twin.content_name})",
+    }
+
+
+def test_a_report_keeps_the_name_in_its_file(tmp_path, named):
+    report = evaluate("constant_half", named, QUICK)
+    again = EvaluationReport.read(report.write(tmp_path / "evaluation.json"))
+    assert report.title == again.title == "k2"
+    assert " on k2 (S=2" in str(again)
+    assert "task" not in evaluate("constant_half", OTHER, QUICK).to_dict()
