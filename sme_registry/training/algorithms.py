@@ -1,4 +1,11 @@
-"""Stable-Baselines3's algorithms by name, imported only when needed: PyTorch takes seconds.
+"""`uses`: the name of what `sme train` and the cells of a study train. Imported only when needed.
+
+    PPO, TD3, …        an algorithm of Stable-Baselines3, in any case
+    an entry point     of the group `sme_registry.algorithms`, in an installed package
+    module:name        imported, from this folder or installed
+
+An entry point or `module:name` is either a class like those of Stable-Baselines3
+(`sb3_contrib:TQC`), or a function that returns a learner; see `learners`.
 
 Also the settings they share here: one thread, no messages, a replay buffer of the size needed.
 """
@@ -7,13 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.metadata
 import io
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
-from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.io import require_packages
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.io import import_object, require_packages
 from sme_registry.spec import SMESpec
 
 # Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
@@ -24,6 +32,7 @@ ALGORITHMS = {
     "PPO": "on-policy; steps ten times faster, but learns from many more",
     "A2C": "on-policy",
 }
+ENTRY_POINTS = "sme_registry.algorithms"
 _ON_POLICY = ("PPO", "A2C")
 _TEAMS = 8
 _ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO, of one environment; ours at least
@@ -88,6 +97,53 @@ def load_algorithm(name: str) -> Any:
     # It imports the deprecated `gym` if that is installed, which prints a long notice.
     with contextlib.redirect_stderr(io.StringIO()), quiet():
         return getattr(importlib.import_module("stable_baselines3"), known_algorithm(name))
+
+
+def find_algorithm(uses: str, field: str = "uses", others: Iterable[str] = ()) -> Any:
+    """The class or function that `uses` names.
+
+    Args:
+      uses: its name; see the module.
+      field: what error messages call the name.
+      others: further names that the caller knows, which error messages list.
+
+    Raises:
+      UnknownNameError: nothing has this name; the message suggests similar ones.
+      OptionError: a module or entry point cannot be imported or called.
+      MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
+    """
+    require_sb3()  # every learner gets their `VecEnv`
+    if ":" in uses:
+        with quiet():
+            algorithm = import_object(uses, field, OptionError)
+    elif uses.casefold() in (known.casefold() for known in ALGORITHMS):
+        return load_algorithm(uses)
+    else:
+        algorithm = _entry_point(uses, field, others)
+    if not callable(algorithm):
+        raise OptionError(
+            f"{field}={uses!r}: is of type {type(algorithm).__name__}: must be a class like those "
+            "of Stable-Baselines3, or a function from an environment to a learner."
+        )
+    return algorithm
+
+
+def _entry_point(name: str, field: str, others: Iterable[str]) -> Any:
+    installed = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    if name not in installed:
+        known = [*ALGORITHMS, *sorted(installed), *others]
+        raise UnknownNameError(
+            f"{field}={name!r}: must be one of {', '.join(known)}; or module:Class or "
+            f"module:function, such as sb3_contrib:TQC.{did_you_mean(name, known)}"
+        )
+    point = installed[name]
+    try:
+        return point.load()
+    except Exception as error:
+        raise OptionError(
+            f"{field}={name!r}: the entry point {point.value!r} cannot be imported: "
+            f"{type(error).__name__}: {error}. Repair or remove the package that provides it."
+        ) from error
 
 
 def is_sb3(algorithm: Any) -> bool:

@@ -19,16 +19,13 @@ from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import versions, write_atomically
 from sme_registry.spec.study import Cell
-from sme_registry.studies.engine.algorithms import (
-    find_algorithm,
-    new_learner,
-    reference_name,
-)
+from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.task import materialize
 from sme_registry.training import ALGORITHMS
 from sme_registry.training.algorithms import one_thread, quiet, require_sb3
+from sme_registry.training.learners import new_learner
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import PACKAGES
 

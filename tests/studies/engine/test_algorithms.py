@@ -11,7 +11,8 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError, UnknownNameError
-from sme_registry.studies.engine.algorithms import find_algorithm, new_learner, reference_name
+from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
+from sme_registry.training.learners import new_learner
 
 sb3 = pytest.importorskip("stable_baselines3")
 
@@ -119,8 +120,9 @@ def test_a_reference_is_told_from_what_learns() -> None:
     [
         ("TD3", {"learning_rat": 0.1}, "Did you mean 'learning_rate'"),
         ("PPO", {"seed": 3}, "PPO has no such hyperparameter"),
-        ("SAC", {"policy_kwargs": {"depth": 3}}, "rejects the task or the hyperparameters"),
-        ("own_learners:small", {"depth": 3}, "unexpected keyword argument 'depth'"),
+        ("SAC", {"policy_kwargs": {"depth": 3}}, r"policy_kwargs\.depth: SAC's policy has no such"),
+        ("SAC", {"learning_rate": "fast"}, "rejects the task or the hyperparameters"),
+        ("own_learners:small", {"depth": 3}, "small has no such hyperparameter.*Known: width"),
         ("own_learners:nothing", {}, "returned a NoneType, which has no learn and no predict"),
     ],
 )

@@ -1,0 +1,144 @@
+"""Hyperparameters: as text, as JSON values, and their check against an algorithm.
+
+    nested_hyperparameters({"policy_kwargs.net_arch": [64, 64]})   # --set, by dotted names
+    check_hyperparameters("PPO", {"n_stepz": 64})                  # OptionError: … 'n_steps'?
+
+The same for `sme train` and for studies. Importing this module does not import PyTorch.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from sme_registry.errors import OptionError, did_you_mean
+from sme_registry.io import import_object, read_json
+from sme_registry.training.algorithms import find_algorithm, is_sb3
+
+# Arguments of an algorithm's constructor that are not hyperparameters.
+_RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
+# Arguments of a policy's constructor that the algorithm passes.
+_PASSED = ("self", "observation_space", "action_space", "lr_schedule")
+
+
+def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Hyperparameters whose dotted names are resolved: `policy_kwargs.net_arch` is in a dict.
+
+    Raises:
+      OptionError: a name has an empty part, or is used both for a value and for a dict.
+    """
+    nested: dict[str, Any] = {}
+    for name, value in flat.items():
+        *parents, last = name.split(".")
+        block: Any = nested
+        for parent in parents:
+            block = block.setdefault(parent, {}) if isinstance(block, dict) else None
+        if not all((*parents, last)) or not isinstance(block, dict) or last in block:
+            raise OptionError(
+                f"hyperparameters.{name}: is not a name, or is set twice. Use one name for each "
+                "value, such as policy_kwargs.net_arch."
+            )
+        block[last] = value
+    return nested
+
+
+def read_hyperparameters(path: Path) -> dict[str, Any]:
+    """The hyperparameters in a JSON file: an object of names and values.
+
+    Raises:
+      MalformedDocumentError: it cannot be read, or is no JSON.
+      OptionError: it is not an object.
+    """
+    values = read_json(path)
+    if not isinstance(values, dict):
+        raise OptionError(
+            f"{path}: must be an object of hyperparameters, such as "
+            '{"learning_rate": 0.0001, "policy_kwargs": {"net_arch": [64, 64]}}.'
+        )
+    return nested_hyperparameters(values)
+
+
+def check_hyperparameters(
+    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+) -> None:
+    """Check that an algorithm has hyperparameters of these names. It checks no values.
+
+    The names are those of the constructor, or of the function, and in `policy_kwargs` those of the
+    policy's constructor.
+
+    Args:
+      uses: the algorithm; see `find_algorithm`.
+      hyperparameters: names and values.
+      field: what error messages call them.
+
+    Raises:
+      OptionError: it has no hyperparameter of a name; the message suggests a similar one.
+      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
+    """
+    if hyperparameters:
+        refuse_unknown(find_algorithm(uses), uses, hyperparameters, field)
+
+
+def refuse_unknown(
+    algorithm: Any, uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+) -> None:
+    """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
+    if not isinstance(algorithm, type) or not is_sb3(algorithm):
+        environment = next(iter(inspect.signature(algorithm).parameters), "env")
+        _refuse_names(field, uses, hyperparameters, _names(algorithm, (environment, "seed")))
+        return
+    _refuse_names(field, uses, hyperparameters, _names(algorithm, _RESERVED))
+    policy_kwargs = hyperparameters.get("policy_kwargs")
+    if isinstance(policy_kwargs, Mapping):
+        names = _names(_policy_class(algorithm), _PASSED)
+        _refuse_names(f"{field}.policy_kwargs", f"{uses}'s policy", policy_kwargs, names)
+
+
+def resolved(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Values for a constructor, from those of JSON.
+
+    Lists become tuples (`"train_freq": [1, "episode"]`), and in `policy_kwargs` a text
+    `module:Class` the class (`"activation_fn": "torch.nn:ReLU"`).
+
+    Raises:
+      OptionError: a class cannot be imported.
+    """
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in hyperparameters.items()}
+    policy_kwargs = values.get("policy_kwargs")
+    if isinstance(policy_kwargs, Mapping):
+        values["policy_kwargs"] = {
+            name: import_object(value, f"hyperparameters.policy_kwargs.{name}", OptionError)
+            if isinstance(value, str) and ":" in value
+            else value
+            for name, value in policy_kwargs.items()
+        }
+    return values
+
+
+def policy_alias(algorithm: Any) -> str:
+    """SB3's name of an algorithm's perceptron policy: "MlpPolicy", or "MlpLstmPolicy"."""
+    aliases: list[str] = ["MlpPolicy", *algorithm.policy_aliases]
+    return next(a for a in aliases if a in algorithm.policy_aliases and a.startswith("Mlp"))
+
+
+def _policy_class(algorithm: Any) -> Any:
+    return algorithm.policy_aliases[policy_alias(algorithm)]
+
+
+def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
+    """The names of a function's arguments that a user may set; None if it accepts any."""
+    parameters = inspect.signature(function).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return None
+    return [name for name in parameters if name not in reserved and not name.startswith("_")]
+
+
+def _refuse_names(field: str, owner: str, names: Iterable[str], known: list[str] | None) -> None:
+    for name in names:
+        if known is not None and name not in known:
+            raise OptionError(
+                f"{field}.{name}: {owner} has no such hyperparameter.{did_you_mean(name, known)} "
+                f"Known: {', '.join(known) or 'none'}."
+            )

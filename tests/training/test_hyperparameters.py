@@ -1,0 +1,77 @@
+"""Hyperparameters: their names, their values, and those that several lanes need."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.training.hyperparameters import (
+    check_hyperparameters,
+    nested_hyperparameters,
+    read_hyperparameters,
+    resolved,
+)
+
+pytest.importorskip("stable_baselines3")
+
+
+def test_dotted_names_are_nested() -> None:
+    flat = {"gamma": 0.9, "policy_kwargs.net_arch": [64, 64], "policy_kwargs.n_critics": 1}
+    assert nested_hyperparameters(flat) == {
+        "gamma": 0.9,
+        "policy_kwargs": {"net_arch": [64, 64], "n_critics": 1},
+    }
+
+
+@pytest.mark.parametrize(
+    "flat", [{"a": 1, "a.b": 2}, {"a.b": 2, "a": 1}, {"a.": 1}, {".a": 1}, {"a": 1, "a.b.c": 2}]
+)
+def test_names_that_cannot_be_nested_are_rejected(flat: dict[str, Any]) -> None:
+    with pytest.raises(OptionError, match="one name for each value"):
+        nested_hyperparameters(flat)
+
+
+def test_a_file_holds_an_object(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text('{"policy_kwargs.net_arch": [8], "gamma": 0.5}')
+    assert read_hyperparameters(path) == {"policy_kwargs": {"net_arch": [8]}, "gamma": 0.5}
+    path.write_text("[1]")
+    with pytest.raises(OptionError, match="must be an object"):
+        read_hyperparameters(path)
+
+
+@pytest.mark.parametrize(
+    ("uses", "values", "message"),
+    [
+        ("PPO", {"n_stepz": 64}, r"hyperparameters\.n_stepz: PPO has .*Did you mean 'n_steps'"),
+        ("td3", {"policy_kwargs": {"net_arhc": [8]}}, r"policy_kwargs\.net_arhc: .*'net_arch'"),
+        ("PPO", {"_init_setup_model": False}, "has no such hyperparameter"),
+        ("PPO", {"tensorboard_log": "logs"}, "has no such hyperparameter"),
+        ("sb3_contrib:TQC", {"top_quantiles": 1}, "top_quantiles_to_drop_per_net"),
+    ],
+)
+def test_unknown_names_are_rejected_with_a_similar_one(
+    uses: str, values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        check_hyperparameters(uses, values)
+
+
+def test_known_names_are_accepted_whatever_their_values() -> None:
+    check_hyperparameters("PPO", {"n_steps": "many", "policy_kwargs": {"net_arch": [8]}})
+    check_hyperparameters("sb3_contrib:RecurrentPPO", {"policy_kwargs": {"lstm_hidden_size": 8}})
+    with pytest.raises(UnknownNameError):
+        check_hyperparameters("TD4", {"gamma": 0.9})
+
+
+def test_json_values_become_those_of_a_constructor() -> None:
+    from torch import nn
+
+    values = {"train_freq": [1, "episode"], "policy_kwargs": {"activation_fn": "torch.nn:ELU"}}
+    assert resolved(values) == {
+        "train_freq": (1, "episode"),
+        "policy_kwargs": {"activation_fn": nn.ELU},
+    }
