@@ -2,6 +2,7 @@
 
     SMEError
     ├── SpecError                 an invalid or missing field of a document (also a ValueError)
+    │   ├── UnexpectedKeywordError    an environment has no such argument (also a TypeError)
     │   ├── MalformedDocumentError    not JSON, or not the JSON of this kind of document
     │   ├── DigestMismatchError       a file's digest is not the digest of its spec
     │   └── FingerprintMismatchError  the drawn numbers differ from the published ones
@@ -32,6 +33,13 @@ class SMEError(Exception):
 
 class SpecError(SMEError, ValueError):
     """A field of a document is invalid, missing, unknown, or conflicts with another."""
+
+
+class UnexpectedKeywordError(SpecError, TypeError):
+    """A keyword is neither an argument of the environment nor a field of its spec.
+
+    A TypeError in Python's words, since frameworks try arguments and go on after that error.
+    """
 
 
 class MalformedDocumentError(SpecError):

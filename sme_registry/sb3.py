@@ -22,13 +22,14 @@ from gymnasium.envs.registration import EnvSpec
 from sme_registry.envs import arguments
 from sme_registry.envs.base import renamed_by_content
 from sme_registry.envs.batch import Batch
+from sme_registry.envs.lanes import Lane
 from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
 from sme_registry.spec import ActionRange, SMESpec, SpecLike
-from sme_registry.task import Task, load_task
+from sme_registry.task import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -112,25 +113,6 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         return [False for _ in self._get_indices(indices)]
 
 
-class Lane:
-    """One agent's environment, as SB3 sees it: attributes shared by all lanes, and its own."""
-
-    def __init__(self, vec_env: _BatchVecEnv, team: int, agent: str, **shared: Any) -> None:
-        self._vec_env, self._team, self.agent = vec_env, team, agent
-        vars(self).update(shared)
-
-    @property
-    def state(self) -> Array:
-        """The present state of the agent's team, `[S]` (a copy)."""
-        state: Array = self._vec_env._batch.state[self._team]
-        return state
-
-    @property
-    def unwrapped(self) -> Lane:
-        """Itself, as environments without a wrapper have it."""
-        return self
-
-
 class _SingleLane(Lane):
     """A lane of a single agent's task, which can be reset alone."""
 
@@ -138,9 +120,9 @@ class _SingleLane(Lane):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode in this lane alone; see `SMEEnv.reset`."""
-        start = self._vec_env._start([options or {}])
-        observations = self._vec_env._begin({self._team: (seed, start)})
-        return observations[self._team], {}
+        start = self._owner._start([options or {}])
+        observations = self._owner._begin({self._index: (seed, start)})
+        return observations[self._index], {}
 
 
 class _BatchVecEnv(LanesVecEnv):
@@ -172,7 +154,11 @@ class _BatchVecEnv(LanesVecEnv):
         }  # fmt: skip
         teams = range(self.num_teams)
         super().__init__(
-            [self._lane_type(self, team, name, **shared) for team in teams for name in self.agents]
+            [
+                self._lane_type(self, team, agent=name, **shared)
+                for team in teams
+                for name in self.agents
+            ]
         )
 
     def seed(self, seed: int | None = None) -> list[int | None]:
@@ -304,7 +290,9 @@ class SMEVecEnv(_BatchVecEnv):
         **overrides: Any,
     ) -> None:
         named = registered_or_new(spec_or_id)
-        task = arguments.single_agent(load_task(named.kwargs["spec"], **overrides))
+        task = arguments.single_agent(
+            arguments.load_overridden(type(self), named.kwargs["spec"], overrides)
+        )
         kwargs = {**named.kwargs, "action_range": action_range, **overrides}
         env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), task.spec)
         S, A = task.spec.state_dim, task.spec.action_dim
@@ -340,7 +328,7 @@ class SMETeamVecEnv(_BatchVecEnv):
         action_range: ActionRange = "symmetric",
         **overrides: Any,
     ) -> None:
-        task = load_task(spec_or_id, **overrides)
+        task = arguments.load_overridden(type(self), spec_or_id, overrides)
         # For each channel of the joint action: the agent that owns it, and the entry of its action.
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])

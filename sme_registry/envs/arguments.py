@@ -7,6 +7,7 @@ the task's digest.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import gymnasium
@@ -14,10 +15,37 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.envs.types import Array, Mask
-from sme_registry.errors import ActionError, OptionError, SpecError, StateError, did_you_mean
+from sme_registry.errors import (
+    ActionError,
+    OptionError,
+    SpecError,
+    StateError,
+    UnexpectedKeywordError,
+    did_you_mean,
+)
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ACTION_RANGES
-from sme_registry.task import Task
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike
+from sme_registry.task import Task, load_task
+
+
+def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
+    """The task of an environment class that is called with these overrides of spec fields.
+
+    Raises:
+      UnexpectedKeywordError: an override is no field, and no argument of the environment.
+      SpecError, UnknownNameError, ResourceLimitError: see `load_task`.
+    """
+    fields = list(SMESpec.model_fields)
+    for name in overrides:
+        if name not in fields:
+            parameters = inspect.signature(environment).parameters.values()
+            named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+            raise UnexpectedKeywordError(
+                f"{environment.__name__}() got an unexpected keyword argument {name!r}: must be "
+                f"{', '.join(named)} or a field of the spec ({', '.join(fields)})."
+                f"{did_you_mean(name, [*named, *fields]) or ' Remove it.'}"
+            )
+    return load_task(spec, **overrides)
 
 
 def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.Box, bool]:

@@ -18,7 +18,6 @@ from sme_registry.envs.base import (
 from sme_registry.envs.types import Action, Array, Observation
 from sme_registry.errors import EpisodeError
 from sme_registry.spec import ActionRange, SpecLike
-from sme_registry.task import load_task
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
@@ -57,7 +56,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        self._task = arguments.single_agent(load_task(spec, **overrides))
+        self._task = arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
         S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
         space, self._rescaled = arguments.action_space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)

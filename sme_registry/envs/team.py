@@ -24,7 +24,7 @@ from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.types import Array, Lanes, Observation
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import ActionRange, SpecLike
-from sme_registry.task import Task, load_task
+from sme_registry.task import Task
 
 _ONLY_LANE: Lanes = np.zeros(1, np.int64)
 
@@ -72,7 +72,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        self._task = load_task(spec, **overrides)
+        self._task = arguments.load_overridden(type(self), spec, overrides)
         self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
         self._every_column = np.concatenate(columns)

@@ -14,11 +14,11 @@ from gymnasium.vector.utils import batch_space
 from sme_registry.envs import arguments
 from sme_registry.envs.base import GymnasiumMixin, check_time_limit
 from sme_registry.envs.batch import Batch
+from sme_registry.envs.lanes import Lane
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import ActionRange, SpecLike
-from sme_registry.task import load_task
 
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
@@ -60,10 +60,10 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             )
         if not isinstance(autoreset_mode, AutoresetMode):
             choice("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
-        self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.render_mode = None
-        self._task = arguments.single_agent(load_task(spec, **overrides))
+        self._task = arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
         sme = self._task.spec
         if max_episode_steps is not None:
             check_time_limit(max_episode_steps, sme.horizon)
@@ -78,6 +78,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
         self._all_begun, self._any_ended = False, False
+        self._lanes: list[Lane] = []
 
     @property
     def state(self) -> Array:
@@ -144,7 +145,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if not self._all_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         ended_before, any_ended_before = self._ended, self._any_ended
-        if any_ended_before and self.mode is AutoresetMode.DISABLED:
+        if any_ended_before and self.autoreset_mode is AutoresetMode.DISABLED:
             first = np.flatnonzero(ended_before)[0]
             raise EpisodeError(
                 f"step: the episodes of {ended_before.sum()} lanes have ended (the first is lane "
@@ -172,7 +173,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._begin(np.flatnonzero(ended_before), observation)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
-        if any_ended and self.mode is AutoresetMode.SAME_STEP:
+        if any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
             infos = _masked(info, ~ended)
             final = np.full(B, None, dtype=object)
             for lane in np.flatnonzero(ended):
@@ -182,9 +183,44 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._begin(np.flatnonzero(ended), observation)
         else:
             infos = _masked(info, live)
-            if self.mode is not AutoresetMode.SAME_STEP:
+            if self.autoreset_mode is not AutoresetMode.SAME_STEP:
                 self._ended, self._any_ended = ended, any_ended
         return observation, reward, terminated, truncated, infos
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of each lane, or read an attribute; see `get_attr`."""
+        attributes = [getattr(lane, name) for lane in self._all_lanes()]
+        return tuple(each(*args, **kwargs) if callable(each) else each for each in attributes)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of each lane: `state` `[S]`, `task`, `sme_spec`, `spec`, … or one set."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: list[Any] | tuple[Any, ...] | Any) -> None:
+        """Set an attribute of each lane, from a list or tuple of one for each, or from one for all.
+
+        Raises:
+          OptionError: the number of values is not that of the lanes.
+        """
+        if not isinstance(values, list | tuple):
+            values = [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise OptionError(
+                f"values: must be one for each of the {self.num_envs} lanes, got {len(values)}."
+            )
+        for lane, value in zip(self._all_lanes(), values, strict=True):
+            setattr(lane, name, value)
+
+    def _all_lanes(self) -> list[Lane]:
+        """The lanes, created when they are first asked for: most batches never need them."""
+        if not self._lanes:
+            shared = {
+                "task": self.task, "sme_spec": self.sme_spec, "spec": self.spec,
+                "action_space": self.single_action_space, "render_mode": None,
+                "observation_space": self.single_observation_space,
+            }  # fmt: skip
+            self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
+        return self._lanes
 
     def _begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
         """Put lanes at the start of an episode, and write their observations."""

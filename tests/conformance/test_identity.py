@@ -16,7 +16,12 @@ from gymnasium.envs.registration import EnvSpec
 
 import sme_registry
 from sme_registry import SMESpec
-from sme_registry.errors import OptionError, SpecError, UnknownNameError
+from sme_registry.errors import (
+    OptionError,
+    SpecError,
+    UnexpectedKeywordError,
+    UnknownNameError,
+)
 
 ROOT = Path(sme_registry.__file__).resolve().parents[1]
 
@@ -144,6 +149,28 @@ def test_making_with_a_bad_argument_is_a_typed_error(
     if "render_mode" not in kwargs:
         with pytest.raises(error, match=words):
             sme_registry.envs.SMEVectorEnv("Default", 2, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **unknown: gymnasium.make("SME/Default-v1", **unknown),
+        lambda **unknown: gymnasium.make_vec("SME/Default-v1", **unknown),
+        lambda **unknown: sme_registry.make("Default", **unknown),
+        lambda **unknown: sme_registry.make_parallel("Team2", **unknown),
+        lambda **unknown: sme_registry.make_aec("Team2", **unknown),
+    ],
+    ids=["make", "make_vec", "sme_registry.make", "make_parallel", "make_aec"],
+)
+def test_an_unknown_keyword_is_a_type_error_in_pythons_words(make: Any) -> None:
+    # Frameworks try `frameskip=1` and go on only after exactly this error.
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'") as caught:
+        make(frameskip=1)
+    assert isinstance(caught.value, UnexpectedKeywordError)
+    with pytest.raises(SpecError, match="Did you mean 'complexity'"):
+        make(complexty=2)
+    with pytest.raises(SpecError, match="Did you mean 'action_range'"):
+        make(action_rnge="unit")
 
 
 def test_an_unknown_name_says_what_is_near() -> None:

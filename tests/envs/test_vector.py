@@ -256,3 +256,28 @@ def test_numpy_integers_serve_as_seed_and_number_of_lanes():
     assert env.num_envs == 3
     first = env.reset(seed=np.array(5))[0]
     np.testing.assert_array_equal(first, env.reset(seed=5)[0])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_attributes_of_lanes_are_asked_for_as_of_gymnasiums_vectors(mode: str) -> None:
+    env = gymnasium.make_vec("SME/Plane1-v1", num_envs=3, autoreset_mode=mode)
+    assert env.autoreset_mode is env.metadata["autoreset_mode"] is AutoresetMode(mode)
+    env.reset(seed=0)
+    env.step(HALF)
+    np.testing.assert_array_equal(env.get_attr("state"), env.unwrapped.state)
+    assert env.get_attr("sme_spec") == (env.unwrapped.sme_spec,) * 3
+    assert env.get_attr("spec") == (env.unwrapped.spec,) * 3
+    assert env.call("action_space") == (env.single_action_space,) * 3
+    best = env.get_attr("task")[0].optimal_action(env.get_attr("state")[1])
+    assert best.shape == (2,)
+
+    env.set_attr("label", ["a", "b", "c"])
+    assert env.get_attr("label") == ("a", "b", "c")
+    env.set_attr("label", "d")
+    assert env.get_attr("label") == ("d",) * 3
+    env.set_attr("act", lambda x: x + 1)
+    assert env.call("act", 2) == (3, 3, 3)
+    with pytest.raises(OptionError, match="each of the 3 lanes"):
+        env.set_attr("label", ["a", "b"])
+    with pytest.raises(AttributeError, match="nothing"):
+        env.get_attr("nothing")

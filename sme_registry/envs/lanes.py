@@ -1,0 +1,32 @@
+"""`Lane`: one environment of a batch, with the attributes that users of vectors ask each for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sme_registry.envs.types import Array
+
+
+class Lane:
+    """One environment of a batch: attributes that all lanes share, and its own.
+
+    Args:
+      owner: the batched environment.
+      index: the row of the batch.
+      **shared: attributes with the same value in each lane, such as `task` and `action_space`.
+    """
+
+    def __init__(self, owner: Any, index: int, **shared: Any) -> None:
+        self._owner, self._index = owner, index
+        vars(self).update(shared)
+
+    @property
+    def state(self) -> Array:
+        """The present state s, `[S]` float64 in [0, 1] (a copy)."""
+        state: Array = self._owner._batch.state[self._index]
+        return state
+
+    @property
+    def unwrapped(self) -> Lane:
+        """Itself, as environments without a wrapper have it."""
+        return self
