@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sme_registry.cli import study_new, study_plan
+from sme_registry.cli import study_new, study_plan, study_sweep
 from sme_registry.cli.arguments import Json, Out, find_file
 from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
 from sme_registry.errors import OptionError
@@ -32,6 +32,8 @@ app = typer.Typer(
 
       sme study run smoke --folder runs/smoke
 
+      sme study sweep -t Default --sweep k=1,2,5,10 -a PPO -n 20000 -f runs/k
+
       sme study plan paper-ablations --cores 64
 
       sme study status runs/smoke
@@ -41,6 +43,7 @@ app = typer.Typer(
 )
 app.command("new")(study_new.new)
 app.command("plan")(study_plan.plan)
+app.command("sweep")(study_sweep.sweep)
 
 
 @app.command("run")

@@ -13,6 +13,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sme_registry.spec.sweep import sweep
     from sme_registry.studies.engine.cell import run_cell
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
@@ -28,24 +29,26 @@ __all__ = [
     "run_cell",
     "run_study",
     "study_status",
+    "sweep",
     "write_report",
 ]
 
 _LAZY = {
-    "CellResult": "engine.result",
-    "StudyFrames": "report.frames",
-    "StudyStatus": "engine.status",
-    "load": "report.frames",
-    "run_cell": "engine.cell",
-    "run_study": "engine.runner",
-    "study_status": "engine.status",
-    "write_report": "report.write",
+    "CellResult": "studies.engine.result",
+    "StudyFrames": "studies.report.frames",
+    "StudyStatus": "studies.engine.status",
+    "load": "studies.report.frames",
+    "run_cell": "studies.engine.cell",
+    "run_study": "studies.engine.runner",
+    "study_status": "studies.engine.status",
+    "sweep": "spec.sweep",
+    "write_report": "studies.report.write",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
+        return getattr(importlib.import_module(f"sme_registry.{_LAZY[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

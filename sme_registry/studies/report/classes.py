@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,10 +30,11 @@ class ClassInfo:
 
     Attributes:
       name: in the plan.
-      axis: the field in which it differs from the first class; "" for the first; `SEVERAL`.
-        `policy_init` counts only if nothing else differs: deep tasks need another one.
+      axis: the field in which it differs from the first class, dotted within a team
+        (`team.reward`); "" for the first; `SEVERAL`. `policy_init` counts only if nothing else
+        differs: deep tasks need another one.
       label: `k = 25`; for several axes each of them.
-      setting: the value of every axis.
+      setting: the value of every field, those within a team by their dotted names.
     """
 
     name: str
@@ -74,30 +76,75 @@ def groups(
     """
     first, *others = classes.values()
     result = []
-    for axis in ("", *AXES, SEVERAL):
+    unnamed = [c.axis for c in others if c.axis not in ("", *AXES, SEVERAL)]
+    for axis in dict.fromkeys(("", *AXES, *unnamed, SEVERAL)):
         members = [first, *(c for c in others if axis in ("", c.axis))]
-        if axis in AXES and axis != "policy_init":
-            members.sort(key=lambda c: float(c.setting[axis]))
+        values = axis_values(axis, members)
+        if is_numeric(values):
+            members = [c for _, c in sorted(zip(values, members, strict=True), key=lambda x: x[0])]
         present = [c.name for c in members if any((c.name, a) in done for a in algorithms)]
         compared = [name for name in present if all((name, a) in done for a in algorithms)]
         if present and (not axis or len(members) > 1):
-            name = AXES[axis][1] if axis in AXES else axis or ALL
+            name = axis_label(axis) or ALL
             left_out = [n for n in present if n not in compared]
             result.append(Group(name, axis, tuple(present), tuple(compared), tuple(left_out)))
     return tuple(result)
 
 
+def axis_label(axis: str) -> str:
+    """What an axis is called: `reward interval k`."""
+    return AXES[axis][1] if axis in AXES else axis
+
+
+def axis_values(axis: str, members: Sequence[ClassInfo]) -> list[Any]:
+    """The value of an axis in each class; empty if they have no common axis."""
+    if axis in ("", SEVERAL):
+        return []
+    return [member.setting.get(axis) for member in members]
+
+
+def is_numeric(values: Sequence[Any]) -> bool:
+    """Whether values are numbers, so that they have an order and distances."""
+    return bool(values) and all(type(value) in (int, float) for value in values)
+
+
 def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
     """`k = 25`, or `25` without the symbol of the field."""
-    text = value if isinstance(value, str) else f"{value:g}"
-    return f"{AXES[field][0]} = {text}" if with_symbol else text
+    text = value if isinstance(value, str) else _json(value)
+    if is_numeric([value]):
+        text = f"{value:g}"
+    return f"{AXES.get(field, (field,))[0]} = {text}" if with_symbol else text
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
-    setting, base = member.setting.to_dict(), first.setting.to_dict()
+    setting, base = (_flat(each.setting.to_dict()) for each in (member, first))
     differing = [name for name in AXES if setting[name] != base[name]]
+    team = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == "team"]
+    team = [name for name in team if setting.get(name) != base.get(name)]
+    if len(team) == 1 and member.setting.team is not None and first.setting.team is not None:
+        differing += team
+    elif team:
+        differing.append("team")
     if len(differing) > 1 and "policy_init" in differing:
         differing.remove("policy_init")
+    agents = 0 if member.setting.team is None else len(member.setting.team.agents)
+    setting["team"] = f"{agents} agents" if agents else "none"
     axis = differing[0] if len(differing) == 1 else SEVERAL if differing else ""
     label = ", ".join(setting_label(name, setting[name]) for name in differing)
-    return ClassInfo(member.name, axis, label, {name: setting[name] for name in AXES})
+    return ClassInfo(member.name, axis, label, setting)
+
+
+def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of nested plain data by their dotted names; lists of numbers are values."""
+    flat: dict[str, Any] = {}
+    for key, value in fields.items() if isinstance(fields, dict) else enumerate(fields):
+        name = f"{prefix}{key}"
+        nested = isinstance(value, dict) or (
+            isinstance(value, list) and any(isinstance(each, dict) for each in value)
+        )
+        flat |= _flat(value, f"{name}.") if nested else {name: value}
+    return flat
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)

@@ -16,7 +16,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.classes import AXES
+from sme_registry.studies.report.classes import AXES, SEVERAL
 from sme_registry.studies.report.exports import TextTable
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import Findings
@@ -28,7 +28,7 @@ __all__ = ["page"]
 _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "offline": ("Learning from data", ("offline",)),
     "findings": ("Findings", ()),
-    "breaks": ("What breaks it", ("contrasts", "wd-regret", "ood-regret")),
+    "breaks": ("What breaks it", ("contrasts", "regret", "wd-regret", "ood-regret")),
     "regions": ("Inside and outside the training cube", ("regions", "decay", "maps")),
     "algorithms": ("Algorithms compared", ("aggregates", "profiles", "improvements")),
     "learning": ("Learning", ("learning-curves",)),
@@ -73,6 +73,7 @@ def page(
         },
         findings=findings,
         axes=AXES,
+        several=SEVERAL,
         figures=by_section,
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
         absent=absent,

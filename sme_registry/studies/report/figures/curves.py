@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,9 +12,10 @@ import pandas as pd
 from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots import GREY, literal, shades
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.classes import AXES, SEVERAL, Group, setting_label
+from sme_registry.studies.report.classes import SEVERAL, Group, axis_values, setting_label
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import CONSTANT, LINEAR, Look, Picture
+from sme_registry.studies.report.figures.scale import Scale
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
 from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, training_data
 
@@ -22,57 +24,81 @@ _BEHAVIOUR = Look("black", "", "-")
 _OPTIMUM = Look(GREY, "", (0, (1, 1.2)))
 
 
+_REGRET_CAPTION = (
+    "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant action ½, "
+    "the dashed line the linear least-squares policy fitted to the optimum. "
+    f"Hollow: fewer than {ENOUGH_RUNS} runs."
+)
+
+
 def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
-    """Normalised regret within and out of distribution, one panel an axis."""
+    """Normalised regret along each axis: WD and OOD in one figure for a single axis, else two."""
     groups = _axis_groups(analysis)
-    names = analysis.learners or analysis.algorithms
-    looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
+    if len(groups) == 1 and groups[0].axis not in ("", SEVERAL):
+        (group,) = groups
+        yield Picture(
+            f"regret-{group.axis.replace('.', '-')}",
+            f"Normalised regret along the {group.name}",
+            f"{_REGRET_CAPTION} {NOT_COMPARABLE}",
+            _draw_panels(analysis, formats, [(group, metric) for metric in panels.HEADINGS]),
+        )
+        return
     for metric, heading in panels.HEADINGS.items():
-        with panels.panel_grid(len(groups), formats, (0.7, 2.3)) as grid:
-            for axes, group in zip(grid.panels, groups, strict=True):
-                _draw_axis(axes, analysis, group, metric, looks)
-            grid.panels[0].set_ylim(bottom=0.0)  # last: it ends autoscaling, for all panels
-            grid.label_rows("normalised regret")
-            panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
         yield Picture(
             metric.replace("_", "-"),
             f"Normalised regret {heading}, along each axis",
-            "IQM over runs with its 95 % bootstrap interval: 0 is the optimum, 1 the constant "
-            "action ½, the dashed line the linear least-squares policy fitted to the optimum. "
-            f"Hollow: fewer than {ENOUGH_RUNS} runs."
-            + (f" {NOT_COMPARABLE}" if metric == "ood_regret" else ""),
-            grid.files,
+            _REGRET_CAPTION + (f" {NOT_COMPARABLE}" if metric == "ood_regret" else ""),
+            _draw_panels(analysis, formats, [(group, metric) for group in groups]),
         )
+
+
+def _draw_panels(
+    analysis: Analysis, formats: Sequence[str], drawn: Sequence[tuple[Group, str]]
+) -> Mapping[str, bytes]:
+    """A panel for each group and metric, named by what differs between the panels."""
+    names = analysis.learners or analysis.algorithms
+    looks = {name: look for name, look in panels.looks(analysis).items() if name in names}
+    one_group = len({group.name for group, _ in drawn}) < len(drawn)
+    with panels.panel_grid(len(drawn), formats, (0.9, 2.3)) as grid:
+        for axes, (group, metric) in zip(grid.panels, drawn, strict=True):
+            scale = _draw_axis(axes, analysis, group, metric, looks)
+            axes.set_title(
+                literal(panels.HEADINGS[metric] if one_group else group.name), fontsize=9
+            )
+            if one_group:
+                log = ", log scale" if scale.spacing == "log" else ""
+                axes.set_xlabel(literal(group.name) + log)
+        grid.panels[0].set_ylim(bottom=0.0)  # last: it ends autoscaling, for all panels
+        grid.label_rows("normalised regret")
+        panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
+    return grid.files
 
 
 def _draw_axis(
     axes: Any, analysis: Analysis, group: Group, metric: str, looks: Mapping[str, Look]
-) -> None:
+) -> Scale:
     """The classes of one axis, in the order of its values."""
-    x = {name: i for i, name in enumerate(group.classes)}
+    ordered = group.axis not in ("", SEVERAL)
+    values = axis_values(group.axis, [analysis.classes[name] for name in group.classes])
+    scale = Scale.of(values, len(group.classes))
+    x = dict(zip(group.classes, scale.at, strict=True))
     levels = analysis.levels[analysis.levels.metric == metric]
     levels = levels[levels.class_name.isin(x)]
     levels = levels.sort_values("class_name", key=lambda names: names.map(x), kind="stable")
     at = levels.class_name.map(x)
-    ordered = group.axis not in ("", SEVERAL)
     linear = levels.drop_duplicates("class_name", keep="last")
     look = LINEAR if ordered else Look(GREY, "_", "none")
     axes.plot(
         at[linear.index], linear.linear, **look.line, linewidth=1.2, markersize=14, zorder=1.6
     )
     axes.axhline(1.0, color=GREY, linewidth=1.2, linestyle=CONSTANT.dash, zorder=1.6)
-    panels.marks_by_algorithm(
-        axes, levels, "iqm", at, levels.runs >= ENOUGH_RUNS, looks, spread=0.5, upright=True,
-        joined=ordered,
-    )  # fmt: skip
-    axes.set_xticks(
-        range(len(group.classes)),
-        [literal(label) for label in _class_labels(analysis, group)],
-        **({} if ordered else {"rotation": 30, "ha": "right", "fontsize": 8}),
-    )
-    axes.set_title(literal(group.name), fontsize=9)
-    axes.set_xlim(-0.5, len(group.classes) - 0.5)
+    for name, algorithm, shift in panels.side_by_side(looks, 0.5):
+        own = levels[levels.algorithm == name]
+        places, enough = scale.shifted(at[own.index], shift), own.runs >= ENOUGH_RUNS
+        panels.marks(axes, own, "iqm", places, enough, algorithm, upright=True, joined=ordered)
+    scale.apply(axes, [literal(label) for label in _class_labels(analysis, group)])
     axes.grid(visible=False, axis="x")
+    return scale
 
 
 def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
@@ -130,7 +156,7 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
             panels.legend(grid.figure, dict(zip(labels, looks.values(), strict=True)), across=4)
         window = rows.window.max()
         yield Picture(
-            f"learning-curves-{(group.axis or group.name).replace(' ', '-').lower()}",
+            f"learning-curves-{re.sub('[ .]', '-', group.axis or group.name).lower()}",
             f"Learning curves: {group.name}",
             "Median over runs, with the interquartile range as a band"
             + (f", averaged over {window} evaluations" if window > 1 else "")
@@ -223,9 +249,9 @@ def _axis_groups(analysis: Analysis) -> Sequence[Group]:
 
 def _class_labels(analysis: Analysis, group: Group, *, with_symbol: bool = False) -> list[str]:
     """The value of the axis in each class, `25` or `k = 25`; the class's name without an axis."""
-    if group.axis not in AXES:
+    values = axis_values(group.axis, [analysis.classes[name] for name in group.classes])
+    if not values:
         return list(group.classes)
-    values = [analysis.classes[name].setting[group.axis] for name in group.classes]
     return [setting_label(group.axis, value, with_symbol=with_symbol) for value in values]
 
 

@@ -1,0 +1,176 @@
+"""The options that describe a plan, shared by the commands that make one."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+
+from sme_registry import load
+from sme_registry.cli.arguments import Protocol, find_file, json_or_text
+from sme_registry.cli.study_plan import scaled_plan
+from sme_registry.errors import OptionError, SMEError
+from sme_registry.io import integer_in, parse_json
+from sme_registry.spec import SMESpec, StudyFile, StudyPlan, SuiteFile, catalogue
+from sme_registry.spec.sweep import sweep
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """Options of a command, each with its help."""
+
+    suite: Annotated[str | None, typer.Option(help="A suite of classes: name or path.")] = None
+    task: Annotated[
+        list[str] | None,
+        typer.Option("--task", "-t", help="A task as a class of its own. Repeatable."),
+    ] = None
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=VALUE,…",
+            help="Vary a field of the --task, such as k=1,2,5 or team.reward=individual,team: a "
+            "class for each value. Repeatable: each sweep is an axis of its own around the task, "
+            "not a cross product.",
+        ),
+    ] = None
+    instances: Annotated[
+        int, typer.Option(help="Draws of each --task: its seed and those that follow.")
+    ] = 1
+    algorithm: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--algorithm",
+            "-a",
+            metavar="[NAME=]USES",
+            help="PPO, TD3, SAC, … of Stable-Baselines3, module:function, reference:linear, "
+            "reference:constant, offline:bc, … Repeatable.",
+        ),
+    ] = None
+    steps: Annotated[
+        list[str] | None,
+        typer.Option("--steps", "-n", metavar="N|ALGORITHM=N", help="Of each run. Repeatable."),
+    ] = None
+    seeds: Annotated[int, typer.Option(help="Runs of each algorithm on each class.")] = 10
+    evaluations: Annotated[int, typer.Option(help="Evaluations during each training.")] = 100
+    evaluation_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 5
+    action_range: Annotated[
+        list[str] | None,
+        typer.Option(help="symmetric or unit. Repeatable: each algorithm with each range."),
+    ] = None
+    protocol: Protocol = "paper-v1"
+
+    def plan(self, source: str) -> StudyPlan:
+        """The plan that the options describe; errors name `source`."""
+        from sme_registry.evaluation import resolve_protocol
+
+        fields = {
+            "classes": self._classes(),
+            "algorithms": self._algorithms(),
+            "seeds": self.seeds,
+            "evaluations": self.evaluations,
+            "evaluation_episodes": self.evaluation_episodes,
+            "protocol": resolve_protocol(self.protocol).to_dict(),
+        }
+        plan = StudyPlan.from_dict(fields, source)
+        draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
+        return scaled_plan(draft, self.steps, None, None).plan
+
+    def _classes(self) -> list[dict[str, Any]]:
+        """The classes of a suite, one for each task, or those of the sweeps."""
+        tasks = self.task or ()
+        if self.sweep and (self.suite is not None or len(tasks) != 1):
+            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
+        if self.suite is None and not tasks:
+            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        instances = integer_in("instances", self.instances, 1, 10_000)
+        axes = sweep_axes(self.sweep or ())
+        classes = [] if self.suite is None else find_file(SuiteFile, self.suite).suite.classes
+        for task in tasks:
+            spec = load(task)
+            classes = [*classes, *sweep(spec, axes, name=_title(spec), instances=instances)]
+        return [member.to_dict() for member in classes]
+
+    def _algorithms(self) -> list[dict[str, Any]]:
+        """Each `[NAME=]USES` with each action range."""
+        if not self.algorithm:
+            raise OptionError("--algorithm: is required, such as --algorithm PPO.")
+        ranges = self.action_range or ["symmetric"]
+        algorithms = []
+        for text in self.algorithm:
+            name, equals, uses = text.partition("=")
+            if not equals:
+                name, uses = text.rsplit(":", 1)[-1], text
+            for action_range in ranges:
+                fields: dict[str, Any] = {
+                    "name": f"{name} ({action_range})" if len(ranges) > 1 else name,
+                    "uses": uses,
+                    "action_range": action_range,
+                }
+                if uses.startswith("reference:"):
+                    fields["steps"] = 0
+                algorithms.append(fields)
+        return algorithms
+
+
+def sweep_axes(texts: typing.Iterable[str]) -> dict[str, list[Any]]:
+    """The axes of `FIELD=VALUE,…`: values are JSON, or else text, separated by commas."""
+    axes: dict[str, list[Any]] = {}
+    for text in texts:
+        field, equals, values = text.partition("=")
+        field = field.strip()
+        if not equals or not field or not values.strip():
+            raise OptionError(f"--sweep {text!r}: must be FIELD=VALUE,…, such as k=1,2,5,10.")
+        if field in axes:
+            raise OptionError(f"--sweep {text!r}: {field} is swept twice. Join their values.")
+        try:
+            axes[field] = parse_json(f"[{values}]")
+        except SMEError:
+            axes[field] = [json_or_text(value.strip()) for value in values.split(",")]
+    return axes
+
+
+def with_options(options: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the fields of a dataclass as options; it receives them as `options`."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = typing.get_type_hints(command, include_extras=True)
+        types = typing.get_type_hints(options, include_extras=True)
+        fields = [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=types[field.name],
+            )
+            for field in dataclasses.fields(options)
+        ]
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(command).parameters.items():
+            if name == "options":
+                parameters += fields
+            else:
+                kind = inspect.Parameter.KEYWORD_ONLY
+                parameters.append(parameter.replace(annotation=hints[name], kind=kind))
+
+        @functools.wraps(command)
+        def with_fields(**values: Any) -> None:
+            chosen = {field.name: values.pop(field.name) for field in fields}
+            command(options=options(**chosen), **values)
+
+        with_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        with_fields.__annotations__ = {each.name: each.annotation for each in parameters}
+        return with_fields
+
+    return decorate
+
+
+def _title(spec: SMESpec) -> str:
+    """The name of a task's class: its title, as a document's name."""
+    title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
+    return title.replace(" (", "-").removesuffix(")")
