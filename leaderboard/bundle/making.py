@@ -32,8 +32,6 @@ from sme_registry.spec import SuiteFile
 
 Progress = Callable[[int, int], None]
 
-_RANGES = {"unit": "[0, 1]", "symmetric": "[-1, 1]"}
-
 
 def make_bundle(
     folder: str | os.PathLike[str],
@@ -50,6 +48,7 @@ def make_bundle(
     statement: str = "",
     runs_started: dict[str, int] | None = None,
     training: Training | None = None,
+    algorithm: str | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Bundle:
@@ -59,7 +58,7 @@ def make_bundle(
       folder: the bundle to write; written completely or not at all.
       suite: the suite of the runs.
       key: the submitter's key.
-      runs: folders that `sme train` wrote, folders that contain such folders, and tables. A
+      runs: folders of `sme train` or `sme study run`, folders that contain such, and tables. A
         Stable-Baselines3 .zip can run code when it is loaded: give only files that you trust.
       method: its name on the board.
       submitter: the submitter's name on the board.
@@ -71,6 +70,7 @@ def make_bundle(
       runs_started: all runs ever started with this method, by class; for other classes, the number
         of listed runs.
       training: facts of the training; None takes them from the records of the runs.
+      algorithm: of folders with runs of several, the only one to submit.
       force: replace an existing bundle.
       progress: called after each run with the number of finished runs and of all runs.
 
@@ -86,7 +86,7 @@ def make_bundle(
     """
     folder = Path(folder)
     _refuse_existing(folder, force)
-    listed = [run for path in runs for run in runs_of(Path(path), suite)]
+    listed = [run for path in runs for run in runs_of(Path(path), suite, algorithm)]
     refuse_other_specs(listed, suite)
     fields = {
         "suite": {"name": suite.versioned_name, "digest": suite.digest},
@@ -132,29 +132,24 @@ def _submission(
     ]
     submission = Submission.from_dict({**fields, "created": now(), "runs": runs})
     check_names(submission)
-    check_runs(suite.suite, submission)
+    check_runs(suite.suite, submission, [run.source for run in listed])
     return submission
 
 
 def _training_facts(listed: list[SubmittedRun]) -> Training:
     """Facts of the training from the records of the runs; empty without records."""
-    records = [run.record for run in listed if run.record is not None]
-    if not records:
+    known = [run.provenance for run in listed if run.provenance is not None]
+    if not known:
         return Training()
-    libraries, settings = set(), set()
-    for record in records:
-        versions = record.versions
+    libraries = set()
+    for versions in (each.versions for each in known):
         names = ("stable_baselines3", "torch", "sme_registry", "python")
         libraries.add(", ".join(f"{name} {versions[name]}" for name in names if name in versions))
-        settings.add(
-            f"{record.algorithm}, {record.hyperparameters}; actions in "
-            f"{_RANGES[record.action_range]}; num_envs={record.num_envs}"
-        )
-    seconds = [record.wall_seconds for record in records]
+    seconds = [each.seconds for each in known]
     return Training(
         library=_shortened("; ".join(sorted(libraries)), 200),
-        hyperparameters=_shortened("\n".join(sorted(settings)), 2000),
-        hardware=f"CPU; {statistics.median(seconds):,.0f} s a run (median of {len(records)}), "
+        hyperparameters=_shortened("\n".join(sorted({each.settings for each in known})), 2000),
+        hardware=f"CPU; {statistics.median(seconds):,.0f} s a run (median of {len(known)}), "
         f"{sum(seconds) / 3600:,.1f} h in total",
     )
 

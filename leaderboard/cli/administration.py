@@ -10,21 +10,37 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, Json, ProtocolName, SuiteName, find_suite
+from leaderboard.cli.options import BoardFolder, Json, NewBoardFolder, SuiteName, find_suite
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json
 
 
 def init(
-    board: BoardFolder = Path("board"),
+    board: NewBoardFolder = Path("board"),
     suite: SuiteName = "smoke-v1",
-    protocol: ProtocolName = "paper-v1",
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            help="A protocol's name (see `sme list`) or file; default paper-v1, for practice "
+            "quick-v1."
+        ),
+    ] = None,
     title: Annotated[
         str | None, typer.Option(help="Title of the pages; names the suite by default.")
     ] = None,
     runs_to_rank: Annotated[
-        int, typer.Option(help="Runs that an entry needs in each class to be ranked.")
-    ] = 10,
+        int | None,
+        typer.Option(
+            help="Runs that an entry needs in each class to be ranked; default 10, for practice "
+            "one on each instance."
+        ),
+    ] = None,
+    practice: Annotated[
+        bool,
+        typer.Option(
+            "--practice", help="A board to try things out: few runs give a rank, as its pages say."
+        ),
+    ] = False,
 ) -> None:
     """Create a board with its key and two reference rows, which wait to be scored.
 
@@ -35,13 +51,20 @@ def init(
 
       sme-leaderboard init board --suite core
 
+      sme-leaderboard init board --practice
+
       sme-leaderboard score board
     """
     from leaderboard import intake
+    from leaderboard.documents.board import RUNS_TO_RANK
     from leaderboard.store import Store
     from sme_registry.evaluation import resolve_protocol
 
     file = find_suite(suite)
+    protocol = protocol or ("quick-v1" if practice else "paper-v1")
+    if runs_to_rank is None:
+        instances = min(len(member.seeds) for member in file.suite.classes)
+        runs_to_rank = min(instances, RUNS_TO_RANK - 1) if practice else RUNS_TO_RANK
     name, protocol_name = file.versioned_name, Path(protocol).stem
     with Store.create(
         board,
@@ -52,10 +75,18 @@ def init(
         protocol=resolve_protocol(protocol),
         runs_to_rank=runs_to_rank,
     ) as store:
-        ids = intake.submit_references(store)
-    folder = escape(str(board))
-    out().print(f"Created {folder} with suite {name} and protocol {protocol_name}.")
-    out().print(f"Next, score its {len(ids)} reference rows: sme-leaderboard score {folder}")
+        intake.submit_references(store)
+        document = store.document
+    folder, classes = escape(str(board)), len(file.suite.classes)
+    kind = "a practice board" if document.practice else "a board"
+    out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
+    out().print(
+        f"A ranked entry needs {document.runs_needed} trained policies: one on each of the suite's "
+        f"{len(file.suite.instances)} instances, and at least {runs_to_rank} in each of its "
+        f"{classes} classes.",
+        soft_wrap=True,
+    )
+    out().print(f"Next, score the reference rows: sme-leaderboard score {folder}")
 
 
 def score(

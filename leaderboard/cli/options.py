@@ -1,24 +1,122 @@
-"""Arguments that several commands share."""
+"""Arguments that several commands share, and how their text is read."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from leaderboard.documents.board import FILE, BoardDocument, Folder
+from sme_registry.errors import OptionError
 from sme_registry.spec import SuiteFile, catalogue
 
+_HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
+
+
+def is_url(board: str) -> bool:
+    """Whether a board is given by its URL."""
+    return "://" in board
+
+
+def board_folder(board: str | Path) -> Path:
+    """The folder of a board on this machine.
+
+    Raises:
+      OptionError: it is a URL, a file, or nothing that exists.
+    """
+    name = str(board)
+    if is_url(name):
+        raise OptionError(
+            f"{name!r}: must be a board's folder: this command reads its files. Open the URL "
+            "in a browser for the ranking. `submit`, `show`, `check` and `withdraw` accept a URL."
+        )
+    path = Path(board)
+    if path.is_file():
+        raise OptionError(f"{name!r}: is a file. Give the folder that contains board.json.")
+    if path.exists():
+        return path
+    if _HOST.fullmatch(name):
+        raise OptionError(
+            f"{name!r}: no such folder. For a served board, give the whole URL, such as "
+            f"http://{name}"
+        )
+    suite = _suite_named(name)
+    if suite is not None:
+        raise OptionError(f"{name!r}: no such folder. {_how_to_use(suite)}")
+    raise OptionError(
+        f"{name!r}: no such folder. Correct it, or create a board with "
+        f"`sme-leaderboard init {name}`."
+    )
+
+
+def new_board_folder(board: str | Path) -> Path:
+    """The folder of a board to create.
+
+    Raises:
+      OptionError: it is a URL, a file, or the name of a suite.
+    """
+    name = str(board)
+    if is_url(name):
+        raise OptionError(
+            f"{name!r}: must be a folder on this machine. To serve a board at a URL, create "
+            "it and run `sme-leaderboard serve`."
+        )
+    if Path(board).is_file():
+        use = f" To use this suite: sme-leaderboard init board --suite {name}"
+        raise OptionError(f"{name!r}: is a file. Give a new folder.{use * name.endswith('.json')}")
+    suite = _suite_named(name)
+    if suite is not None:
+        raise OptionError(
+            f"{name!r}: must be a folder. {_how_to_use(suite)}. For a folder of this "
+            f"name, give .{os.sep}{name}"
+        )
+    return Path(board)
+
+
+def board_or_url(board: str) -> str:
+    """A board's folder or the URL of a served board, as it is given.
+
+    Raises:
+      OptionError: see `board_folder`.
+    """
+    return board if is_url(board) else str(board_folder(board))
+
+
+def _suite_named(name: str) -> SuiteFile | None:
+    """The suite of the catalogue with this name, with or without its version."""
+    suites = catalogue.entries(SuiteFile)
+    return next((file for file in suites if name in (file.name, file.versioned_name)), None)
+
+
+def _how_to_use(suite: SuiteFile) -> str:
+    return (
+        f"{suite.name} is a suite. To create a board for it: sme-leaderboard init board "
+        f"--suite {suite.name}"
+    )
+
+
 BoardFolder = Annotated[
-    Path, typer.Argument(metavar="BOARD", help="The board's folder.", show_default=True)
+    Path, typer.Argument(metavar="BOARD", help="The board's folder.", parser=board_folder)
+]
+NewBoardFolder = Annotated[
+    Path, typer.Argument(metavar="BOARD", help="The board's new folder.", parser=new_board_folder)
 ]
 BoardOrUrl = Annotated[
-    str, typer.Argument(metavar="BOARD", help="A board's folder, or the URL of a served board.")
+    str,
+    typer.Argument(
+        metavar="BOARD",
+        help="A board's folder, or the URL of a served board.",
+        parser=board_or_url,
+    ),
 ]
 BundleFolder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="The submission's folder.")]
-SuiteName = Annotated[str, typer.Option(help="A suite's name (see `sme list`) or file.")]
-ProtocolName = Annotated[str, typer.Option(help="A protocol's name (see `sme list`) or file.")]
+SuiteName = Annotated[
+    str,
+    typer.Option(help="A suite's name (see `sme list`) or file, or the board that has it."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 KEY_VARIABLE = "SME_LEADERBOARD_KEY"
 DEFAULT_KEY = Path(typer.get_app_dir("sme-leaderboard")) / "ed25519.key"
@@ -29,11 +127,24 @@ KeyFile = Annotated[
 
 
 def find_suite(name: str) -> SuiteFile:
-    """A suite by its name in the catalogue or its file's path."""
+    """A suite by its name in the catalogue, its file's path, or a board that has it.
+
+    Raises:
+      UnknownNameError, SpecError: there is none, or it is invalid.
+      BoardError: the served board cannot be reached.
+    """
+    if is_url(name) or os.path.isfile(os.path.join(name, FILE)):
+        return board_document(name).suite_file
     is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
     return SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
 
 
-def is_url(board: str) -> bool:
-    """Whether a board is given by its URL."""
-    return board.startswith(("http://", "https://"))
+def board_document(board: str) -> BoardDocument:
+    """The definition of a board, by its folder or URL.
+
+    Raises:
+      BoardError: there is no board, or it cannot be reached.
+    """
+    from leaderboard.web import client
+
+    return client.board_document(board) if is_url(board) else Folder(board).read()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, Json
+from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url
 from leaderboard.documents.result import Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
@@ -18,6 +18,7 @@ from sme_registry.terminal import Progress, err, fixed, out, print_json, print_p
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.result import Estimate, Result
     from leaderboard.public_view import PublicView
     from leaderboard.scoring.ranking import RankedRow
@@ -79,18 +80,21 @@ def rank(
         if wanted:
             sys.stdout.write(export(rows, metric, document, head))
             return
-    out().print(_ranking_table(rows, metric, document.suite_name))
+    out().print(_ranking_table(rows, metric, document))
 
 
-def _ranking_table(rows: list[RankedRow], metric: Metric, suite: str) -> Table:
+def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
     from leaderboard.scoring.ranking import REASONS
 
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
+    caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()]
+    if board.practice:
+        caption.append(f"A practice board: {board.runs_to_rank} runs in each class give a rank.")
     ranking = table(
-        f"{LABELS[metric]} on {suite} (0 optimal, 1 the constant ½; 95 % intervals)",
+        f"{LABELS[metric]} on {board.suite_name} (0 optimal, 1 the constant ½; 95 % intervals)",
         {},
-        caption="\n".join(f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()),
+        caption="\n".join(caption),
     )
     ranking.add_column("rank", justify="right", no_wrap=True)
     ranking.add_column("method")
@@ -119,9 +123,12 @@ def _interval(value: Estimate) -> str:
 
 
 def show(
-    board: BoardFolder,
+    board: BoardOrUrl,
     id: Annotated[
-        str, typer.Argument(metavar="ID", help="A submission's id, or its first digits.")
+        str,
+        typer.Argument(
+            metavar="ID", help="The submission's id; its first digits suffice for a folder."
+        ),
     ],
     json: Json = False,
 ) -> None:
@@ -134,22 +141,20 @@ def show(
 
       sme-leaderboard show board 3f2a
     """
-    from leaderboard.public_view import public_view
-    from leaderboard.store import Store
-
-    with Store.open(board, read_only=True) as store:
-        view = public_view(store, find_entry(store, id))
+    view = _public_view(board, id)
     if json:
         print_json(view.to_dict())
         return
     _print_submission(view)
     result = view.result
     if view.withheld:
-        out().print(f"[yellow]scores withheld[/]: {escape(view.withheld)}", soft_wrap=True)
+        withheld = escape(_printable(view.withheld))
+        out().print(f"[yellow]scores withheld[/]: {withheld}", soft_wrap=True)
     if result is None:
         return
     if result.status == "rejected":
-        out().print(f"[red]{result.code}[/]: {escape(result.message)}", soft_wrap=True)
+        message = escape(_printable(result.message))
+        out().print(f"[red]{escape(result.code)}[/]: {message}", soft_wrap=True)
         return
     out().print(_scores_table(result))
     out().print(_class_table(result))
@@ -157,28 +162,47 @@ def show(
         out().print("[yellow]oracle-like[/]: so close to π* that the method's code is required.")
 
 
-def _print_submission(view: PublicView) -> None:
-    from leaderboard.exports import one_line
+def _public_view(board: str, id: str) -> PublicView:
+    """What a board's folder or a served board publishes about a submission."""
+    from leaderboard.public_view import PublicView, public_view
+    from leaderboard.store import Store
+    from leaderboard.web import client
 
-    entry, submission = view.entry, view.signed.submission
+    if is_url(board):
+        return PublicView.from_dict(client.status(board, id))
+    with Store.open(board, read_only=True) as store:
+        return public_view(store, find_entry(store, id))
+
+
+def _print_submission(view: PublicView) -> None:
+    submission = view.signed.submission
+    method, runs = submission.method, submission.runs
+    steps = sum(run.steps for run in runs)
     pairs: dict[str, object] = {
-        "id": entry.id,
-        "received": entry.received,
-        "key": entry.key,
-        "family, knowledge": f"{entry.family}, {entry.knowledge}",
-        "code": entry.code_link or "none",
-        "runs": f"{entry.runs:,} with {entry.steps:,} steps in total",
+        "id": view.id,
+        "received": view.received,
+        "key": submission.submitter.key,
+        "family, knowledge": f"{method.family}, {method.knowledge}",
+        "code": submission.code or "none",
+        "runs": f"{len(runs):,} with {steps:,} steps in total",
         "training": submission.training.library or "not stated",
         "statement": submission.statement or "none",
     }
     if view.withdrawal is not None:
-        reason = one_line(view.withdrawal.withdrawal.reason)
-        pairs["reason for withdrawal"] = reason or "not stated"
+        pairs["reason for withdrawal"] = view.withdrawal.withdrawal.reason or "not stated"
+    title = f"{method.name} {method.version}", submission.submitter.name, view.status
+    name, submitter, status = (escape(_printable(text)) for text in title)
     print_pairs(
-        f"[bold]{escape(entry.method)} {escape(entry.version)}[/] by {escape(entry.submitter)}: "
-        f"{entry.status}",
-        pairs,
+        f"[bold]{name}[/] by {submitter}: {status}",
+        {label: _printable(str(value)) for label, value in pairs.items()},
     )
+
+
+def _printable(text: str) -> str:
+    """Text without control characters: a served board may be hostile."""
+    from leaderboard.exports import one_line
+
+    return "\n".join(map(one_line, text.splitlines()))
 
 
 def _scores_table(result: Result) -> Table:

@@ -15,8 +15,9 @@ from leaderboard.cli.options import (
     BundleFolder,
     Json,
     KeyFile,
-    ProtocolName,
     SuiteName,
+    board_document,
+    board_or_url,
     find_suite,
     is_url,
 )
@@ -28,7 +29,9 @@ from sme_registry.errors import OptionError
 from sme_registry.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
+    from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.result import Result
+    from sme_registry.spec import SuiteFile
 
 
 def keygen(key: KeyFile = DEFAULT_KEY) -> None:
@@ -78,13 +81,20 @@ def new(
         list[str],
         typer.Option(
             "--runs",
-            help="Run folders of `sme train`, or a file runs.json that lists spec, policy, steps "
-            "and seed of each run, with policy null if it failed. Accepts patterns; repeatable.",
+            help="Run folders of `sme train`, a folder of `sme study run --keep-models`, or a file "
+            "runs.json that lists spec, policy, steps and seed of each run, with policy null if it "
+            "failed. Accepts patterns; repeatable.",
         ),
     ],
     method: Annotated[str, typer.Option(help="Name of the method, as the board shows it.")],
     submitter: Annotated[str, typer.Option(help="Your name or your lab's.")],
     suite: SuiteName = "smoke-v1",
+    algorithm: Annotated[
+        str | None,
+        typer.Option(
+            "--algorithm", "-a", help="Of --runs with several algorithms, the one to submit."
+        ),
+    ] = None,
     method_version: Annotated[str, typer.Option(help="Version of the method.")] = "1",
     family: Annotated[
         str | None, typer.Option(help="Family such as PPO; the method's name by default.")
@@ -112,9 +122,14 @@ def new(
 ) -> None:
     """Create a signed submission from trained runs.
 
-    Every instance of the suite needs a run; `sme show smoke` lists the instances.
+    Every instance of the suite needs a run; `sme show smoke` lists the instances. A study of the
+    suite trains on all of them.
 
     Examples:
+
+      sme study run smoke --folder runs/smoke --keep-models
+
+      sme-leaderboard new ppo --runs runs/smoke -a PPO --method PPO --submitter "A Lab"
 
       sme train sha256:dfe78aa6aba8 --algorithm TD3 --seed 0
 
@@ -138,12 +153,13 @@ def new(
             code=code,
             statement=statement,
             runs_started=_runs_started(started or []),
+            algorithm=algorithm,
             force=force,
             progress=progress.update_of,
         )
     runs_listed = len(new_bundle.signed.submission.runs)
     out().print(f"{new_bundle.signed.id}\n{runs_listed} runs", soft_wrap=True)
-    out().print(f"Next: sme-leaderboard check {escape(str(bundle))}", soft_wrap=True)
+    out().print(f"Next: sme-leaderboard check {escape(str(bundle))} BOARD", soft_wrap=True)
 
 
 def _expanded(patterns: list[str]) -> list[Path]:
@@ -173,30 +189,64 @@ def _runs_started(pairs: list[str]) -> dict[str, int]:
 
 def check(
     bundle: BundleFolder,
-    suite: Annotated[
-        str | None, typer.Option(help="The suite's file, if it is not in the catalogue.")
+    board: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="BOARD",
+            help="The folder or URL of the board to submit to; default a board of the suite with "
+            "the protocol paper-v1.",
+            parser=board_or_url,
+        ),
     ] = None,
-    protocol: ProtocolName = "paper-v1",
+    suite: Annotated[
+        str | None,
+        typer.Option(help="Without BOARD: the suite's file, if it is not in the catalogue."),
+    ] = None,
+    protocol: Annotated[
+        str | None,
+        typer.Option(help="Without BOARD: a protocol's name (see `sme list`) or file."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Score a submission locally, exactly as the board does: all checks, sandbox and scores.
 
     Examples:
 
-      sme-leaderboard check td3
+      sme-leaderboard check td3 board
 
       sme-leaderboard check td3 --protocol quick-v1
     """
     from leaderboard.bundle import Bundle
-    from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.checks import check_submission
     from leaderboard.scoring.score import score_submission
-    from sme_registry.evaluation import resolve_protocol
 
     content = Bundle.read(bundle)
     submission = content.signed.submission
-    file = find_suite(suite or submission.suite.name)
-    board = BoardDocument(
+    if board is None:
+        document = _board_of(find_suite(suite or submission.suite.name), protocol or "paper-v1")
+    elif suite is None and protocol is None:
+        document = board_document(board)
+    else:
+        raise OptionError("--suite, --protocol: BOARD has both. Leave them out, or BOARD.")
+    check_submission(document, submission, datetime.datetime.now(datetime.UTC))
+    with Progress("scoring", len(submission.runs), console=err(), unit="states") as progress:
+        result = score_submission(
+            document, submission, content.artefact, progress=progress.update_of
+        )
+    if json:
+        print_json(result.to_dict())
+    if result.status == "rejected":
+        raise Rejection(result.code, result.message)
+    if not json:
+        _print_scores(result)
+
+
+def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
+    """A board of a suite that does not exist, to score by."""
+    from leaderboard.documents.board import BoardDocument
+    from sme_registry.evaluation import resolve_protocol
+
+    return BoardDocument(
         title="check",
         suite_name=file.versioned_name,
         suite=file.suite,
@@ -204,15 +254,6 @@ def check(
         protocol=resolve_protocol(protocol),
         key="0" * 64,
     )
-    check_submission(board, submission, datetime.datetime.now(datetime.UTC))
-    with Progress("scoring", len(submission.runs), console=err(), unit="states") as progress:
-        result = score_submission(board, submission, content.artefact, progress=progress.update_of)
-    if json:
-        print_json(result.to_dict())
-    if result.status == "rejected":
-        raise Rejection(result.code, result.message)
-    if not json:
-        _print_scores(result)
 
 
 def _print_scores(result: Result) -> None:

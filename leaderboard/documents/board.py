@@ -33,10 +33,13 @@ from sme_registry.spec import (
     SMESpec,
     StrictModel,
     Suite,
+    SuiteFile,
 )
 
 FILE = "board.json"
 KEY = "board.key"
+RUNS_TO_RANK = 10
+"""Runs in each class that a rank needs, unless the board is for practice."""
 
 
 class Limits(StrictModel):
@@ -66,7 +69,8 @@ class BoardDocument(Document):
       suite_name: the suite's versioned name, such as `smoke-v1`.
       protocol_name: the protocol's, such as `paper-v1`.
       key: the public key of the log's signatures.
-      runs_to_rank: runs that a ranked entry needs in each class.
+      runs_to_rank: runs that a ranked entry needs in each class; below 10 the board is for
+        practice, and says so.
       draws: number of bootstrap resamples.
     """
 
@@ -78,9 +82,29 @@ class BoardDocument(Document):
     protocol_name: Name
     protocol: EvaluationProtocol
     key: PublicKey
-    runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = 10
+    runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = RUNS_TO_RANK
     draws: Annotated[Integer, Field(ge=100, le=10**6)] = 10_000
     limits: Limits = Limits()
+
+    @property
+    def practice(self) -> bool:
+        """Whether entries are ranked by so few runs that the ranking proves little."""
+        return self.runs_to_rank < RUNS_TO_RANK
+
+    @property
+    def runs_needed(self) -> int:
+        """Runs of a ranked entry: at least one on each instance, and enough in each class."""
+        return sum(max(len(one.seeds), self.runs_to_rank) for one in self.suite.classes)
+
+    @property
+    def suite_file(self) -> SuiteFile:
+        """The suite as a file, from which others train on it."""
+        name, _, version = self.suite_name.rpartition("-v")
+        named = {"name": name, "version": int(version)} if name and version.isdecimal() else {}
+        named = named or {"name": self.suite_name}
+        return SuiteFile.from_dict(
+            {**named, "digest": self.suite.digest, "suite": self.suite.to_dict()}
+        )
 
     @property
     def suite_reference(self) -> SuiteReference:
@@ -126,7 +150,8 @@ class Folder:
         """
         if not self.board.is_file():
             raise BoardError(
-                f"{self.path}: holds no board. Create one with `sme-leaderboard init {self.path}`."
+                f"{self.path}: contains no board (no {FILE}). Give a board's folder, or create a "
+                "board with `sme-leaderboard init`."
             )
         try:
             return BoardDocument.from_dict(read_json(self.board), str(self.board))

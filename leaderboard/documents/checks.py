@@ -22,6 +22,7 @@ import datetime
 import re
 import unicodedata
 from collections import Counter
+from collections.abc import Sequence
 
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.submission import (
@@ -144,8 +145,13 @@ def _folded(name: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def check_runs(suite: Suite, submission: Submission) -> None:
+def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()) -> None:
     """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
+
+    Args:
+      suite: the board's suite.
+      submission: the submission.
+      sources: what to call each run in an error, such as its folder; empty for `runs.0`, ….
 
     Raises:
       Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
@@ -160,14 +166,14 @@ def check_runs(suite: Suite, submission: Submission) -> None:
                 f"{len(class_of)} instances (`sme show {submission.suite.name}`). Train on those, "
                 "or submit to a board of its suite.",
             )
-    _check_duplicates(submission)
+    _check_duplicates(submission, sources or [f"runs.{i}" for i in range(len(submission.runs))])
     ran = {run.spec for run in submission.runs}
     for digest, name in class_of.items():
         if digest not in ran:
             raise Rejection(
                 "missing_run",
                 f"runs: none on {digest} of class {name}: every instance must have one. "
-                "Train on it, or list a failed run with artefact null, which scores 1.",
+                "Train on it, or list a failed run (policy null in runs.json), which scores 1.",
             )
     _check_started(submission, Counter(class_of[run.spec] for run in submission.runs))
 
@@ -180,8 +186,7 @@ def refuse_unsubmittable(board: BoardDocument) -> None:
     Raises:
       BoardError: they exceed the size limit of a submission.
     """
-    needed = sum(max(len(one.instances), board.runs_to_rank) for one in board.suite.classes)
-    most = most_runs(board)
+    needed, most = board.runs_needed, most_runs(board)
     if needed > most:
         raise BoardError(
             f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, one on each instance "
@@ -235,19 +240,19 @@ def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
         )
 
 
-def _check_duplicates(submission: Submission) -> None:
+def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
     first: dict[tuple[str, str, int | str], int] = {}
     for index, run in enumerate(submission.runs):
-        values: list[tuple[str, str, int | str]] = [("seed", "seed", run.seed)]
+        values: list[tuple[str, int | str]] = [("seed", run.seed)]
         if run.artefact is not None:
-            values.append(("artefact.sha256", "policy", run.artefact.sha256))
-        for field, name, value in values:
-            before = first.setdefault((run.spec, field, value), index)
+            values.append(("policy", run.artefact.sha256))
+        for name, value in values:
+            before = first.setdefault((run.spec, name, value), index)
             if before != index:
                 raise Rejection(
                     "duplicate_run",
-                    f"runs.{index}.{field}={value}: runs.{before} has the same spec and {name}. "
-                    "Remove one of them.",
+                    f"{sources[index]}: {name}={value}: {sources[before]} has the same spec and "
+                    f"{name}. Remove one of them.",
                 )
 
 
@@ -258,14 +263,15 @@ def _check_started(submission: Submission, listed: Counter[str]) -> None:
             raise Rejection(
                 "missing_run",
                 f"runs_started.{name}: must be a class of the suite: {', '.join(listed)}. "
-                "Rename or remove it.",
+                "Rename or remove it (option --started).",
             )
     for name, count in listed.items():
         if started.get(name, 0) < count:
             raise Rejection(
                 "missing_run",
                 f"runs_started.{name}={started.get(name)}: must be at least {count}, the number of "
-                "listed runs. Count every run that was ever started with this method.",
+                "listed runs. Count every run that was ever started with this method (option "
+                "--started).",
             )
     if sum(started.values()) > MAX_RUNS:
         raise Rejection(

@@ -16,12 +16,12 @@ from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 from leaderboard.bundle import Bundle
-from leaderboard.documents.board import hex_of
+from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
-from sme_registry.errors import MalformedDocumentError, OptionError
+from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
 from sme_registry.io import parse_json, require_packages
 
 if TYPE_CHECKING:
@@ -88,6 +88,21 @@ def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
     with _Client(url, insecure=insecure) as client:
         _, answer = client.request("GET", f"/api/submissions/{_digits(id)}")
     return _answer_for(f"sha256:{_digits(id)}", answer, url)
+
+
+def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
+    """The definition of a served board: suite, protocol and limits.
+
+    Raises:
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL is invalid.
+    """
+    with _Client(url, insecure=insecure) as client:
+        _, answer = client.request("GET", "/definition.json")
+    try:
+        return BoardDocument.from_dict(answer)
+    except SpecError as error:
+        raise BoardError(f"{url}: its definition is invalid: {_printable(error)}") from None
 
 
 def withdraw(

@@ -32,6 +32,13 @@ SpecChanges = Annotated[
 Protocol = Annotated[
     str, typer.Option(help="Evaluation protocol: a name from `sme list`, or a path.")
 ]
+DatasetsFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--datasets",
+        help="Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets.",
+    ),
+]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder.")]
 ActionRange = Annotated[
     str | None,

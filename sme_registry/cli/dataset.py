@@ -14,6 +14,7 @@ from rich.table import Table
 from sme_registry import load
 from sme_registry.cli.arguments import (
     ActionRange,
+    DatasetsFolder,
     Force,
     Json,
     Protocol,
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from sme_registry.datasets import Dataset
     from sme_registry.datasets.scores import PolicyScore
 
+_DEFAULT = "MINARI_DATASETS_PATH, or ~/.minari/datasets"
+
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -42,16 +45,8 @@ app = typer.Typer(
     """,
 )
 
-Folder = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        "-o",
-        help="Folder of data sets; default MINARI_DATASETS_PATH, or ~/.minari/datasets.",
-    ),
-]
 Name = Annotated[
-    str, typer.Argument(metavar="ID|PATH", help="The id of a data set, or its folder.")
+    str, typer.Argument(metavar="DATASET", help="The id of a data set, or its folder.")
 ]
 
 
@@ -83,7 +78,10 @@ def make(
     name: Annotated[
         str | None, typer.Option(help="Minari id, such as sme/mine-v0; default from the settings.")
     ] = None,
-    out_folder: Folder = None,
+    out_folder: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help=f"Folder of data sets to add to; default {_DEFAULT}."),
+    ] = None,
     set_: SpecChanges = None,
     force: Force = False,
     json: Json = False,
@@ -145,25 +143,25 @@ def _weighted(text: str) -> tuple[Any, float]:
 
 
 @app.command("list")
-def list_(out_folder: Folder = None, json: Json = False) -> None:
+def list_(folder: DatasetsFolder = None, json: Json = False) -> None:
     """List the data sets in a folder.
 
     Examples:
 
       sme dataset list
 
-      sme dataset list --out data --json
+      sme dataset list --datasets data --json
     """
     from sme_registry.datasets import datasets_folder, list_datasets
 
-    datasets, broken = list_datasets(out_folder)
+    datasets, broken = list_datasets(folder)
     if json:
         print_json([_summary(dataset) for dataset in datasets])
     elif datasets:
         out().print(_datasets_table(datasets))
     else:
         err().print(
-            f"There are no data sets in {escape(str(datasets_folder(out_folder)))}. "
+            f"There are no data sets in {escape(str(datasets_folder(folder)))}. "
             "To make one, see `sme dataset make --help`.",
             soft_wrap=True,
         )
@@ -172,7 +170,7 @@ def list_(out_folder: Folder = None, json: Json = False) -> None:
 
 
 @app.command("show")
-def show(name: Name, out_folder: Folder = None, json: Json = False) -> None:
+def show(name: Name, folder: DatasetsFolder = None, json: Json = False) -> None:
     """Show a data set: its recipe, scores and digests.
 
     Examples:
@@ -183,13 +181,13 @@ def show(name: Name, out_folder: Folder = None, json: Json = False) -> None:
     """
     from sme_registry.datasets import open_dataset
 
-    _print(open_dataset(name, out_folder), json)
+    _print(open_dataset(name, folder), json)
 
 
 @app.command("validate")
 def validate(
-    sets: Annotated[list[str], typer.Argument(metavar="ID|PATH…", help="Data sets to check.")],
-    out_folder: Folder = None,
+    sets: Annotated[list[str], typer.Argument(metavar="DATASET…", help="Data sets to check.")],
+    folder: DatasetsFolder = None,
     json: Json = False,
 ) -> None:
     """Check data sets bit for bit: location, digests, and every transition recomputed by the task.
@@ -207,8 +205,8 @@ def validate(
     for name in sets:
         result: dict[str, Any] = {"set": name, "valid": True, "error": None}
         try:
-            dataset = open_dataset(name, out_folder)
-            check_location(dataset, out_folder)
+            dataset = open_dataset(name, folder)
+            check_location(dataset, folder)
             replay(dataset.transitions(), dataset.recipe, materialize(dataset.recipe.spec))
             result["arrays_digest"] = dataset.record.arrays_digest
         except SMEError as error:

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sme_registry.cli.arguments import Force, Json, Out, changes
+from sme_registry.cli.arguments import DatasetsFolder, Force, Json, Out, changes
 from sme_registry.cli.files import print_training
 from sme_registry.terminal import Progress, err, table
 
@@ -38,9 +38,7 @@ def train(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
     ] = None,
-    folder: Annotated[
-        Path | None, typer.Option("--datasets", help="Folder of data sets; default Minari's.")
-    ] = None,
+    folder: DatasetsFolder = None,
     out_folder: Out = None,
     force: Force = False,
     json: Json = False,

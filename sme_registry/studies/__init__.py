@@ -17,12 +17,13 @@ if TYPE_CHECKING:
     from sme_registry.studies.engine.cell import run_cell
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
-    from sme_registry.studies.engine.status import StudyStatus, study_status
+    from sme_registry.studies.engine.status import CellStatus, StudyStatus, study_status
     from sme_registry.studies.report.frames import StudyFrames, load
     from sme_registry.studies.report.write import write_report
 
 __all__ = [
     "CellResult",
+    "CellStatus",
     "StudyFrames",
     "StudyStatus",
     "load",
@@ -35,6 +36,7 @@ __all__ = [
 
 _LAZY = {
     "CellResult": "studies.engine.result",
+    "CellStatus": "studies.engine.status",
     "StudyFrames": "studies.report.frames",
     "StudyStatus": "studies.engine.status",
     "load": "studies.report.frames",

@@ -207,3 +207,13 @@ def test_list_reports_broken_data_sets(tmp_path):
     assert "two-v0" not in result.stdout
     assert "invalid:" in result.stderr
     assert "two-v0" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["list", "show", "validate"])
+def test_readers_name_the_folder_of_data_sets_as_offline_train_does(command):
+    assert "--datasets" in good(command, "--help").stdout
+    assert "--datasets" in CliRunner().invoke(app, ["offline", "train", "--help"]).stdout
+    name = () if command == "list" else (NAME,)
+    assert "--out" in refused(command, *name, "--out", "data")
+    good("make", "Default", "-n", "50", "--seed", "7", "--out", "data")
+    assert NAME in good(command, *name, "--datasets", "data").stdout

@@ -16,7 +16,9 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES, Trai
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec, save
 from sme_registry.errors import OptionError, PolicyError, SMEError, SpecError
-from sme_registry.spec import Suite, SuiteFile
+from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
+from sme_registry.studies import CellResult, run_study
+from sme_registry.studies.engine.result import CellFailure
 from sme_registry.training import RunRecord, train
 
 SUITE = Suite.from_dict(
@@ -461,3 +463,75 @@ def test_the_constant_policy_may_stand_for_two_instances_of_one_width(tmp_path, 
     rows = [row(A0, "half.onnx"), row(A1, "half.onnx"), row(B0, None)]
     bundle = made(tmp_path / "bundle", rewritten(table, rows))
     assert len(list((bundle.folder / "artefacts").iterdir())) == 1
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """A study of the suite: one algorithm ran, with its models kept, and one did not."""
+    folder = tmp_path_factory.mktemp("study") / "runs"
+    names = {"A2C": "A2C", "Other": "TD3"}
+    fields = {
+        "classes": [one.to_dict() for one in SUITE.classes],
+        "algorithms": [{"name": name, "uses": uses} for name, uses in names.items()],
+        "seeds": 2,
+        "steps": 10,
+        "evaluations": 1,
+        "evaluation_episodes": 1,
+        "protocol": {"states_per_region": 2},
+    }
+    plan = StudyPlan.from_dict(fields)
+    file = StudyFile(name="two", digest=plan.digest, plan=plan)
+    only = ["algorithm=A2C"]
+    run_study(file, folder, executor="in-process", keep_models=True, only=only)
+    return folder
+
+
+def test_the_runs_of_a_study_are_submitted_with_their_records(tmp_path, study):
+    bundle = made(tmp_path / "bundle", study)  # the only algorithm that ran
+    submission = Bundle.read(bundle.folder).signed.submission
+    assert {run.spec for run in submission.runs} == {spec.digest for spec in SUITE.instances}
+    assert all(run.steps >= 10 and run.artefact is not None for run in submission.runs)
+    assert "stable_baselines3" in submission.training.library
+    assert submission.training.hyperparameters.startswith("A2C, default hyperparameters")
+    assert made(tmp_path / "same", study, algorithm="a2c").signed.submission.runs
+
+
+def test_a_study_that_is_not_finished_or_has_no_such_algorithm_is_refused(tmp_path, study):
+    with pytest.raises(OptionError, match=r"4 of 4 runs are not finished"):
+        made(tmp_path / "bundle", study, algorithm="Other")
+    with pytest.raises(OptionError, match=r"algorithm='TD3': .* has runs of A2C"):
+        made(tmp_path / "bundle", study, algorithm="TD3")
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_a_failed_run_of_a_study_is_submitted_without_a_policy(tmp_path, study):
+    copy = tmp_path / "copy"
+    shutil.copytree(study, copy)
+    result = next((copy / "cells").iterdir())
+    cell = CellResult.from_dict(json.loads(result.read_text()))
+    failure = CellFailure(key=cell.key, cell=cell.cell, error="diverged", traceback="", versions={})
+    (copy / "failed").mkdir(exist_ok=True)
+    (copy / "failed" / result.name).write_text(json.dumps(failure.to_dict()))
+    result.unlink()
+    runs = made(tmp_path / "bundle", copy).signed.submission.runs
+    failed = [run for run in runs if run.artefact is None]
+    assert [(run.spec, run.seed) for run in failed] == [(cell.cell.spec.digest, cell.cell.seed)]
+
+
+def test_a_study_without_models_is_refused(tmp_path, study):
+    copy = tmp_path / "copy"
+    shutil.copytree(study, copy)
+    shutil.rmtree(copy / "models")
+    with pytest.raises(OptionError, match="--keep-models"):
+        made(tmp_path / "bundle", copy)
+
+
+def test_an_algorithm_selects_among_the_folders_of_trained_runs(tmp_path, trained, failed):
+    with pytest.raises(Rejection, match=f"missing_run: runs: none on {A0.digest}.*policy null"):
+        made(tmp_path / "bundle", trained, failed, algorithm="TD3")
+    assert made(tmp_path / "bundle", trained, failed, algorithm="a2c")
+
+
+def test_a_run_that_is_listed_twice_is_named_by_its_source(tmp_path, trained, failed):
+    with pytest.raises(Rejection, match=r"A2C/0: seed=3: .*A2C/0 has the same"):
+        made(tmp_path / "bundle", trained, trained, failed)

@@ -19,6 +19,7 @@ from leaderboard.store import Store
 from sme_registry import EvaluationProtocol, SMESpec
 from sme_registry.spec import ProtocolFile, SuiteFile
 from tests.leaderboard.conftest import linear_onnx, tiny_suite
+from tests.leaderboard.serving import serving
 
 READERS = ("rank", "show", "verify")
 KEEPERS = ("init", "score", "site", "serve", "reindex", "gc", "demo")
@@ -181,6 +182,127 @@ def test_invalid_usage_exits_with_2() -> None:
     assert "at most one" in fails(2, "rank", "board", "--json", "--csv")
     assert "new folder" in fails(2, "init", "board", "--suite", "tiny-v1.json")
     assert "no submission" in fails(2, "show", "board", "abcdef0123")
+
+
+@pytest.mark.parametrize("command", ["verify", "score", "site", "serve", "reindex", "gc"])
+def test_a_url_is_no_folder(command: str) -> None:
+    assert "Open the URL" in fails(2, command, "http://127.0.0.1:8000")
+
+
+@pytest.mark.parametrize(
+    ("board", "advice"),
+    [
+        ("http://127.0.0.1:8000", "Open the URL"),
+        ("board/board.json", "Give the folder"),
+        ("tiny-v1.json", "is a file"),
+        ("127.0.0.1:8000", "http://127.0.0.1:8000"),
+        ("core", "init board --suite core"),
+        ("nowhere", "no such folder"),
+        ("empty", "contains no board"),
+    ],
+)
+def test_what_is_no_board_is_refused_with_advice(board: str, advice: str) -> None:
+    make_board()
+    Path("empty").mkdir()
+    before = sorted(Path().rglob("*"))
+    assert advice in fails(2, "rank", board)
+    assert sorted(Path().rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", ["submit", "withdraw", "show", "check"])
+@pytest.mark.parametrize(
+    ("board", "advice"),
+    [("localhost:8000", "http://localhost:8000"), ("smoke-v1", "--suite smoke"), ("x", "folder")],
+)
+def test_commands_that_accept_a_url_say_what_is_wrong_with_another_board(
+    command: str, board: str, advice: str
+) -> None:
+    arguments = (board, "abcd") if command in ("withdraw", "show") else ("bundle", board)
+    assert advice in fails(2, command, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("board", "advice"),
+    [
+        ("core", "init board --suite core"),
+        ("core-v1", "init board --suite core"),
+        ("http://127.0.0.1:8000", "serve"),
+        ("tiny-v1.json", "init board --suite tiny-v1.json"),
+    ],
+)
+def test_init_creates_no_board_where_something_else_was_meant(board: str, advice: str) -> None:
+    before = sorted(Path().rglob("*"))
+    assert advice in fails(2, "init", board)
+    assert sorted(Path().rglob("*")) == before
+
+
+def test_a_folder_may_have_the_name_of_a_suite() -> None:
+    good("init", "./core", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")
+    assert Store.open("core", read_only=True).document.suite_name == "tiny-v1"
+    assert "waiting" in fails(2, "rank", "core")
+
+
+def test_a_practice_board_ranks_few_runs_and_says_so() -> None:
+    good("keygen")
+    created = good("init", "board", "--suite", "tiny-v1.json", "--practice")
+    assert "practice" in created
+    with Store.open("board", read_only=True) as store:
+        assert (store.document.runs_to_rank, store.document.protocol_name) == (1, "quick-v1")
+        assert store.document.runs_needed == 1
+        assert store.document.practice
+    make_bundle()
+    assert "without a rank" not in good("check", "bundle", "board")
+    good("submit", "bundle", "board")
+    good("score", "board")
+    ranking = json.loads(good("rank", "board", "--json"))
+    assert ranking["runs_to_rank"] == 1
+    assert [row["first"] for row in ranking["rows"] if row["method"] == "Linear"] == [1]
+    assert "practice" in good("rank", "board")
+    good("site", "board", "--out", "public")
+    assert "practice board" in Path("public/index.html").read_text()
+
+
+def test_a_board_says_at_its_creation_how_many_runs_a_rank_needs() -> None:
+    created = good("init", "board", "--suite", "smoke")
+    with Store.open("board", read_only=True) as store:
+        assert store.document.runs_needed == 30
+        assert not store.document.practice
+    assert "30 trained policies" in created
+    assert "practice" not in created
+
+
+def test_check_scores_as_the_board_that_is_given() -> None:
+    good("keygen")
+    make_board()
+    make_bundle()
+    at_home = json.loads(good("check", "bundle", "board", "--json"))
+    assert at_home["enough_runs"]  # two runs suffice on this board, and ten elsewhere
+    with Store.open("board", read_only=True) as store:
+        assert at_home["protocol"] == store.document.protocol.digest
+    message = fails(2, "check", "bundle", "board", "--protocol", "small-v1.json")
+    assert "BOARD has both" in message
+
+
+def test_everything_a_submitter_needs_is_at_the_boards_address() -> None:
+    good("keygen")
+    make_board()
+    with serving(Path("board")) as url:
+        id = good(
+            "new", "bundle", "--runs", "runs.json", "--suite", url, "--method", "Linear",
+            "--submitter", "A Lab",
+        ).split()[0]  # fmt: skip
+        assert json.loads(good("check", "bundle", url, "--json"))["enough_runs"]
+        assert good("submit", "bundle", url).strip() == id
+        assert "waiting" in good("show", url, id)
+        good("score", "board")
+        assert "WD regret" in good("show", url, id)
+        remote = json.loads(good("show", url, id, "--json"))
+        good("withdraw", url, id)
+        assert "withdrawn" in good("show", url, id)
+    assert remote["result"]["scores"]["wd_regret"]["value"] > 0
+    good("site", "board", "--out", "public")
+    assert SuiteFile.read("public/suite.json") == SuiteFile.read("tiny-v1.json")
+    assert json.loads(Path("public/definition.json").read_text())["runs_to_rank"] == 2
 
 
 def test_a_board_whose_references_wait_shows_nothing() -> None:

@@ -5,6 +5,7 @@
     compare.html, board-data.js         comparison of chosen entries, drawn by static/board.js
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
     method.html                         the formulas
+    suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
 Jinja2 escapes all text from submitters. Only the drawings are marked as safe; they contain numbers
@@ -22,7 +23,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from leaderboard import exports
-from leaderboard.documents.board import hex_of
+from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES
@@ -30,6 +31,8 @@ from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
 from leaderboard.web.site import charts
 from leaderboard.web.site.rows import SHORT, TABS, https_only, run_rows, steps_text
+from sme_registry.io import to_json
+from sme_registry.spec import StrictModel
 
 STATIC = Path(__file__).parent / "static"
 LOG_ROWS = 200  # entries on a page of the log; a full page never changes again
@@ -42,6 +45,10 @@ _TYPES = {
     ".csv": "text/csv; charset=utf-8",
     ".tex": "text/plain; charset=utf-8",
     ".svg": "image/svg+xml",
+}
+_DEFINITIONS: dict[str, Callable[[BoardDocument], StrictModel]] = {
+    "suite.json": lambda board: board.suite_file,
+    "definition.json": lambda board: board,
 }
 _EXPORTS = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
 
@@ -209,6 +216,8 @@ class Pages:
         folder, _, name = path.rpartition("/")
         if folder == "static":
             return _static().get(name)
+        if path in _DEFINITIONS:  # without scores, and needed to train for the board
+            return to_json(_DEFINITIONS[path](self.document).to_dict()).encode()
         self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
@@ -218,6 +227,7 @@ class Pages:
     def paths(self) -> Iterator[str]:
         """The paths of all files of the site; `index.html` last, so that its links work."""
         yield from (f"static/{name}" for name in _static())
+        yield from _DEFINITIONS
         for entry in self.entries:
             digits = hex_of(entry.id)
             yield f"submissions/{digits}.json"

@@ -229,14 +229,14 @@ def test_a_run_on_another_spec_is_refused():
 
 def test_the_same_spec_and_seed_twice_is_refused():
     refused(
-        "duplicate_run", "runs.3.seed=0: runs.1 has the same", runs=[*RUNS, run(A1, 0, policy(9))]
+        "duplicate_run", "runs.3: seed=0: runs.1 has the same", runs=[*RUNS, run(A1, 0, policy(9))]
     )
 
 
 def test_the_same_policy_twice_on_one_spec_is_refused():
     refused(
         "duplicate_run",
-        "runs.3.artefact.sha256=.*1: runs.0 has the same",
+        "runs.3: policy=sha256.*1: runs.0 has the same",
         runs=[*RUNS, run(A0, 1, policy(1))],
     )
 

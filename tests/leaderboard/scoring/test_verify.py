@@ -161,7 +161,7 @@ def test_an_invalid_digest_is_rejected(board):
 
 
 def test_a_missing_board_is_not_tampering(tmp_path):
-    with pytest.raises(BoardError, match="holds no board"):
+    with pytest.raises(BoardError, match="contains no board"):
         verify(tmp_path)
     with pytest.raises(OptionError, match="rescore=-1"):
         verify(tmp_path, rescore=-1)
