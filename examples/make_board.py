@@ -1,6 +1,6 @@
 """Make a leaderboard: the small one in `examples/board`, or one from your own training runs.
 
-    pip install 'sme-registry[leaderboard]'
+    pip install '.[leaderboard]'
     python examples/make_board.py --out examples/board       # small: about a minute, no PyTorch
     python examples/make_board.py --out board --suite smoke-v1 --protocol paper-v1 \
         --runs PPO runs/ppo --runs TD3 runs/td3

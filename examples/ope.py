@@ -1,6 +1,6 @@
 """Off-policy evaluation compared with the exact return: fitted Q evaluation (FQE) as an example.
 
-    pip install 'sme-registry[fast]'
+    pip install '.[fast]'
     python examples/ope.py --env Default --nu 1 --seeds 0 1 2
 
 A behaviour policy of quality ν collects 20,000 transitions. From these alone, FQE estimates the

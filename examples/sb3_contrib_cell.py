@@ -1,6 +1,6 @@
 """Compare algorithms from other packages with Stable-Baselines3's, as cells of a study.
 
-    pip install 'sme-registry[fast,train]' sb3-contrib
+    pip install '.[fast,train]' sb3-contrib
     python examples/sb3_contrib_cell.py --env Default --steps 8192 --seeds 0 1 2
 
 The field `uses` names the algorithm of a cell. It can be a class with the interface of

@@ -1,6 +1,6 @@
 """Train a team with TorchRL, and print the exact regret of each agent.
 
-    pip install torchrl 'sme-registry[fast]'
+    pip install torchrl '.[fast]'
     python examples/torchrl_team.py --env Team4 --seeds 0
 
 `make_parallel` returns a PettingZoo environment, which TorchRL's `PettingZooWrapper` accepts

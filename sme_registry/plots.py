@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, as_policy
 from sme_registry.evaluation.report import LABELS
-from sme_registry.io import integer_in, write_atomically
+from sme_registry.io import integer_in, require_packages, write_atomically
 from sme_registry.spec import ActionRange, SMESpec, SpecLike, catalogue
 from sme_registry.task import load_spec, materialize
 from sme_registry.task.draw import Array
@@ -390,15 +390,11 @@ def drawing(
     Raises:
       MissingDependencyError: Matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError(
-            "Figures need Matplotlib, which is not installed. "
-            "Run `pip install 'sme-registry[plot]'`."
-        ) from None
+    require_packages("figures", {"matplotlib": "Matplotlib"}, "plot")
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     drawn: dict[str, bytes] = {}
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size)

@@ -25,8 +25,8 @@ from sme_registry.envs.batch import Batch
 from sme_registry.envs.lanes import Lane
 from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.types import Array, Mask, Observation
-from sme_registry.errors import EpisodeError, MissingDependencyError, OptionError
-from sme_registry.io import integer_in
+from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.io import integer_in, require_packages
 from sme_registry.registration import registered_or_new
 from sme_registry.spec import ActionRange, SMESpec, SpecLike
 from sme_registry.task import Task
@@ -35,10 +35,8 @@ try:
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError:
-    raise MissingDependencyError(
-        "sme_registry.sb3: Stable-Baselines3 is not installed. "
-        "Run `pip install 'sme-registry[train]'`."
-    ) from None
+    require_packages("sme_registry.sb3", {"stable_baselines3": "Stable-Baselines3"}, "train")
+    raise
 
 __all__ = ["LanesVecEnv", "SMETeamVecEnv", "SMEVecEnv"]
 

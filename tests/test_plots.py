@@ -78,7 +78,7 @@ def test_a_figure_that_fails_keeps_the_old_file(tmp_path):
 def test_without_matplotlib_the_message_names_the_extra(tmp_path, report, monkeypatch):
     for module in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'sme-registry\[plot\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install .*\[plot\]"):
         plots.decay_curve(report, tmp_path / "figure.png")
 
 

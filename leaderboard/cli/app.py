@@ -15,6 +15,7 @@ from sme_registry.terminal import CommandGroup, application
 
 class _Commands(CommandGroup):
     exit_codes = ((Rejection, 1), (TamperedError, 3))
+    extra = "leaderboard"
 
 
 app = application(

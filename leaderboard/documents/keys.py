@@ -11,13 +11,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from pydantic import Field
 
 from leaderboard.errors import BoardError
+from sme_registry.io import require_packages
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 Purpose = Literal["submission", "withdrawal", "log", "upload"]
 PublicKey = Annotated[
@@ -37,6 +39,9 @@ class SigningKey:
     @classmethod
     def generate(cls) -> SigningKey:
         """A new key from the operating system's randomness."""
+        _require_cryptography()
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
         return cls(Ed25519PrivateKey.generate())
 
     @classmethod
@@ -46,6 +51,9 @@ class SigningKey:
         Raises:
           BoardError: the file is missing or contains no key.
         """
+        _require_cryptography()
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
         try:
             text = Path(path).read_text("ascii").strip()
             return cls(Ed25519PrivateKey.from_private_bytes(bytes.fromhex(text)))
@@ -92,12 +100,21 @@ class SigningKey:
 
 def verifies(public: str, signature: str, purpose: Purpose, digest: str) -> bool:
     """Whether the signature of this digest and purpose is by this public key."""
+    _require_cryptography()
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
     try:
         key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
         key.verify(bytes.fromhex(signature), _message(purpose, digest))
     except (InvalidSignature, ValueError):
         return False
     return True
+
+
+def _require_cryptography() -> None:
+    """Imported where it is used, so that commands can show their help without it."""
+    require_packages("signatures", {"cryptography": "cryptography"}, "leaderboard")
 
 
 def _message(purpose: Purpose, digest: str) -> bytes:

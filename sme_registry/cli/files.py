@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sme_registry.errors import OptionError
-from sme_registry.io import is_installed, refuse_existing
+from sme_registry.io import install_command, is_installed, refuse_existing
 from sme_registry.terminal import err, out, print_json
 
 
@@ -30,7 +30,10 @@ def can_draw() -> bool:
     """Whether figures can be drawn; prints a warning if not."""
     if is_installed("matplotlib"):
         return True
-    err().print("no figures: matplotlib is not installed (pip install 'sme-registry\\[plot]')")
+    err().print(
+        f"no figures: Matplotlib is not installed ({escape(install_command('plot'))})",
+        soft_wrap=True,
+    )
     return False
 
 

@@ -24,8 +24,7 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
-from sme_registry.errors import MissingDependencyError
-from sme_registry.io import choice, is_installed
+from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array
 
@@ -85,13 +84,10 @@ def chosen_backend() -> Backend:
     """
     asked = os.environ.get(BACKEND_VARIABLE, "auto")
     choice(BACKEND_VARIABLE, asked, ("auto", "numba", "numpy"))
-    installed = is_installed("numba")
-    if asked == "numba" and not installed:
-        raise MissingDependencyError(
-            f"{BACKEND_VARIABLE}='numba': Numba is not installed. "
-            "Run `pip install 'sme-registry[fast]'`, or unset the variable."
-        )
-    return "numba" if installed and asked != "numpy" else "numpy"
+    if asked == "numba":
+        purpose = f"{BACKEND_VARIABLE}='numba'"
+        require_packages(purpose, {"numba": "Numba"}, "fast", otherwise="unset the variable")
+    return "numba" if is_installed("numba") and asked != "numpy" else "numpy"
 
 
 _packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()

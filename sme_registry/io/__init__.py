@@ -13,7 +13,14 @@ from sme_registry.io.files import (
 )
 from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
 from sme_registry.io.locks import Lock, file_lock, is_locked
-from sme_registry.io.packages import import_object, is_installed, require_packages, versions
+from sme_registry.io.packages import (
+    import_object,
+    install_command,
+    is_installed,
+    missing_dependency,
+    require_packages,
+    versions,
+)
 
 __all__ = [
     "MAX_DOCUMENT_BYTES",
@@ -25,9 +32,11 @@ __all__ = [
     "claim_folder",
     "file_lock",
     "import_object",
+    "install_command",
     "integer_in",
     "is_installed",
     "is_locked",
+    "missing_dependency",
     "parse_json",
     "read_json",
     "refuse_existing",

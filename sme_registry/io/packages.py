@@ -1,17 +1,28 @@
-"""Installed packages: their versions, whether they are installed, and objects in them by name."""
+"""Installed packages: their versions, how to install missing ones, and objects in them by name."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import platform
+import re
+import shlex
+import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from sme_registry.errors import MissingDependencyError, SMEError, did_you_mean
 from sme_registry.version import __version__
+
+_NAME = "sme-registry"
+_SOURCE = Path(__file__).parents[2]  # the clone, if the package runs from one
+_EXTRA = re.compile(r"""([\w.-]+).*\bextra\s*==\s*['"]([\w-]+)['"]""")
 
 
 def versions(packages: Iterable[str], *, if_imported: Iterable[str] = ()) -> dict[str, str]:
@@ -38,8 +49,16 @@ def is_installed(package: str) -> bool:
     return importlib.util.find_spec(package) is not None
 
 
-def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> None:
+def require_packages(
+    purpose: str, packages: Mapping[str, str], extra: str, *, otherwise: str = ""
+) -> None:
     """Check that optional packages, full names by the name to import, are installed.
+
+    Args:
+      purpose: what needs them.
+      packages: full names by the name to import.
+      extra: the extra of our package that installs them.
+      otherwise: what to do instead of installing, such as `unset the variable`.
 
     Raises:
       MissingDependencyError: names the purpose, the missing packages, and the command that installs
@@ -47,11 +66,91 @@ def require_packages(purpose: str, packages: Mapping[str, str], extra: str) -> N
     """
     missing = [name for package, name in packages.items() if not is_installed(package)]
     if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        raise MissingDependencyError(
-            f"{purpose}: {' and '.join(missing)} {verb} not installed. "
-            f"Run `pip install 'sme-registry[{extra}]'`."
-        )
+        raise _missing(missing, extra, f"{purpose}: ", otherwise)
+
+
+def missing_dependency(
+    error: ModuleNotFoundError, extra: str = ""
+) -> MissingDependencyError | None:
+    """The error to report instead of a failed import: which extra has the module.
+
+    Args:
+      error: the failed import.
+      extra: the extra to name if it has the module; otherwise the smallest that has it.
+
+    Returns:
+      None if no extra of our package has the module: then the import is a fault of ours.
+    """
+    module = (error.name or "").partition(".")[0]
+    package = module.lower().replace("_", "-")
+    extras = {name: has for name, has in _extras().items() if package in has and name != "dev"}
+    if not extras:
+        return None
+    smallest = min(extras, key=lambda name: len(extras[name]))
+    return _missing([module], extra if extra in extras else smallest)
+
+
+def install_command(extra: str) -> str:
+    """The command that installs an extra in the way in which this package was installed.
+
+    It names the clone, the wheel or the repository that the package came from; only a package from
+    an index is installed again by its name alone.
+    """
+    options, requirement = [], f"{_NAME}[{extra}]"
+    origin = _origin()
+    if (_SOURCE / "pyproject.toml").is_file():
+        options, requirement = ["-e"], _in_folder(_SOURCE, extra)
+    elif "dir_info" in origin:
+        folder = Path(url2pathname(urlsplit(origin["url"]).path))
+        if folder.is_dir():
+            requirement = _in_folder(folder, extra)
+    elif "url" in origin:
+        revision = origin.get("vcs_info", {}).get("vcs")
+        requirement += f" @ {revision + '+' if revision else ''}{origin['url']}"
+    return shlex.join([*_pip(), "install", *options, requirement])
+
+
+def _missing(
+    packages: Sequence[str], extra: str, purpose: str = "", otherwise: str = ""
+) -> MissingDependencyError:
+    verb = "is" if len(packages) == 1 else "are"
+    return MissingDependencyError(
+        f"{purpose}{' and '.join(packages)} {verb} not installed. "
+        f"Run `{install_command(extra)}`{', or ' + otherwise if otherwise else ''}."
+    )
+
+
+def _in_folder(folder: Path, extra: str) -> str:
+    return f"{'.' if folder == Path.cwd() else folder}[{extra}]"
+
+
+def _pip() -> list[str]:
+    """This environment's pip, also where the `pip` of the shell belongs to another one."""
+    found = shutil.which("pip")
+    here = found is not None and Path(found).parent == Path(sys.executable).parent
+    return ["pip"] if here else [sys.executable, "-m", "pip"]
+
+
+def _origin() -> dict[str, Any]:
+    """Where the package was installed from, as PEP 610 records it; empty for an index."""
+    try:
+        text = metadata.distribution(_NAME).read_text("direct_url.json")
+    except metadata.PackageNotFoundError:
+        return {}
+    return dict(json.loads(text)) if text else {}
+
+
+def _extras() -> dict[str, set[str]]:
+    """The packages of each extra; those of an extra that it contains are included."""
+    try:
+        requirements = metadata.requires(_NAME) or []
+    except metadata.PackageNotFoundError:
+        return {}
+    extras: dict[str, set[str]] = {}
+    for match in filter(None, map(_EXTRA.match, requirements)):
+        package, extra = match.groups()
+        extras.setdefault(extra, set()).add(package.lower().replace("_", "-"))
+    return extras
 
 
 def import_object(name: str, field: str, error: type[SMEError]) -> Any:

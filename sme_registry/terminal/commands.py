@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from sme_registry.errors import SMEError
+from sme_registry.io import missing_dependency
 from sme_registry.terminal.output import failure
 
 
@@ -21,9 +22,11 @@ class CommandGroup(TyperGroup):
 
     Attributes:
       exit_codes: exit codes of error types; the first match counts. Any other `SMEError` is 2.
+      extra: the extra of our package that these commands need, if there is one.
     """
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()
+    extra: str = ""
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line, and exit with its exit code."""
@@ -43,7 +46,8 @@ class CommandGroup(TyperGroup):
             command = context.command_path if context is not None else self.name
             message = error.format_message().replace("Value error, ", "").rstrip(".")
             if message:  # empty if the help was printed instead
-                failure(f"{message}. See `{command} --help`.")
+                stop = "" if message.endswith(("?", "!")) else "."
+                failure(f"{message}{stop} See `{command} --help`.")
             sys.exit(getattr(error, "exit_code", 2))
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -55,6 +59,12 @@ class CommandGroup(TyperGroup):
             failure(str(error))
             codes = (code for kind, code in self.exit_codes if isinstance(error, kind))
             raise typer.Exit(next(codes, 2)) from None
+        except ModuleNotFoundError as error:
+            missing = missing_dependency(error, self.extra)
+            if missing is None:
+                raise
+            failure(str(missing))
+            raise typer.Exit(2) from None
         except BrokenPipeError:
             raise typer.Exit(_discard_output()) from None
         except KeyboardInterrupt as stopped:

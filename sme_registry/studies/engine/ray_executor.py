@@ -11,7 +11,8 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
-from sme_registry.errors import MissingDependencyError, OptionError
+from sme_registry.errors import OptionError
+from sme_registry.io import require_packages
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
@@ -173,13 +174,9 @@ def _refuse_unreachable(address: str) -> None:
 def _import_ray() -> Any:
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import ray
-    except ImportError:
-        raise MissingDependencyError(
-            "ray: is not installed. Run `pip install 'sme-registry[ray]'`, or leave out --ray to "
-            "use processes on this machine."
-        ) from None
+    instead = "leave out --ray to use processes on this machine"
+    require_packages("a study on a cluster", {"ray": "Ray"}, "ray", otherwise=instead)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import ray
     return ray

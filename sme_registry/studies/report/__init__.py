@@ -1,11 +1,5 @@
 """A study's results as data frames, and its report: one page, figures and tables."""
 
-from sme_registry.errors import MissingDependencyError
+from sme_registry.io import require_packages
 
-try:
-    import pandas  # noqa: F401
-except ImportError:
-    raise MissingDependencyError(
-        "The results of a study need pandas, which is not installed. "
-        "Run `pip install 'sme-registry[studies]'`."
-    ) from None
+require_packages("the results of a study", {"pandas": "pandas"}, "studies")

@@ -238,5 +238,5 @@ def test_without_sb3_a_reference_runs_and_a_learner_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)  # as if it were not installed
     assert run_cell(cell("reference:linear")).online_regret is None
-    with pytest.raises(MissingDependencyError, match="pip install 'sme-registry"):
+    with pytest.raises(MissingDependencyError, match=r"pip install .*\[train\]"):
         run_cell(cell("PPO"))

@@ -1,0 +1,104 @@
+"""Run every command of the installed package in this process, and print what happened as JSON.
+
+`test_extras.py` runs this with the interpreter of each environment, in an empty folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import sys
+import traceback
+from collections.abc import Iterator
+from importlib.metadata import distribution
+from typing import Any
+
+# Arguments that reach the optional packages of a command, and are quick where these are installed.
+ARGUMENTS = {
+    "sme": [
+        "list",
+        "show Default",
+        "new task.json",
+        "validate task.json",
+        "certify task.json",
+        "evaluate linear task.json --protocol quick-v1 --out evaluation",
+        "evaluate task.onnx task.json",
+        "train task.json --steps 0",
+        "diagnose constant --task task.json --states 64 --episodes 2 --out diagnosis",
+        "diagnose constant --task task.json --states 64 --episodes 2 --probe-capacity",
+        "demo --steps 0",
+        "study new plan.json --task task.json -a PPO -n 1",
+        "study plan smoke",
+        "study run smoke --folder study --only class=none",
+        "study run smoke --folder study --only class=none --ray local",
+        "study status study",
+        "study report study",
+        "dataset make task.json --transitions 200 --protocol quick-v1 --out data",
+        "dataset list --out data",
+        "dataset show sme/none-v0 --out data",
+        "dataset validate sme/none-v0 --out data",
+        "offline train sme/none-v0",
+    ],
+    "sme-leaderboard": [
+        "init board --protocol quick-v1",
+        "keygen --key key",
+        "new bundle --runs task.json --method M --submitter S --key key",
+        "export-sb3 model.zip",
+        "check bundle",
+        "submit bundle board",
+        "withdraw http://127.0.0.1:9 none --key key",
+        "rank board",
+        "show board 0000",
+        "verify board",
+        "site board",
+        "serve none",
+        "reindex board",
+        "gc board",
+        "demo",
+    ],
+}
+
+
+def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The names of a command and of all commands in it."""
+    yield path
+    for name, child in getattr(command, "commands", {}).items():
+        yield from leaves(child, (*path, name))
+
+
+def run(main: Any, program: str, arguments: tuple[str, ...]) -> dict[str, Any]:
+    """Call an entry point as its script does."""
+    sys.argv = [program, *arguments]
+    out, err = io.StringIO(), io.StringIO()
+    code: Any = None
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+        except BaseException:
+            code = traceback.format_exc()
+    return {
+        "command": " ".join(sys.argv),
+        "code": code,
+        "out": out.getvalue(),
+        "err": err.getvalue(),
+    }
+
+
+def everything() -> Iterator[dict[str, Any]]:
+    import typer
+
+    package = distribution("sme-registry")
+    for script in package.entry_points.select(group="console_scripts"):
+        main = script.load()
+        app = main.__globals__["app"]
+        for path in leaves(typer.main.get_command(app)):
+            yield run(main, script.name, (*path, "--help"))
+        for arguments in ARGUMENTS[script.name]:
+            yield run(main, script.name, tuple(arguments.split()))
+
+
+if __name__ == "__main__":
+    print(json.dumps(list(everything())))
