@@ -37,6 +37,13 @@ def evaluate(
     out_folder: Out = None,
     action_range: ActionRange = None,
     set_: SpecChanges = None,
+    algorithm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CLASS",
+            help="Class of a model's .zip that does not tell it: PPO, or sb3_contrib:TQC.",
+        ),
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -72,7 +79,7 @@ def evaluate(
     target = None if out_folder is None else out_folder / "evaluation.json"
     if target is not None:
         refuse_existing(target, force=force)
-    prepared = evaluation.as_policy(policy, spec, action_range=action_range)
+    prepared = evaluation.as_policy(policy, spec, action_range=action_range, algorithm=algorithm)
     states = resolved.states_per_region * len(resolved.edges)
     with Progress("evaluating", states, unit="states", console=err()) as progress:
         report = evaluation.evaluate(prepared, spec, resolved, progress=progress.update_of)

@@ -86,7 +86,7 @@ def on_policy(
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
     starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
-    runs = {POLICY: rollout(policy, task, starts)}
+    runs = {POLICY: rollout(policy.start(), task, starts)}
     for name, act in _reference_actions(task, fitted, n, seed).items():
         runs[name] = rollout(act, task, starts)
     run, random = runs[POLICY], runs["uniform_random"]

@@ -41,6 +41,7 @@ def evaluate(
     *,
     action_range: str | None = None,
     name: str | None = None,
+    algorithm: str | None = None,
     progress: Progress | None = None,
 ) -> EvaluationReport:
     """Evaluate a policy within and out of distribution, exactly.
@@ -58,6 +59,7 @@ def evaluate(
       action_range: the range of the policy's actions, "unit" for [0, 1] or "symmetric" for
         [−1, 1]; None takes an SB3 model's own action space, and "unit" for any other policy.
       name: what the report calls the policy.
+      algorithm: the class of a model's .zip that does not tell it, such as "sb3_contrib:TQC".
       progress: called after each batch with the number of states done, and of all states.
 
     Returns:
@@ -72,7 +74,7 @@ def evaluate(
     """
     spec = load_spec(spec_or_id)
     protocol = resolve_protocol(protocol)
-    prepared = as_policy(policy, spec, action_range=action_range, name=name)
+    prepared = as_policy(policy, spec, action_range=action_range, name=name, algorithm=algorithm)
     task = materialize(spec)
     oracle = engine(task)
     channels = {_WHOLE: slice(0, spec.action_dim)}

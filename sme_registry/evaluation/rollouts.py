@@ -15,6 +15,7 @@ import numpy.typing as npt
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Array, Observation
+from sme_registry.evaluation.policies import Policy
 from sme_registry.task import Task, streams
 
 LANES = 4096
@@ -85,7 +86,7 @@ def rollouts(
     Args:
       policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, which are
         clipped to it; B is at most `LANES`. It is also called for episodes that have ended, until
-        all of their batch have.
+        all of their batch have. The state of a recurrent `Policy` is initial at the first call.
       task: the task, of a single agent.
       states: `[n, S]` in [0, 1].
       t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
@@ -111,10 +112,11 @@ def rollouts(
         batch = Batch(task, len(lanes), reuse=True)
         batch.place(states[lanes], t[lanes], r_cum[lanes, None])
         observation = batch.observe()
+        act = policy.start() if isinstance(policy, Policy) else policy
         sums, running, weight = np.zeros((6, len(lanes))), np.ones(len(lanes)), 1.0
         first = None if actions is None else actions[lanes]
         while running.any():
-            a = policy(observation.copy()) if first is None else first
+            a = act(observation.copy()) if first is None else first
             done = batch.advance(np.asarray(a, np.float64))
             similarity, _, regret, reward, _ = done.values[:, 0]
             step = (reward, weight * reward, 1.0, regret, similarity, similarity**2)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import PolicyError
+from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import write_atomically
 
 FILE = "checkpoint.zip"
@@ -23,8 +24,7 @@ _ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 def save(model: Any, path: Path) -> None:
     """Write a checkpoint; raises OptionError if that fails, and the previous one is unchanged."""
-    archive = io.BytesIO()
-    model.save(archive)
+    archive = io.BytesIO(saved_sb3(model))
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
         filled = buffer.size()

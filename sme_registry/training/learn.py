@@ -7,7 +7,6 @@ Imports Stable-Baselines3; import it inside functions only.
 
 from __future__ import annotations
 
-import io
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor
 
+from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, write_atomically
 from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
 from sme_registry.terminal.interrupts import defer_interrupts
@@ -62,10 +62,8 @@ def learn(
             log.close()
             env.close()
     record = callback.record()
-    content = io.BytesIO()
     with defer_interrupts():
-        model.save(content)
-        write_atomically(folder / MODEL, content.getvalue())
+        write_atomically(folder / MODEL, saved_sb3(model))
         record.write(folder)
     return record, log.episodes, model
 

@@ -12,7 +12,6 @@ network, and one whose actions differ on a few probes, is called directly.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from sme_registry.envs.types import Observation
 from sme_registry.errors import SpecError
 from sme_registry.evaluation import Policy, as_policy
+from sme_registry.evaluation.policies.sb3 import torch_policy
 from sme_registry.spec import SMESpec
 from sme_registry.task import streams
 
@@ -81,7 +81,7 @@ def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) 
     policy = as_policy(model, spec, action_range=action_range)
     if not isinstance(policy, Policy):
         raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
-    perceptron = _perceptron(getattr(model, "policy", model))
+    perceptron = _perceptron(torch_policy(model))
     if perceptron is None:
         return policy
     probes = streams.uniform(0, "actor/probes", _PROBES * (spec.state_dim + 2))
@@ -91,19 +91,16 @@ def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) 
     same = expected.shape == actions.shape and np.allclose(
         actions, expected, rtol=_TOLERANCE, atol=_TOLERANCE
     )
-    return replace(policy, act=perceptron) if same else policy
+    return replace(policy, act=perceptron, episodes=None) if same else policy
 
 
 def _perceptron(network: Any) -> Perceptron | None:
-    """A copy of the network; None if it is not a multilayer perceptron."""
-    if "stable_baselines3.common.policies" not in sys.modules:  # not imported: not an SB3 model
+    """A copy of a PyTorch policy of SB3; None if there is none or it has other layers."""
+    if network is None:
         return None
-    from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.torch_layers import FlattenExtractor
     from torch import nn
 
-    if not isinstance(network, BasePolicy):
-        return None
     try:
         extractor, parts = _parts(network)
     except AttributeError:  # a policy class of another package

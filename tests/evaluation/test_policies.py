@@ -17,8 +17,10 @@ from sme_registry.errors import (
     PolicyError,
     UnknownNameError,
 )
-from sme_registry.evaluation import OfflinePolicy, as_policy, evaluate, references
+from sme_registry.evaluation import OfflinePolicy, as_policy, evaluate, load_sb3, references
+from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.spec import SMESpec
+from sme_registry.training import numpy_policy
 
 SPEC = SMESpec(state_dim=3, action_dim=2)
 PROTOCOL = {"states_per_region": 200, "epsilons": [0.5, 1.0]}
@@ -188,8 +190,14 @@ def test_a_file_that_is_no_model_is_refused(tmp_path, name, content, message):
     [
         ("[]", "not a model that Stable-Baselines3 saved"),
         ("{not json", "not a model that Stable-Baselines3 saved"),
-        ('{"exploration_fraction": 0.1}', "unknown algorithm; known: PPO, SAC"),
-        ('{"clip_range": 0.2}', "cannot be loaded as a PPO model"),
+        (
+            '{"exploration_fraction": 0.1}',
+            "does not tell its algorithm. Give the algorithm's class",
+        ),
+        (
+            '{"policy_class": {"__module__": "sb3_contrib.tqc.policies"}}',
+            "cannot be loaded as a model of sb3_contrib:TQC",
+        ),
     ],
 )
 def test_an_archive_that_holds_no_known_model_is_refused(tmp_path, data, message):
@@ -218,6 +226,75 @@ def test_a_saved_model_scores_as_the_model_itself(sb3, algorithm, tmp_path):
     assert (live.policy, saved.policy) == (algorithm, "agent")
     assert saved.regions == live.regions
     assert live.action_range == saved.action_range == "symmetric"
+
+
+@pytest.fixture(scope="module")
+def contrib():
+    return pytest.importorskip("sb3_contrib")
+
+
+@pytest.mark.parametrize("algorithm", ["TQC", "TRPO", "CrossQ", "RecurrentPPO"])
+def test_a_model_of_another_package_is_loaded_as_what_it_is(contrib, algorithm, tmp_path):
+    policy = "MlpLstmPolicy" if algorithm == "RecurrentPPO" else "MlpPolicy"
+    env = sme_registry.make(SPEC, action_range="symmetric")
+    model = getattr(contrib, algorithm)(policy, env, device="cpu", seed=3)
+    model.save(tmp_path / "agent.zip")
+    assert type(load_sb3(tmp_path / "agent.zip")) is type(model)
+    live, saved = evaluated(model), evaluated(tmp_path / "agent.zip")
+    assert (live.policy, saved.policy) == (algorithm, "agent")
+    assert saved.regions == live.regions
+
+
+class Shy:
+    """A policy class outside of the packages whose algorithms are known."""
+
+
+def test_a_saved_model_tells_its_class_if_we_save_it(sb3, tmp_path):
+    model = untrained(sb3, "DDPG")
+    path = tmp_path / "agent.zip"
+    model.policy_class = Shy  # hides the algorithm
+    model.save(path)
+    with pytest.raises(
+        PolicyError, match=r"does not tell its algorithm \(its policy is of .*tests"
+    ):
+        load_sb3(path)
+    model.policy_class = sb3.DDPG.policy_aliases["MlpPolicy"]
+    path.write_bytes(saved_sb3(model))
+    assert type(load_sb3(path)) is sb3.DDPG
+
+
+def test_the_algorithm_of_a_model_can_be_given(sb3, tmp_path):
+    model = untrained(sb3, "DDPG")
+    model.save(tmp_path / "agent.zip")
+    assert type(load_sb3(tmp_path / "agent.zip")) is sb3.TD3  # which acts equally
+    for algorithm in ("ddpg", "stable_baselines3:DDPG"):
+        assert type(load_sb3(tmp_path / "agent.zip", algorithm)) is sb3.DDPG
+        report = evaluated(str(tmp_path / "agent.zip"), algorithm=algorithm)
+        assert (report.policy, report.regions) == ("agent", evaluated(model).regions)
+    for algorithm, message in {
+        "TD4": "must be one of .* Did you mean 'TD3'",
+        "math:sqrt": "must be a class with a method `load`",
+        "PPO": "cannot be loaded as a model of stable_baselines3:PPO",
+    }.items():
+        with pytest.raises(PolicyError, match=message):
+            evaluated(tmp_path / "agent.zip", algorithm=algorithm)
+    with pytest.raises(PolicyError, match="is for the path of a model"):
+        evaluated(model, algorithm="DDPG")
+
+
+def test_a_model_that_predicts_in_its_own_way_is_asked_for_its_predictions(sb3):
+    class Halved(sb3.PPO):
+        def predict(self, *args, **kwargs):
+            actions, state = super().predict(*args, **kwargs)
+            return actions / 2.0, state
+
+    env = sme_registry.make(SPEC)
+    model = Halved("MlpPolicy", env, device="cpu", seed=3)
+    expected = evaluated(lambda o: model.predict(o, deterministic=True)[0]).regions
+    assert evaluated(model).regions == expected
+    observations = np.random.default_rng(0).random((9, 5), dtype=np.float32)
+    actions = model.predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(numpy_policy(model, SPEC)(observations), actions)
 
 
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])

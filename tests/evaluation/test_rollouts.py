@@ -79,6 +79,23 @@ def trained(algorithm: str, spec: SMESpec) -> Any:
     return sb3.__dict__[algorithm]("MlpPolicy", env, seed=1, device="cpu", **settings).learn(150)
 
 
+def test_a_recurrent_model_keeps_its_state_during_an_episode() -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    from sme_registry.sb3 import SMEVecEnv
+
+    spec = PLAIN.derive(horizon=20)
+    model = contrib.RecurrentPPO("MlpLstmPolicy", SMEVecEnv(spec), seed=1, n_steps=16, device="cpu")
+    model.policy.action_net.weight.data *= 100.0  # so that its memory matters
+    states = start_states(0, 0, 3, 3)
+    expected, _ = evaluated_by_sb3(model, spec, states)
+    policy, task = as_policy(model, spec), materialize(spec)
+    for _ in range(2):  # the second batch starts anew
+        done = rollouts(policy, task, states)
+        np.testing.assert_allclose(done.episode_return, expected, atol=2e-3)
+    without_memory = rollouts(policy.__call__, task, states)
+    assert np.abs(without_memory.episode_return - expected).max() > 0.02
+
+
 @pytest.mark.parametrize("spec", [PLAIN, HARD], ids=["plain", "hard"])
 def test_an_episode_has_the_scores_of_a_single_environment(spec: SMESpec) -> None:
     policy, states = nearly_optimal(spec), start_states(0, 0, 12, 3)

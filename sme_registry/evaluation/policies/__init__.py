@@ -1,13 +1,13 @@
 """Policies: every form in which a user may give one, as one checked function of observations.
 
-callable · Stable-Baselines3 model or .zip · .onnx file · .npz file of an offline policy ·
-`module:function` · name of a reference policy · for teams also a dict by agent.
+callable · model of Stable-Baselines3, sb3-contrib or sbx, or its .zip · .onnx file · .npz file of
+an offline policy · `module:function` · name of a reference policy · for teams also a dict by agent.
 """
 
 from sme_registry.evaluation.policies.forms import as_policy
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.policies.policy import Member, Policy, TeamPolicy
-from sme_registry.evaluation.policies.sb3 import load_sb3
+from sme_registry.evaluation.policies.sb3_files import load_sb3, saved_sb3
 
 __all__ = [
     "Member",
@@ -16,4 +16,5 @@ __all__ = [
     "TeamPolicy",
     "as_policy",
     "load_sb3",
+    "saved_sb3",
 ]

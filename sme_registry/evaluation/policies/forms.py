@@ -22,6 +22,7 @@ from sme_registry.evaluation.policies.policy import (
     TeamPolicy,
     prefixed_errors,
 )
+from sme_registry.evaluation.policies.sb3_files import load_sb3
 from sme_registry.evaluation.references import POLICIES, reference_policy
 from sme_registry.io import choice, import_object
 from sme_registry.spec import ACTION_RANGES, ActionRange, SMESpec
@@ -31,14 +32,20 @@ _SUFFIXES = (".zip", ".onnx", ".npz")
 
 
 def as_policy(
-    policy: Any, spec: SMESpec, *, action_range: str | None = None, name: str | None = None
+    policy: Any,
+    spec: SMESpec,
+    *,
+    action_range: str | None = None,
+    name: str | None = None,
+    algorithm: str | None = None,
 ) -> Policy | TeamPolicy:
     """Prepare a policy for a task.
 
     Args:
       policy: one of
         a callable from observations `[B, S + 2]` float32 to actions `[B, A]`;
-        a Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
+        a model of Stable-Baselines3, or any other with `predict(observations, deterministic=True)`;
+        the path of such a model's .zip (loading it can run code of its author);
         the path of an .onnx file, or of the .npz of an offline policy;
         `module:function`, imported from the working directory or an installed package;
         the name of a reference policy, one of `references.POLICIES`;
@@ -51,6 +58,10 @@ def as_policy(
       action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1]; None takes an SB3
         model's own action space, and "unit" for any other policy.
       name: what reports call it; None takes its name, or that of its file, algorithm or function.
+      algorithm: the class of a .zip that does not tell it, as in `load_sb3`.
+
+    A recurrent model is memoryless here: it acts from its initial state in each observation.
+    `Policy.start` makes it keep its state, as `rollouts` does.
 
     Raises:
       UnknownNameError: a text that is neither a path, nor `module:function`, nor a reference.
@@ -64,6 +75,8 @@ def as_policy(
     range_ = cast("ActionRange | None", action_range)
     if isinstance(policy, str):
         policy, name = _named(policy, spec), name or _display_name(policy)
+    if algorithm is not None:
+        policy, name = _of_algorithm(policy, algorithm), name or Path(policy).stem
     if isinstance(policy, TeamPolicy):
         policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
@@ -97,6 +110,14 @@ def _named(text: str, spec: SMESpec) -> Any:
     return function
 
 
+def _of_algorithm(policy: Any, algorithm: str) -> Any:
+    if not isinstance(policy, os.PathLike) or Path(policy).suffix != ".zip":
+        raise PolicyError(
+            f"algorithm={algorithm!r}: is for the path of a model's .zip. Leave it out."
+        )
+    return load_sb3(policy, algorithm)
+
+
 def _display_name(text: str) -> str:
     is_path = text not in POLICIES and (text.endswith(_SUFFIXES) or ":" not in text)
     return Path(text).stem if is_path else text
@@ -114,7 +135,7 @@ def _prepare(
     if isinstance(policy, str | os.PathLike):
         name = Path(policy).stem if name is None else name
         policy = _load(Path(policy), interface)
-    act = policy
+    act, episodes = policy, None
     if hasattr(policy, "predict"):
         interface.check(
             "policy",
@@ -123,6 +144,7 @@ def _prepare(
         )
         sb3.check_not_normalised(policy)
         act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
+        episodes = sb3.episode_predictor(policy)
     elif not callable(policy):
         raise PolicyError(
             f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
@@ -136,6 +158,7 @@ def _prepare(
         act,
         interface.action_dim,
         interface.hint,
+        episodes,
     )
 
 
@@ -148,7 +171,7 @@ def _load(path: Path, interface: Interface) -> Any:
             str(path), observations=(policy.observation_dim,), actions=(policy.action_dim,)
         )
         return policy
-    return sb3.load_sb3(path)
+    return load_sb3(path)
 
 
 def _name_of(policy: Any) -> str:

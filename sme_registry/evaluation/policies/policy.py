@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -59,6 +59,8 @@ class Policy:
       act: observations float32 to actions; unchecked.
       action_dim: A, entries of an action.
       hint: a sentence about its interface, which error messages end with.
+      episodes: a new `act` for a batch of episodes that start together: it keeps the state of a
+        recurrent policy from call to call, row by row. None: it has no state.
     """
 
     name: str
@@ -66,6 +68,11 @@ class Policy:
     act: Callable[[Observation], Any]
     action_dim: int
     hint: str = ""
+    episodes: Callable[[], Callable[[Observation], Any]] | None = None
+
+    def start(self) -> Policy:
+        """This policy at the start of a batch of episodes; a recurrent one keeps its state."""
+        return self if self.episodes is None else replace(self, act=self.episodes())
 
     def __call__(self, observations: Observation) -> Array:
         """Actions `[B, A]`, converted to the unit range but not clipped to it.

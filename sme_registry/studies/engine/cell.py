@@ -12,9 +12,11 @@ import io
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import Policy, evaluate
+from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import versions, write_atomically
@@ -24,7 +26,7 @@ from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.task import materialize
 from sme_registry.training import ALGORITHMS
-from sme_registry.training.algorithms import one_thread, quiet, require_sb3
+from sme_registry.training.algorithms import is_sb3, one_thread, quiet, require_sb3
 from sme_registry.training.learners import new_learner
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import PACKAGES
@@ -201,10 +203,17 @@ def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy:
         evaluate_now(env.steps)
     save = getattr(learner, "save", None)
     if model_path is not None and save is not None:
-        archive = io.BytesIO()
-        save(archive)
-        write_atomically(model_path, archive.getvalue())
+        write_atomically(model_path, _saved(learner, save))
     return numpy_policy(learner, cell.spec, action_range=cell.action_range)
+
+
+def _saved(learner: Any, save: Callable[[Any], Any]) -> bytes:
+    """The bytes of a learner's .zip."""
+    if is_sb3(learner):
+        return saved_sb3(learner)
+    archive = io.BytesIO()
+    save(archive)
+    return archive.getvalue()
 
 
 def versions_for(uses: str) -> dict[str, str]:
