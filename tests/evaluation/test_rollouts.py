@@ -83,7 +83,7 @@ def test_a_recurrent_model_keeps_its_state_during_an_episode() -> None:
     contrib = pytest.importorskip("sb3_contrib")
     from sme_registry.sb3 import SMEVecEnv
 
-    spec = PLAIN.derive(horizon=20)
+    spec = PLAIN.derive(horizon=8)  # rounding errors grow from step to step
     model = contrib.RecurrentPPO("MlpLstmPolicy", SMEVecEnv(spec), seed=1, n_steps=16, device="cpu")
     model.policy.action_net.weight.data *= 100.0  # so that its memory matters
     states = start_states(0, 0, 3, 3)
