@@ -38,7 +38,7 @@ from sme_registry.errors import (
     UnknownNameError,
     did_you_mean,
 )
-from sme_registry.io import build_folder, read_json, to_json, write_atomically
+from sme_registry.io import build_folder, read_json, refuse_unwritable, to_json, write_atomically
 
 NAMESPACE = "sme"
 _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
@@ -122,7 +122,7 @@ def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool)
     Raises:
       NameTakenError: the target exists, and `force` is false or it is not a data set of this
         package.
-      OptionError: the target is inside another data set.
+      OptionError: the target is inside another data set, or cannot be written.
     """
     for parent in target.relative_to(folder).parents:
         if parent != Path() and (folder / parent / "data").exists():
@@ -130,6 +130,7 @@ def check_target(target: Path, folder: Path, recipe: DatasetRecipe, force: bool)
                 f"name: {folder / parent} is a data set, and Minari lists none inside another. "
                 "Give another namespace."
             )
+    refuse_unwritable(target)
     if not os.path.lexists(target):
         return
     if not force:

@@ -259,6 +259,12 @@ class Diagnosis(StrictModel):
         """The verdict on a question, such as "sparsity"."""
         return next(verdict for verdict in self.verdicts if verdict.question == question)
 
+    def _repr_markdown_(self) -> str:
+        """The page, for notebooks."""
+        from sme_registry.diagnosis.render import markdown
+
+        return markdown(self, ())
+
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a diagnosis.json.

@@ -11,9 +11,11 @@ which region 0 is WD and 1 to M are the OOD shells:
 
 from __future__ import annotations
 
+import csv
 import io
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -206,8 +208,11 @@ class EvaluationReport(StrictModel):
         require_packages("EvaluationReport.to_frame", {"pandas": "pandas"}, "studies")
         import pandas
 
+        return pandas.DataFrame(self._rows())
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
         scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
-        return pandas.DataFrame(
+        return (
             {"policy": policy, "reference": is_reference, "agent": agent, "region": region.name}
             | region.model_dump(exclude={"name", "channels"})
             for agent, scope in scopes.items()
@@ -217,6 +222,31 @@ class EvaluationReport(StrictModel):
             )
             for region in regions
         )
+
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the rows of `to_frame` as CSV, completely or not at all; pandas is not required.
+
+        Raises:
+          OptionError: it cannot be written; an existing file is unchanged.
+        """
+        rows = list(self._rows())
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        return write_atomically(path, text.getvalue())
+
+    def __repr__(self) -> str:
+        return (
+            f"<EvaluationReport: {self.policy} on {catalogue.title(self.spec)}, "
+            f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        from sme_registry.terminal.html import table_html
+
+        return table_html(self.table())
 
     def __str__(self) -> str:
         from rich.console import Console

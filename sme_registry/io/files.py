@@ -73,16 +73,37 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
 
 
 def refuse_existing(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Return a path that a command is about to write.
+    """Return a path that a command is about to write; call it before the work, not after.
 
     Raises:
-      OptionError: it exists and `force` is false.
+      OptionError: it exists and `force` is false, or nothing can be written there.
     """
-    path = Path(path)
+    path = refuse_unwritable(path)
     if os.path.lexists(path) and not force:
         raise OptionError(
             f"{path} already exists. Use --force to replace it (in Python, force=True)."
         )
+    return path
+
+
+def refuse_unwritable(path: str | os.PathLike[str]) -> Path:
+    """Return a path, of a file or a folder, whose parent folders can be created and written to.
+
+    Nothing remains of the check.
+
+    Raises:
+      OptionError: they cannot.
+    """
+    path = Path(path)
+    try:
+        # As an absolute path, so that there is an existing parent. By a file rather than
+        # `os.access`, which does not see read-only file systems.
+        parent = next(each for each in path.absolute().parents if os.path.lexists(each))
+        probe = temporary_beside(parent / path.name)
+        os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+        os.unlink(probe)
+    except (OSError, ValueError) as error:
+        raise _unwritable(path, error) from None
     return path
 
 
@@ -117,6 +138,7 @@ def claim_folder(
         )
     if names:
         refuse_existing(folder, force=force)
+    refuse_unwritable(folder / "run")
     return folder
 
 

@@ -7,7 +7,7 @@ equal digests on every machine, regardless of key order and of how a number was 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence, Sized
 from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import rfc8785
@@ -65,6 +65,20 @@ Digest = Annotated[
 ]
 
 
+_LONGEST_FIELD = 100  # characters of a field in `repr`
+
+
+class _Abbreviated:
+    """A long field in the `repr` of a model."""
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def __repr__(self) -> str:
+        size = f" of {len(self._value)}" if isinstance(self._value, Sized) else ""
+        return f"<{type(self._value).__name__}{size}>"
+
+
 class StrictModel(BaseModel):
     """Frozen and strict; invalid and unknown fields are errors that say how to correct them."""
 
@@ -103,6 +117,11 @@ class StrictModel(BaseModel):
             else plain_number(value)
             for name, value in data.items()
         }
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """The fields; a long one is shown by its type and length, so that none fills a screen."""
+        for name, value in super().__repr_args__():
+            yield name, value if len(repr(value)) <= _LONGEST_FIELD else _Abbreviated(value)
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:

@@ -219,6 +219,16 @@ class SMESpec(Setting):
         copy._name = name
         return copy
 
+    def _repr_html_(self) -> str:
+        """A card with every field that is set, and the digest, for notebooks."""
+        from sme_registry.spec import catalogue
+        from sme_registry.terminal.html import pairs_html
+
+        fields = {name: value for name, value in self.to_dict().items() if value is not None}
+        if self.team is not None:
+            fields["team"] = f"{len(self.team.agents)} agents, {self.team.reward} reward"
+        return pairs_html(catalogue.title(self), {**fields, "digest": self.digest})
+
     def __eq__(self, other: object) -> bool:
         """Whether all fields are equal; the name is none of them."""
         if not isinstance(other, SMESpec):

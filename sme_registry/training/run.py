@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ class TrainingResult:
 
     folder: Path
     record: RunRecord  # the content of `run.json`
-    episodes: tuple[Episode, ...]  # the content of `episodes.csv`
+    episodes: tuple[Episode, ...] = field(repr=False)  # the content of `episodes.csv`
     report: EvaluationReport  # of the final model
     figures: tuple[Path, ...]  # empty if matplotlib is not installed
 
@@ -69,6 +69,10 @@ class TrainingResult:
     def model_path(self) -> Path:
         """Path of the trained model, for SB3's `load`."""
         return self.folder / MODEL
+
+    def _repr_html_(self) -> str:
+        """The report's table, for notebooks."""
+        return self.report._repr_html_()
 
 
 def train(

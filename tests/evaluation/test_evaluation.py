@@ -276,6 +276,27 @@ def test_a_frame_without_pandas_names_the_extra(report, monkeypatch):
         report.to_frame()
 
 
+def test_a_csv_file_has_the_frame_and_does_not_need_pandas(report, tmp_path, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+    frame = report.to_frame()
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        path = report.to_csv(tmp_path / "report.csv")
+    pandas.testing.assert_frame_equal(pandas.read_csv(path, keep_default_na=False), frame)
+
+
+def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
+    assert len(repr(report)) < 150
+    assert f"WD regret {report.wd_regret:.3f}" in repr(report)
+    html = report._repr_html_()
+    rows = html.split("<tr>")[1:]
+    assert len(rows) == 1 + report.table().row_count
+    assert all(row.count("</td>") == 7 for row in rows[1:])
+    assert f"{report.regions[5].normalised_regret:.3f}" in html
+    escaped = report.model_copy(update={"policy": "<b>[bold]"})._repr_html_()
+    assert "&lt;b&gt;[bold] on SME" in escaped
+
+
 def test_printing_a_report_shows_its_table(report):
     text = str(report)
     assert text == "\n".join(line.rstrip() for line in rendered(report).splitlines())

@@ -228,6 +228,19 @@ def test_a_saved_model_scores_as_the_model_itself(sb3, algorithm, tmp_path):
     assert live.action_range == saved.action_range == "symmetric"
 
 
+@pytest.mark.parametrize(
+    "command", [["evaluate", "never:act", "Plane1"], ["diagnose", "never:act", "--task", "Plane1"]]
+)
+def test_an_output_that_cannot_be_written_is_refused_before_the_policy_acts(
+    command, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "never.py").write_text("def act(observations):\n    raise SystemExit(3)\n")
+    result = CliRunner().invoke(app, [*command, "--out", "never.py/out"])
+    assert result.exit_code == 2
+    assert "cannot be written" in result.output.replace("\n", " ")
+
+
 @pytest.fixture(scope="module")
 def contrib():
     return pytest.importorskip("sb3_contrib")

@@ -21,6 +21,17 @@ def test_an_existing_path_is_refused_without_force(tmp_path):
         assert refuse_existing(path, force=True) == path
 
 
+@pytest.mark.parametrize("place", ["file/evaluation.json", "file/a/b", "null\0"])
+def test_a_path_that_cannot_be_written_is_refused_before_the_work(tmp_path, place):
+    (tmp_path / "file").write_text("")
+    path = tmp_path / place
+    for check in (refuse_existing, lambda path: claim_folder(path, [])):
+        with pytest.raises(OptionError, match="cannot be written"):
+            check(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == ""
+
+
 def test_a_claimed_folder_is_created_with_its_parents(tmp_path):
     folder = claim_folder(tmp_path / "a" / "b", ["run.json"])
     assert folder.is_dir()

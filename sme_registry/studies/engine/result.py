@@ -97,6 +97,10 @@ class CellResult(StrictModel):
     timing: Timing
     versions: dict[str, str]
 
+    def _repr_html_(self) -> str:
+        """The report's table, for notebooks."""
+        return self.report._repr_html_()
+
 
 class CellFailure(StrictModel):
     """A run that raised an error: its message and the last lines of its traceback."""

@@ -88,6 +88,14 @@ class StudyFrames(NamedTuple):
     results: pd.DataFrame
     curves: pd.DataFrame
 
+    def __repr__(self) -> str:
+        return f"<StudyFrames: results {self.results.shape}, curves {self.curves.shape}>"
+
+    def _repr_html_(self) -> str:
+        """Both frames, for notebooks; pandas abbreviates long ones."""
+        frames = self._asdict().items()
+        return "".join(f"<h4>{name}</h4>{frame.to_html(max_rows=10)}" for name, frame in frames)
+
 
 def load(folder: str | os.PathLike[str]) -> StudyFrames:
     """Load the finished runs of a study.

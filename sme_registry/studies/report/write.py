@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sme_registry.errors import OptionError
-from sme_registry.io import to_json, write_atomically
+from sme_registry.io import refuse_unwritable, to_json, write_atomically
 from sme_registry.studies.engine.ledger import REPORT, Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import csv_tables, text_tables
@@ -67,10 +67,11 @@ def write_report(
             f"folder={str(folder)!r}: none of its {len(keys)} runs has finished. Run them with "
             "`sme study run`, and check them with `sme study status`."
         )
+    target = Path(folder) / REPORT if out is None else Path(out)
+    refuse_unwritable(target / "index.html")
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     contents = _contents(analyse(file, results, failures), models, formats)
-    target = Path(folder) / REPORT if out is None else Path(out)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
 
