@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sme_registry.cli import study_new, study_plan, study_sweep
+from sme_registry.cli import study_compare, study_new, study_plan, study_sweep
 from sme_registry.cli.arguments import Json, Out, find_file
 from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
 from sme_registry.errors import OptionError
@@ -39,11 +39,14 @@ app = typer.Typer(
       sme study status runs/smoke
 
       sme study report runs/smoke
+
+      sme study compare runs/smoke PPO TD3
     """,
 )
 app.command("new")(study_new.new)
 app.command("plan")(study_plan.plan)
 app.command("sweep")(study_sweep.sweep)
+app.command("compare")(study_compare.compare)
 
 
 @app.command("run")

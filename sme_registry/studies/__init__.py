@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from sme_registry.studies.engine.result import CellResult
     from sme_registry.studies.engine.runner import run_study
     from sme_registry.studies.engine.status import CellStatus, StudyStatus, study_status
+    from sme_registry.studies.report.compare import compare, write_comparison
     from sme_registry.studies.report.frames import StudyFrames, load
     from sme_registry.studies.report.write import write_report
 
@@ -26,11 +27,13 @@ __all__ = [
     "CellStatus",
     "StudyFrames",
     "StudyStatus",
+    "compare",
     "load",
     "run_cell",
     "run_study",
     "study_status",
     "sweep",
+    "write_comparison",
     "write_report",
 ]
 
@@ -39,11 +42,13 @@ _LAZY = {
     "CellStatus": "studies.engine.status",
     "StudyFrames": "studies.report.frames",
     "StudyStatus": "studies.engine.status",
+    "compare": "studies.report.compare",
     "load": "studies.report.frames",
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.status",
     "sweep": "spec.sweep",
+    "write_comparison": "studies.report.compare",
     "write_report": "studies.report.write",
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -45,6 +46,7 @@ class Analysis:
     aggregates: pd.DataFrame
     profiles: pd.DataFrame
     improvements: pd.DataFrame
+    differences: pd.DataFrame
     offline_runs: pd.DataFrame
     offline: pd.DataFrame
 
@@ -103,6 +105,7 @@ def analyse(
         aggregates=tables.aggregates(runs, compared, names, bootstrap),
         profiles=tables.profiles(runs, compared, names, bootstrap),
         improvements=tables.improvements(runs, compared, names, bootstrap),
+        differences=tables.differences(runs, itertools.combinations(names, 2), draws=draws),
         offline_runs=offline_runs,
         offline=offline_tables.offline(offline_runs, bootstrap),
     )

@@ -14,14 +14,14 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.latex import latex_table
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
-from sme_registry.terminal import escape_latex
+from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, Metric
 from sme_registry.terminal.templates import fixed, signed
 
 CSV_TABLES = (
     "results", "curves", "counts", "missing", "contrasts", "levels", "regions", "aggregates",
-    "profiles", "improvements", "learning_curves",
+    "profiles", "improvements", "differences", "learning_curves",
 )  # fmt: skip
 ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
@@ -32,25 +32,19 @@ _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
 class TextTable:
     """A table for people, with the name of its files, a title, and a note on how to read it.
 
-    All columns of its frame are text; the first one names the rows.
+    All columns of its frame are text; the first `names` of them name the rows.
     """
 
     name: str
     title: str
     note: str
     frame: pd.DataFrame
+    names: int = 1
 
     def latex(self) -> str:
-        """As a LaTeX `table` with the rules of the package booktabs; ASCII only."""
-        frame = self.frame.map(escape_latex).rename(columns=escape_latex)
-        table = frame.style.hide(axis="index").to_latex(
-            hrules=True,
-            column_format="l" + "r" * (len(frame.columns) - 1),
-            position_float="centering",
-            caption=escape_latex(f"{self.title}. {self.note}"),
-            label=f"tab:{self.name}",
-        )
-        return f"% needs \\usepackage{{booktabs}}\n{table}"
+        """As a LaTeX `table` that fits a column of two; ASCII only."""
+        caption = f"{self.title}. {self.note}"
+        return latex_table(self.frame, names=self.names, caption=caption, label=self.name)
 
 
 def csv_tables(analysis: Analysis) -> dict[str, str]:
@@ -64,7 +58,9 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
     """What people read: settings down, algorithms across. Tables without rows are left out."""
     tables = [
         *(offline_tables(analysis) if analysis.has_offline_runs else ()),
-        *(_contrasts(analysis, metric.key, metric.label) for metric in METRICS),
+        *(_levels(analysis, metric) for metric in METRICS),
+        *(_differences(analysis, metric) for metric in METRICS),
+        *(_contrasts(analysis, metric) for metric in METRICS),
         *(_regions(analysis, name) for name in analysis.algorithms),
         _aggregates(analysis),
         _improvements(analysis),
@@ -96,6 +92,7 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
             "the number of runs, or of the behaviour policy's data sets. The constant ½ is "
             "evaluated within distribution.",
             similarity,
+            names=2,
         ),
         TextTable(
             "offline-improvement",
@@ -104,24 +101,69 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
             "†: above its data, *: below, by an interval that excludes 0 and rests on at least "
             f"{ENOUGH_RUNS} runs.",
             _wide(rows, at, "learner", _improvement),
+            names=2,
         ),
     ]
 
 
-def _contrasts(analysis: Analysis, metric: str, label: str) -> TextTable:
-    rows = analysis.contrasts[analysis.contrasts.metric == metric]
-    digits = 1 if metric == "final_return" else 2
+def _levels(analysis: Analysis, metric: Metric) -> TextTable:
+    rows = analysis.levels[analysis.levels.metric == metric.key]
+
+    def entry(row: Any) -> str:
+        count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
+        return _with_interval(row.iqm, row, metric.digits) + count
+
+    return TextTable(
+        f"levels-{metric.key.replace('_', '-')}",
+        f"{metric.label[0].upper()}{metric.label[1:]} by class",
+        "IQM over runs, with its 95 % bootstrap interval.",
+        _wide(rows, {"class_name": "class"}, "algorithm", entry, analysis.algorithms),
+    )
+
+
+def _differences(analysis: Analysis, metric: Metric) -> TextTable:
+    first = analysis.algorithms[0]
+    rows = analysis.differences[analysis.differences["first"] == first]
+    return difference_table(rows[rows.metric == metric.key], metric)
+
+
+def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False) -> TextTable:
+    """Paired differences of one metric: classes down, pairs of algorithms across.
+
+    With `levels`, of a single pair, the levels of both algorithms are columns as well.
+    """
+    rows = rows.assign(pair=rows["first"] + " − " + rows["second"])
     frame = _wide(
-        rows, {"class_name": "class"}, "algorithm", lambda row: _change(row, digits),
-        analysis.algorithms,
+        rows, {"class_name": "class"}, "pair",
+        lambda row: _change(row, row.difference, metric.digits + 1),
+    )  # fmt: skip
+    for place, name in enumerate(("first", "second")) if levels else ():
+        texts = [fixed(value, metric.digits + 1) for value in rows[f"{name}_level"]]
+        frame.insert(1 + place, rows[name].iloc[0], texts)
+    return TextTable(
+        f"differences-{metric.key.replace('_', '-')}",
+        f"Difference of {metric.label} between algorithms",
+        "IQM over pairs of runs on the same instance with the same seed, with its 95 % bootstrap "
+        "interval. *: the first algorithm is worse, †: better, by an interval that excludes 0 and "
+        "rests on enough pairs.",
+        frame,
+    )
+
+
+def _contrasts(analysis: Analysis, metric: Metric) -> TextTable:
+    rows = analysis.contrasts[analysis.contrasts.metric == metric.key]
+    frame = _wide(
+        rows, {"class_name": "class"}, "algorithm",
+        lambda row: _change(row, row.change, metric.digits), analysis.algorithms,
     )  # fmt: skip
     frame.insert(1, "setting", [analysis.classes[name].label for name in frame["class"]])
     return TextTable(
-        f"contrasts-{metric.replace('_', '-')}",
-        f"Change of {label}, from the class {analysis.base}",
+        f"contrasts-{metric.key.replace('_', '-')}",
+        f"Change of {metric.label}, from the class {analysis.base}",
         "IQM over pairs of runs, with the 95 % bootstrap interval of the change. "
         "*: worse, †: better, by an interval that excludes 0 and rests on enough pairs.",
         frame,
+        names=2,
     )
 
 
@@ -150,6 +192,7 @@ def _aggregates(analysis: Analysis) -> TextTable:
         "Means over classes of a statistic over runs, with 95 % stratified bootstrap intervals. "
         "For the optimality gap less is better.",
         _wide(rows, at, "algorithm", lambda row: _with_interval(row.value, row)),
+        names=3,
     )
 
 
@@ -162,6 +205,7 @@ def _improvements(analysis: Analysis) -> TextTable:
         "Probability of improvement",
         "That a run of the first algorithm beats one of the second, on a class drawn at random.",
         _wide(rows, at, "metric", lambda row: _with_interval(row.probability, row)),
+        names=2,
     )
 
 
@@ -201,10 +245,10 @@ def _wide(
     return wide.fillna(ABSENT)
 
 
-def _change(row: Any, digits: int) -> str:
+def _change(row: Any, change: float, digits: int) -> str:
     count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
     mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
-    return _with_interval(row.change, row, digits, signed) + count + mark
+    return _with_interval(change, row, digits, signed) + count + mark
 
 
 def _improvement(row: Any) -> str:

@@ -30,7 +30,10 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "findings": ("Findings", ()),
     "breaks": ("What breaks it", ("contrasts", "regret", "wd-regret", "ood-regret")),
     "regions": ("Inside and outside the training cube", ("regions", "decay", "maps")),
-    "algorithms": ("Algorithms compared", ("aggregates", "profiles", "improvements")),
+    "algorithms": (
+        "Algorithms compared",
+        ("aggregates", "profiles", "improvements", "differences"),
+    ),
     "learning": ("Learning", ("learning-curves",)),
     "absent": ("Figures that could not be drawn", ()),
     "tables": ("Tables", ()),

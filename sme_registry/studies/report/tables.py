@@ -18,6 +18,10 @@ Columns of each table, those that name the row first; class_name and algorithm a
                       tasks, NaN for metrics of training
     contrasts         metric: axis; base, level: IQM on the first class and on this one; change,
                       low, high; pairs; enough_pairs; verdict: worse, better or open
+    differences       first, second, metric: first_level, second_level: IQM over the pairs;
+                      difference: IQM over pairs of  x_i(first) − x_i(second),  and for `ALL`
+                      classes its mean over classes; low, high; pairs; enough_pairs; verdict of the
+                      first algorithm: worse, better or open
     aggregates        group, metric, statistic: classes, runs, fewest_runs (of a class); value: mean
                       over classes; low, high
     profiles          group, metric, threshold: fewest_runs; share: of runs whose value is above the
@@ -31,7 +35,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +45,7 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.spec import StudyPlan
 from sme_registry.statistics import Array, Statistic
-from sme_registry.studies.report.classes import ClassInfo, Group
+from sme_registry.studies.report.classes import ALL, ClassInfo, Group
 from sme_registry.studies.report.frames import frame, ordered, runs, window
 
 # With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
@@ -66,13 +70,14 @@ class Metric:
     key: str
     label: str
     worse: int
+    digits: int = 2  # of its values in tables
 
 
 METRICS = (
     Metric("wd_regret", "WD regret", 1),
     Metric("ood_regret", "OOD regret", 1),
     Metric("ood_decay", "OOD decay", 1),
-    Metric("final_return", "final return, % of optimum", -1),
+    Metric("final_return", "final return, % of optimum", -1, 1),
     Metric("online_regret", "online regret", 1),
 )
 REGRET_METRICS = METRICS[:2]
@@ -178,6 +183,70 @@ def contrasts(
             )  # fmt: skip
     columns = "axis:str base level change low high pairs:int64 enough_pairs:bool verdict:str"
     return frame(rows, f"{_PLACE} metric:str {columns}")
+
+
+def differences(
+    runs: pd.DataFrame,
+    pairs: Iterable[tuple[str, str]],
+    metrics: Sequence[Metric] = METRICS,
+    draws: int = statistics.DRAWS,
+) -> pd.DataFrame:
+    """How the first algorithm of each pair differs from the second, on each class and on all.
+
+    Two runs of equal number on a class have the same instance and seed, and form a pair. The
+    intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
+    """
+    rows = []
+    for (first, second), metric in itertools.product(pairs, metrics):
+        classes = _paired(runs, first, second, metric.key)
+        bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
+        for name, both in classes.items():
+            change = both[:, 0] - both[:, 1]
+            ends = bootstrap.interval(change, name, metric.key)
+            rows.append(_difference(first, second, metric, name, statistics.iqm(both),
+                                    _iqm(change), ends, len(both), len(both)))  # fmt: skip
+        if len(classes) > 1:
+            change_of = {n: (both[:, 0] - both[:, 1])[:, None] for n, both in classes.items()}
+            sizes = [len(both) for both in classes.values()]
+            low, high = statistics.stratified_bootstrap(
+                change_of, draws, bootstrap.seed(metric.key)
+            )
+            ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
+            rows.append(_difference(first, second, metric, ALL, statistics.aggregate(classes),
+                                    float(statistics.aggregate(change_of)[0]), ends,
+                                    sum(sizes), min(sizes)))  # fmt: skip
+    columns = (
+        "first_level second_level difference low high pairs:int64 enough_pairs:bool verdict:str"
+    )
+    return frame(rows, f"first:str second:str metric:str class_name:str {columns}")
+
+
+def _paired(runs: pd.DataFrame, first: str, second: str, metric: str) -> dict[str, Array]:
+    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed."""
+    on = ["class_name", "spec_digest", "seed"]
+    left, right = (runs.loc[runs.algorithm == name, [*on, metric]] for name in (first, second))
+    both = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
+    return {
+        str(name): group[[f"{metric}_1", f"{metric}_2"]].to_numpy()
+        for name, group in both.groupby("class_name", sort=False)
+    }
+
+
+def _difference(
+    first: str,
+    second: str,
+    metric: Metric,
+    class_name: str,
+    levels: Array,
+    difference: float,
+    ends: tuple[float, float],
+    pairs: int,
+    fewest: int,
+) -> tuple[Any, ...]:
+    verdict = contrast_verdict(difference * metric.worse, *ends)
+    enough = fewest >= ENOUGH_RUNS
+    place = (first, second, metric.key, class_name)
+    return (*place, *levels, difference, *ends, pairs, enough, verdict)
 
 
 def contrast_verdict(worsening: float, low: float, high: float) -> str:

@@ -30,6 +30,7 @@ SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF"}
 FIGURES = {
     "contrasts-regret", "contrasts-training", "wd-regret", "ood-regret", "regions", "decay",
     "aggregates", "profiles-wd", "profiles-ood", "improvements", "learning-curves-k",
+    "differences", "learning-curves-by-class",
     "learning-curves-r_min", "learning-curves-complexity", "learning-curves-several-axes",
 }  # fmt: skip
 
@@ -150,17 +151,25 @@ def test_the_csv_holds_every_number_of_the_tables(written: Path, finished: Path)
 
 def test_latex_tables_are_ascii_and_as_wide_as_they_say(written: Path):
     files = list((written / "tables").glob("*.tex"))
-    assert len(files) == 11
+    assert len(files) == 21
     for path in files:
         text = path.read_text()
         assert text.isascii(), path
-        columns = re.search(r"begin\{tabular\}\{(l+r*)\}", text)
+        columns = re.search(r"X(r*)@\{\}\}$", text, re.MULTILINE)
         assert columns is not None
         rows = [line for line in text.splitlines() if line.endswith(r" \\")]
         assert len(rows) > 1
         for row in rows:
-            assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1]) - 1
+            if not row.startswith(r"\multicolumn{2}"):
+                assert len(re.findall(r"(?<!\\)&", row)) == len(columns[1])
             assert not re.search(r"(?<!\\)[_%#]", row)
+
+
+def test_the_levels_by_class_are_on_the_page(written: Path, analysis: Analysis):
+    text = (written / "index.html").read_text()
+    assert 'id="table-levels-wd-regret"' in text
+    levels = analysis.levels[analysis.levels.metric == "wd_regret"]
+    assert all(f"<td>{row.iqm:.2f} [" in text for row in levels.itertuples())
 
 
 def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]):

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures import comparisons, curves, maps
+from sme_registry.studies.report.figures import comparisons, curves, differences, maps
 from sme_registry.studies.report.figures.panels import Picture
 
 __all__ = ["Picture", "draw_figures"]
@@ -52,6 +52,8 @@ def draw_figures(
         *comparisons.draw_aggregates(analysis, formats),
         *curves.draw_profiles(analysis, formats),
         *comparisons.draw_improvements(analysis, formats),
+        *differences.draw_differences(analysis, formats),
+        *differences.draw_class_curves(analysis, formats),
         *curves.draw_learning_curves(analysis, formats),
         *([plane] if isinstance(plane, Picture) else ()),
         *curves.draw_offline(analysis, formats),

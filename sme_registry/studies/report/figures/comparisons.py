@@ -21,7 +21,7 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
         if rows.empty:
             continue
         looks = {a: look for a, look in panels.looks(analysis).items() if a in set(rows.algorithm)}
-        place = _class_places(analysis, set(rows.class_name))
+        place = class_places(analysis, set(rows.class_name))
         height = 1.15 + (0.07 * len(looks) + 0.09) * max(5.0, max(place.values()) + 1)
         with panels.panel_grid(len(metrics), formats, (0.0, height)) as grid:
             for axes, metric in zip(grid.panels, metrics, strict=True):
@@ -32,7 +32,7 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
                 side = "right" if metric.worse > 0 else "left"
                 axes.set_xlabel(f"change of\n{metric.label}\n(worse to the {side})")
                 axes.locator_params(axis="x", nbins=15 // len(metrics))
-            _name_rows(grid, place)
+            name_rows(grid, place)
             panels.legend(grid.figure, looks)
         labels = [metric.label.partition(",")[0] for metric in metrics]
         yield Picture(
@@ -61,7 +61,7 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pict
             panels.marks_by_algorithm(axes, selected, "value", at, enough, looks)
             axes.set_title(heading, fontsize=9)
             axes.set_xlabel("IQM of 1 − normalised regret")
-        _name_rows(grid, place)
+        name_rows(grid, place)
         panels.legend(grid.figure, looks)
     yield Picture(
         "aggregates",
@@ -88,7 +88,7 @@ def draw_improvements(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pi
             axes.set_xlim(-0.02, 1.02)
             axes.set_title(heading, fontsize=9)
             axes.set_xlabel("P(a run of X beats a run of Y)")
-        _name_rows(grid, place, shaded=False)
+        name_rows(grid, place, shaded=False)
     caption = (
         "How probably a run of the first algorithm beats a run of the second on a class drawn at "
         "random, with its 95 % interval: ½ where neither is better."
@@ -132,7 +132,7 @@ def _places(names: Iterable[str]) -> dict[str, float]:
     return {name: float(i) for i, name in enumerate(dict.fromkeys(names))}
 
 
-def _class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
+def class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
     """The height of each class's row, with a gap between axes."""
     places: dict[str, float] = {}
     y, last = -1.0, None
@@ -143,7 +143,7 @@ def _class_places(analysis: Analysis, present: set[str]) -> dict[str, float]:
     return places
 
 
-def _name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool = True) -> None:
+def name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool = True) -> None:
     """Rows of marks from top to bottom, on light bands instead of grid lines."""
     for axes in grid.panels:
         axes.grid(visible=False, axis="y")

@@ -110,7 +110,7 @@ def draw_profiles(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictur
             for axes, group in zip(grid.panels, groups, strict=True):
                 for name, profile in rows[rows.group == group].groupby("algorithm", sort=False):
                     columns = ["threshold", "low", "share", "high"]
-                    _line_with_band(axes, profile[columns], looks[name], (5, 20))
+                    line_with_band(axes, profile[columns], looks[name], (5, 20))
                 axes.set_title(literal(group), fontsize=9)
                 axes.set_ylim(-0.02, 1.02)
                 axes.set_xlim(0.0, 1.0)
@@ -149,7 +149,7 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
                 stack[-1].set_xlabel(f"{'gradient' if data[name] else 'environment'} steps")
                 stack[-1].set_xlim(left=0)
                 stack[-1].locator_params(axis="x", nbins=4)
-                stack[-1].xaxis.set_major_formatter(_steps)
+                stack[-1].xaxis.set_major_formatter(step_text)
             for index, label in enumerate(CURVES.values()):
                 grid.label_rows(label, index)
             labels = _class_labels(analysis, group, with_symbol=True)
@@ -173,7 +173,7 @@ def _draw_classes(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> N
         if name in curves:
             curve = curves[name][["step", "q25", "median", "q75"]]
             every = max(1, len(curve) // 6)
-            _line_with_band(axes, curve, look, (index * every // len(looks), every))
+            line_with_band(axes, curve, look, (index * every // len(looks), every))
 
 
 def draw_offline(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
@@ -235,7 +235,7 @@ def _offline_caption(analysis: Analysis) -> str:
     return caption
 
 
-def _line_with_band(axes: Any, curve: pd.DataFrame, look: Look, markevery: tuple[int, int]) -> None:
+def line_with_band(axes: Any, curve: pd.DataFrame, look: Look, markevery: tuple[int, int]) -> None:
     """The columns of a curve are x, the lower end of the band, the line, and the upper end."""
     x, low, middle, high = (curve[name] for name in curve)
     axes.fill_between(x, low, high, color=look.colour, alpha=0.14, linewidth=0)
@@ -255,5 +255,6 @@ def _class_labels(analysis: Analysis, group: Group, *, with_symbol: bool = False
     return [setting_label(group.axis, value, with_symbol=with_symbol) for value in values]
 
 
-def _steps(value: float, _: Any) -> str:
+def step_text(value: float, _: Any) -> str:
+    """A number of steps as a tick: `20k`."""
     return f"{value / 1000:g}k" if value >= 10_000 else f"{value:g}"

@@ -1,0 +1,144 @@
+"""`compare`: two algorithms of a study, or two settings of one, by their paired differences.
+
+The runs of a pair have the same instance and seed, so what instances and seeds do to both cancels.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.io import to_json, write_atomically
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.exports import TextTable, difference_table
+from sme_registry.studies.report.frames import StudyFrames, load, plan_file, runs
+from sme_registry.studies.report.tables import METRICS, Metric, differences
+
+__all__ = ["compare", "comparison_tables", "write_comparison"]
+
+DEFAULT_METRICS = ("wd_regret", "ood_regret")
+
+
+def compare(
+    study: StudyFrames | str | os.PathLike[str],
+    first: str,
+    second: str,
+    metrics: Sequence[str] = DEFAULT_METRICS,
+) -> pd.DataFrame:
+    """The paired difference first − second on each class, and its mean over all classes.
+
+    Args:
+      study: the frames of `load`, or the study's folder.
+      first: an algorithm's name in the plan.
+      second: another one.
+      metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret".
+
+    Returns:
+      One row for each metric and class, and one for "all classes": first_level and second_level,
+      IQM over the paired runs; difference, the IQM of the paired differences, with the ends low
+      and high of its 95 % bootstrap interval (NaN for a single pair); pairs; enough_pairs; and the
+      verdict on the first algorithm: better, worse or open. `tables` has the formulas.
+
+    Raises:
+      UnknownNameError: the study has no finished run of such an algorithm, or no such metric.
+      OptionError: both are the same, no class has a pair, or the folder holds no study.
+    """
+    frames = study if isinstance(study, StudyFrames) else load(study)
+    finished = runs(frames.results)
+    _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
+    chosen = [_metric(name) for name in metrics]
+    table = differences(finished, [(first, second)], chosen)
+    if table.empty:
+        raise OptionError(
+            f"{first!r} and {second!r}: no class has a run of both on the same instance with the "
+            "same seed. Run more of the study's cells."
+        )
+    return table
+
+
+def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
+    """The result of `compare` for people, a table for each metric."""
+    return [
+        difference_table(table[table.metric == key], _metric(key), levels=True)
+        for key in dict.fromkeys(table.metric)
+    ]
+
+
+def write_comparison(
+    folder: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    first: str,
+    second: str,
+    metrics: Sequence[str] = DEFAULT_METRICS,
+) -> list[Path]:
+    """Write a comparison as CSV, JSON and LaTeX, and its figures as PNG and PDF.
+
+    Args:
+      folder: of the study.
+      out: the folder to write.
+      first, second, metrics: see `compare`.
+
+    Returns:
+      The files: differences.csv and .json, a .tex for each metric, and the figures `differences`
+      and `learning-curves-by-class`.
+
+    Raises:
+      MissingDependencyError: Matplotlib is not installed.
+      UnknownNameError, OptionError: see `compare`; or a file cannot be written.
+    """
+    from sme_registry.studies.report.figures.differences import draw_class_curves, draw_differences
+
+    table = compare(folder, first, second, metrics)
+    contents: dict[str, str | bytes] = {
+        "differences.csv": table.to_csv(index=False, lineterminator="\n"),
+        "differences.json": to_json(records(table)),
+    }
+    contents |= {f"{each.name}.tex": each.latex() for each in comparison_tables(table)}
+    analysis = _analysis(folder, first, second)
+    formats = ("png", "pdf")
+    for draw in (draw_differences, draw_class_curves):
+        for picture in draw(analysis, formats):
+            contents |= {f"{picture.name}.{each}": picture.files[each] for each in formats}
+    return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a frame as plain data; NaN is None."""
+    plain = table.astype(object).where(table.notna(), None)
+    return [{str(name): value for name, value in row.items()} for row in plain.to_dict("records")]
+
+
+def _analysis(folder: str | os.PathLike[str], first: str, second: str) -> Analysis:
+    """The tables of these two algorithms alone, the first one first."""
+    ledger = Ledger(folder)
+    file = plan_file(ledger)
+    of = {algorithm.name: algorithm for algorithm in file.plan.algorithms}
+    plan = file.plan.model_copy(update={"algorithms": (of[first], of[second])})
+    results = ledger.results(cell.cell.digest for cell in plan.cells)
+    return analyse(file.model_copy(update={"plan": plan}), results)
+
+
+def _check_names(first: str, second: str, known: Sequence[str]) -> None:
+    for name in (first, second):
+        if name not in known:
+            raise UnknownNameError(
+                f"{name!r}: the study has no finished run of such an algorithm."
+                f"{did_you_mean(name, known)} Its algorithms: {', '.join(known) or 'none'}."
+            )
+    if first == second:
+        raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
+
+
+def _metric(name: str) -> Metric:
+    known = {metric.key: metric for metric in METRICS}
+    if name not in known:
+        raise UnknownNameError(
+            f"metric={name!r}: must be one of {', '.join(known)}.{did_you_mean(name, known)}"
+        )
+    return known[name]
