@@ -592,6 +592,9 @@ class TestTrain:
             (("--num-envs", "0"), "num_envs=0"),
             (("--action-range", "unti"), "action_range='unti'"),
             (("--set", "state_dim=x"), "state_dim='x'"),
+            (("--set", "complexty=3"), "Did you mean 'complexity'"),
+            (("--set", "learning_rat=3"), "Did you mean 'learning_rate'"),
+            (("--hyperparameters", "none.json"), "none.json"),
             (("--protocol", "papr-v1"), "Did you mean"),
             (("--checkpoint-every", "0"), "checkpoint_every=0"),
         ],
@@ -602,6 +605,19 @@ class TestTrain:
         pytest.importorskip("stable_baselines3")
         assert message in refused(*SHORT, *options)
         assert list(tmp_path.iterdir()) == []
+
+    def test_hyperparameters_come_from_options_and_a_file(self, tmp_path: Path) -> None:
+        pytest.importorskip("stable_baselines3")
+        (tmp_path / "settings.json").write_text('{"gamma": 0.9}')
+        file = ("--hyperparameters", "settings.json")
+        options = ("--set", "policy_kwargs.net_arch=[8]", "--set", "k=2", *file)
+        printed = json.loads(good(*SHORT, "-n", "30", *options, "--json").stdout)
+        assert printed["run"]["hyperparameters"] == {
+            "gamma": 0.9,
+            "policy_kwargs": {"net_arch": [8]},
+        }
+        assert printed["run"]["spec"]["k"] == 2
+        assert "sets it, too" in refused(*SHORT, *file, "--set", "gamma=0.8")
 
     def test_a_team_is_trained_with_its_regret_shown_and_its_model_evaluated(
         self, tmp_path: Path

@@ -129,8 +129,9 @@ def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
             f"{folder}: contains an unfinished run. Resume it (`sme train --resume`), or list it "
             "in a table with policy null, which scores 1."
         )
+    changes = ", ".join(f"{k}={v}" for k, v in sorted(record.hyperparameters.items()))
     settings = (
-        f"{record.algorithm}, {record.hyperparameters}; actions in "
+        f"{record.algorithm}, defaults{changes and f', but {changes}'}; actions in "
         f"{_RANGES[record.action_range]}; num_envs={record.num_envs}"
     )
     provenance = Provenance(record.versions, settings, record.wall_seconds)

@@ -13,11 +13,11 @@ from sme_registry.cli.arguments import (
     Json,
     Out,
     Protocol,
-    SpecChanges,
     TaskName,
     changes,
 )
 from sme_registry.cli.files import print_training
+from sme_registry.errors import OptionError
 from sme_registry.spec import SMESpec
 from sme_registry.terminal import err
 
@@ -27,7 +27,10 @@ def train(
     algorithm: Annotated[
         str | None,
         typer.Option(
-            "--algorithm", "-a", help="TD3, SAC, DDPG, PPO or A2C; default TD3, for teams PPO."
+            "--algorithm",
+            "-a",
+            help="TD3, SAC, DDPG, PPO, A2C, or module:Class, such as sb3_contrib:TQC. Default TD3, "
+            "for teams PPO.",
         ),
     ] = None,
     steps: Annotated[
@@ -41,12 +44,26 @@ def train(
     num_envs: Annotated[
         int | None,
         typer.Option(
-            help="Environments (teams) at once. More mean fewer updates for off-policy algorithms. "
-            "Default 1; on-policy for a team 8."
+            help="Environments (teams) at once; the algorithm stays the same. Default 1; on-policy "
+            "for a team 8."
         ),
     ] = None,
+    independent: Annotated[
+        bool, typer.Option("--independent", help="One model for each agent of a team.")
+    ] = False,
     protocol: Protocol = "paper-v1",
-    set_: SpecChanges = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change a field of the task or a hyperparameter of the algorithm. Repeatable.",
+        ),
+    ] = None,
+    hyperparameters: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Hyperparameters in a JSON file.", dir_okay=False),
+    ] = None,
     checkpoint_every: Annotated[
         int | None,
         typer.Option(help="Steps between checkpoints; default a twentieth of all, at least 1,000."),
@@ -57,39 +74,55 @@ def train(
 ) -> None:
     """Train an algorithm of Stable-Baselines3, log the exact regret of each episode, evaluate it.
 
-    It uses SB3's default hyperparameters on one CPU thread, which is fastest for networks of this
-    size. PPO and A2C finish their last rollout. The output folder, by default
-    runs/TASK-ALGORITHM-seedN, contains episodes.csv, checkpoint.zip, model.zip, run.json,
-    evaluation.json, figures, and TensorBoard's logs.
+    It runs on one CPU thread, which is fastest for networks of this size. On-policy algorithms
+    finish their last rollout. The output folder, by default runs/TASK-ALGORITHM-seedN, contains
+    episodes.csv, checkpoint.zip, model.zip, run.json, evaluation.json, figures, and logs that
+    `tensorboard --logdir runs` shows.
 
-    The agents of a team share one policy (for its observation see `sme evaluate --help`).
+    --set changes a field of the task (`sme show TASK`) or a hyperparameter, whose names and
+    defaults are those of the algorithm's class in Stable-Baselines3. Values are JSON or text; dots
+    lead into a block, as in policy_kwargs.net_arch=[64,64]. Unknown names are rejected before
+    training starts. run.json records all hyperparameters that differ from the defaults.
+
+    With several environments an algorithm stays the same: PPO still collects 2,048 steps for an
+    update, over all environments (n_steps of each is smaller), and off-policy algorithms still
+    update once for each step (gradient_steps=-1). Setting these yourself overrides this.
+
+    The agents of a team share one policy (for its observation see `sme evaluate --help`). With
+    --independent, each agent has its own, from its observations to its actions, trained with its
+    own rewards; the output folder then contains model/AGENT.zip instead of model.zip.
     episodes.csv then has the team's mean regret, and one column per agent, such as regret/agent_0.
     A step is one step of the whole team, so the algorithm sees as many transitions per step as
-    there are agents. TensorBoard's axis counts those transitions. PPO collects its 2,048
-    transitions over all agents of all teams together; run.json records n_steps.
+    there are agents, and TensorBoard's axis counts those transitions.
 
-    --resume continues from the last checkpoint with the same networks, optimisers, replay buffer
-    and step count. The result differs from an uninterrupted run: random streams get new seeds, and
-    unfinished episodes start again.
+    --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
+    hyperparameters and step count. The result differs from an uninterrupted run: random streams get
+    new seeds, and unfinished episodes start again.
 
     Examples:
 
       sme train Default --steps 20000 --seed 1
 
-      sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10
+      sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10 --set learning_rate=1e-4
+
+      sme train Default -a sb3_contrib:TQC --set top_quantiles_to_drop_per_net=5
 
       sme train mine.json --out runs/mine --resume
 
       sme train Team4 --steps 40000
+
+      sme train Team4 --independent --steps 40000
     """
     from sme_registry import training
 
-    overrides = changes(set_)
+    overrides, settings = _split(changes(set_), hyperparameters)
     spec = load(task).derive(**overrides)
-    algorithm = training.known_algorithm(algorithm or training.default_algorithm(spec))
+    algorithm = training.full_name(algorithm or training.default_algorithm(spec))
+    training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:
         label = _label(task, spec, changed=bool(overrides))
-        out_folder = Path("runs") / f"{label}-{algorithm}-seed{seed}"
+        name = training.short_name(algorithm)
+        out_folder = Path("runs") / f"{label}-{'independent-' * independent}{name}-seed{seed}"
     try:
         result = training.train(
             spec,
@@ -97,6 +130,8 @@ def train(
             steps=steps,
             seed=seed,
             folder=out_folder,
+            hyperparameters=settings,
+            independent=independent,
             action_range=cast(Any, action_range),
             num_envs=num_envs,
             checkpoint_every=checkpoint_every,
@@ -108,6 +143,19 @@ def train(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(how_to_continue(out_folder)) from None
     print_training(result, out_folder, json=json)
+
+
+def _split(values: dict[str, Any], path: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The changes of the task, and the hyperparameters from a file and from --set."""
+    from sme_registry.training import nested_hyperparameters, read_hyperparameters
+
+    fields = {name: value for name, value in values.items() if name in SMESpec.model_fields}
+    flat = {name: value for name, value in values.items() if name not in fields}
+    settings = nested_hyperparameters(flat)
+    from_file = {} if path is None else read_hyperparameters(path)
+    for name in settings.keys() & from_file.keys():
+        raise OptionError(f"--set {name}: {path} sets it, too. Remove one.")
+    return fields, {**from_file, **settings}
 
 
 def _label(task: str, spec: SMESpec, *, changed: bool) -> str:

@@ -7,8 +7,19 @@
 Importing this module does not import PyTorch.
 """
 
-from sme_registry.training.algorithms import ALGORITHMS, default_algorithm, known_algorithm
+from sme_registry.training.algorithms import (
+    ALGORITHMS,
+    default_algorithm,
+    full_name,
+    known_algorithm,
+    short_name,
+)
 from sme_registry.training.episodes import Episode, read_episodes
+from sme_registry.training.hyperparameters import (
+    check_hyperparameters,
+    nested_hyperparameters,
+    read_hyperparameters,
+)
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord
 from sme_registry.training.run import TrainingResult, train
@@ -18,9 +29,14 @@ __all__ = [
     "Episode",
     "RunRecord",
     "TrainingResult",
+    "check_hyperparameters",
     "default_algorithm",
+    "full_name",
     "known_algorithm",
+    "nested_hyperparameters",
     "numpy_policy",
     "read_episodes",
+    "read_hyperparameters",
+    "short_name",
     "train",
 ]

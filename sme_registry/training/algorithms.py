@@ -33,9 +33,7 @@ ALGORITHMS = {
     "A2C": "on-policy",
 }
 ENTRY_POINTS = "sme_registry.algorithms"
-_ON_POLICY = ("PPO", "A2C")
 _TEAMS = 8
-_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO, of one environment; ours at least
 _MAX_REPLAY = 1_000_000  # SB3's default
 
 
@@ -44,26 +42,23 @@ def default_algorithm(spec: SMESpec) -> str:
     return "TD3" if spec.team is None else "PPO"
 
 
-def default_num_envs(spec: SMESpec, algorithm: str) -> int:
-    """The default number of parallel environments: 8 for a team and an on-policy algorithm, or 1.
+def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
+    """The default number of parallel environments: 8 for a team and an on-policy class, or 1."""
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    With an off-policy algorithm, more environments would mean fewer updates.
-    """
-    return _TEAMS if spec.team is not None and algorithm in _ON_POLICY else 1
+    is_class = isinstance(algorithm, type)
+    on_policy = is_class and issubclass(algorithm, OnPolicyAlgorithm)
+    return _TEAMS if spec.team is not None and on_policy else 1
 
 
-def rollout_steps(spec: SMESpec, algorithm: str, num_envs: int) -> int | None:
-    """PPO's `n_steps` for a team; None keeps SB3's default.
+def full_name(uses: str) -> str:
+    """The exact name of an algorithm of Stable-Baselines3 in any case; other names unchanged."""
+    return next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
 
-    The default is 2,048 steps for each lane, and a team has one lane for each agent: 8 teams of 4
-    agents would collect 65,536 transitions for one update. On Team4, seed 0, r̃ was 0.77 after
-    16,384 team steps with the default, and 0.85 with 2,048 transitions divided over the lanes. Mean
-    regret then fell from 0.89 to 0.14 by step 55,000 and rose to 0.55 by step 100,000; with four
-    times the rollout it fell steadily but more slowly, to 0.23 at step 64,000.
-    """
-    if spec.team is None or algorithm != "PPO":
-        return None
-    return max(_MIN_ROLLOUT, _ROLLOUT // (num_envs * len(spec.team.agents)))
+
+def short_name(uses: str) -> str:
+    """What figures, reports and folders call an algorithm: `TQC` for `sb3_contrib:TQC`."""
+    return uses.rpartition(":")[2]
 
 
 def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:

@@ -1,4 +1,4 @@
-"""Hyperparameters: as text, as JSON values, and their check against an algorithm.
+"""Hyperparameters: as text, as JSON values, their check against an algorithm, and those we set.
 
     nested_hyperparameters({"policy_kwargs.net_arch": [64, 64]})   # --set, by dotted names
     check_hyperparameters("PPO", {"n_stepz": 64})                  # OptionError: … 'n_steps'?
@@ -21,6 +21,7 @@ from sme_registry.training.algorithms import find_algorithm, is_sb3
 _RESERVED = ("self", "policy", "env", "seed", "device", "verbose", "tensorboard_log")
 # Arguments of a policy's constructor that the algorithm passes.
 _PASSED = ("self", "observation_space", "action_space", "lr_schedule")
+_ROLLOUT, _MIN_ROLLOUT = 2048, 16  # SB3's default for PPO in one environment; ours at least
 
 
 def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,7 +62,10 @@ def read_hyperparameters(path: Path) -> dict[str, Any]:
 
 
 def check_hyperparameters(
-    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
 ) -> None:
     """Check that an algorithm has hyperparameters of these names. It checks no values.
 
@@ -72,24 +76,30 @@ def check_hyperparameters(
       uses: the algorithm; see `find_algorithm`.
       hyperparameters: names and values.
       field: what error messages call them.
+      others: names that the caller accepts beside them, which the message may suggest.
 
     Raises:
       OptionError: it has no hyperparameter of a name; the message suggests a similar one.
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
     if hyperparameters:
-        refuse_unknown(find_algorithm(uses), uses, hyperparameters, field)
+        refuse_unknown(find_algorithm(uses), uses, hyperparameters, field, others)
 
 
 def refuse_unknown(
-    algorithm: Any, uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+    algorithm: Any,
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
 ) -> None:
     """Raise OptionError if an algorithm's class or function has no hyperparameter of a name."""
     if not isinstance(algorithm, type) or not is_sb3(algorithm):
         environment = next(iter(inspect.signature(algorithm).parameters), "env")
-        _refuse_names(field, uses, hyperparameters, _names(algorithm, (environment, "seed")))
+        names = _names(algorithm, (environment, "seed"))
+        _refuse_names(field, uses, hyperparameters, names, others)
         return
-    _refuse_names(field, uses, hyperparameters, _names(algorithm, _RESERVED))
+    _refuse_names(field, uses, hyperparameters, _names(algorithm, _RESERVED), others)
     policy_kwargs = hyperparameters.get("policy_kwargs")
     if isinstance(policy_kwargs, Mapping):
         names = _names(_policy_class(algorithm), _PASSED)
@@ -127,6 +137,40 @@ def _policy_class(algorithm: Any) -> Any:
     return algorithm.policy_aliases[policy_alias(algorithm)]
 
 
+def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[str, int]:
+    """The changes to SB3's defaults that keep an algorithm the same in several lanes at once.
+
+    A lane is an environment, or one agent of a team. SB3's `n_steps` counts the steps of each lane:
+    PPO in 8 environments would collect 16,384 transitions for one update. We divide the rollout:
+    PPO collects 2,048 transitions over all lanes, with at least 16 steps in each. SB3 also counts
+    `gradient_steps` for a step of all lanes: TD3 in 8 environments would learn an eighth as often.
+    We use -1, one update for each transition.
+
+    On Team4, seed 0, r̃ was 0.77 after 16,384 team steps of PPO with SB3's defaults, and 0.85 with
+    2,048 transitions divided over the lanes. Mean regret then fell from 0.89 to 0.14 by step 55,000
+    and rose to 0.55 by step 100,000; with four times the rollout it fell steadily but more slowly,
+    to 0.23 at step 64,000.
+
+    Args:
+      algorithm: its SB3 class, or a function that returns a learner, which gets no changes.
+      lanes: environments, times the agents of a team.
+      chosen: names of hyperparameters that the user set; they are never changed, and neither are
+        those that depend on them.
+    """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+    if not isinstance(algorithm, type):
+        return {}
+    if issubclass(algorithm, OnPolicyAlgorithm) and "n_steps" not in chosen:
+        default = inspect.signature(algorithm).parameters["n_steps"].default
+        n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
+        return {} if n_steps == default else {"n_steps": n_steps}
+    if issubclass(algorithm, OffPolicyAlgorithm) and lanes > 1:
+        return {} if {"gradient_steps", "train_freq"} & set(chosen) else {"gradient_steps": -1}
+    return {}
+
+
 def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
     """The names of a function's arguments that a user may set; None if it accepts any."""
     parameters = inspect.signature(function).parameters
@@ -135,10 +179,16 @@ def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
     return [name for name in parameters if name not in reserved and not name.startswith("_")]
 
 
-def _refuse_names(field: str, owner: str, names: Iterable[str], known: list[str] | None) -> None:
+def _refuse_names(
+    field: str,
+    owner: str,
+    names: Iterable[str],
+    known: list[str] | None,
+    others: Iterable[str] = (),
+) -> None:
     for name in names:
         if known is not None and name not in known:
             raise OptionError(
-                f"{field}.{name}: {owner} has no such hyperparameter.{did_you_mean(name, known)} "
-                f"Known: {', '.join(known) or 'none'}."
+                f"{field}.{name}: {owner} has no such hyperparameter."
+                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known) or 'none'}."
             )

@@ -8,164 +8,245 @@ Imports Stable-Baselines3; import it inside functions only.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor
 
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, write_atomically
-from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
+from sme_registry.sb3 import EpisodeRegret, EpisodeSums, RegretCallback, SMETeamVecEnv, SMEVecEnv
 from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
 from sme_registry.training import episodes as episode_files
-from sme_registry.training.algorithms import load_algorithm, replay_settings, rollout_steps
+from sme_registry.training.algorithms import is_sb3, short_name, silence
 from sme_registry.training.episodes import Episode, EpisodeLog
-from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
+from sme_registry.training.independent import IndependentLearners
+from sme_registry.training.learners import new_learner
+from sme_registry.training.record import MODEL, MODELS, TENSORBOARD, RunRecord
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 
 
+def new_model(record: RunRecord) -> Any:
+    """The untrained model of a run, with its environment; `IndependentLearners` for such a team.
+
+    Raises:
+      OptionError: the algorithm rejects a hyperparameter's value or the task, or returns no model
+        of Stable-Baselines3.
+    """
+    if record.independent:
+        return IndependentLearners(record)
+    env_class = SMEVecEnv if record.spec.team is None else SMETeamVecEnv
+    env = VecMonitor(env_class(record.spec, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
+    model: Any = new_learner(
+        record.algorithm,
+        env,
+        seed=record.seed,
+        steps=record.steps * record.agents,
+        hyperparameters=record.hyperparameters,
+        field="algorithm",
+    )
+    if not is_sb3(model):
+        raise OptionError(
+            f"algorithm={record.algorithm!r}: returned a {type(model).__name__}, which is no model "
+            "of Stable-Baselines3, so its training cannot be logged or resumed. Train it in a "
+            f"study: `sme study new plan.json -t TASK -a {record.algorithm}`."
+        )
+    return model
+
+
 def learn(
-    record: RunRecord, folder: Path, progress: bool, console: Console | None
+    model: Any, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> tuple[RunRecord, list[Episode], Any]:
-    """Train and write a model; returns the record with its progress, all episodes, and the model.
+    """Train and write a model.
+
+    Args:
+      model: the one of `new_model`; a resumed run continues that of its checkpoint.
+      record: the run's plan.
+      folder: the run's folder.
+      progress: whether to show progress.
+      console: where.
+
+    Returns:
+      The record with its progress, all episodes, and a policy for `evaluate`: the model, or for
+      independent learners a dict of each agent's.
 
     Raises:
       PolicyError: the checkpoint cannot be loaded.
       OptionError: a file cannot be written.
     """
-    env = _new_env(record)
-    model = _model(record, env, folder)
-    first_step = int(model.num_timesteps) // record.agents  # SB3 counts each agent's steps
-    team = record.spec.team
-    names = () if team is None else tuple(agent.name for agent in team.agents)
-    log = EpisodeLog(folder / episode_files.FILE, first_step, names)
-
-    title, total = f"training {record.algorithm}", _total_steps(record, model, first_step)
-    with Progress(title, total, done=first_step, console=console, enabled=progress) as bar:
-        callback = _Callback(model, record, folder, log, bar)
-        try:
-            if first_step < record.steps:
-                model.learn(
-                    (record.steps - first_step) * record.agents,
-                    callback=callback,
-                    reset_num_timesteps=first_step == 0,
-                    tb_log_name="run",
-                )
-                callback.save_checkpoint()
-        finally:
-            log.close()
-            env.close()
-    record = callback.record()
+    env = model.env
+    model = _continued(model, record, folder)
+    lanes_of_a_step = 1 if record.independent else record.agents  # SB3 counts each agent's steps
+    first_step = int(model.num_timesteps) // lanes_of_a_step
+    total = _total_steps(record, model, first_step)
+    _set_loggers(model, folder / TENSORBOARD)
+    with RunLog(record, folder, first_step, total, progress, console) as log:
+        if first_step < record.steps:
+            train = _train_independent if record.independent else _train
+            train(model, record, first_step, log)
+            _save_checkpoint(model, log)
+    for each in _models(model):
+        each.logger.close()
+    env.close()
     with defer_interrupts():
-        write_atomically(folder / MODEL, saved_sb3(model))
-        record.write(folder)
-    return record, log.episodes, model
+        _write_model(model, folder)
+        log.record().write(folder)
+    return log.record(), log.episodes, model.models if record.independent else model
 
 
-class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
-    """Logs finished episodes, saves checkpoints and updates the progress during SB3's training.
+def _train(model: Any, record: RunRecord, first_step: int, log: RunLog) -> None:
+    model.learn(
+        (record.steps - first_step) * record.agents,
+        callback=_Callback(model, log),
+        reset_num_timesteps=first_step == 0,
+    )
 
-    SB3 counts one step for each agent of a team; here and in all files a step is one of the team.
-    The lanes of a team's agents are adjacent.
+
+def _train_independent(
+    learners: IndependentLearners, record: RunRecord, first_step: int, log: RunLog
+) -> None:
+    sums = EpisodeSums(learners.env.num_envs, record.agents)
+
+    def on_step(rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+        finished = sums.add(learners.num_timesteps, rewards, dones, infos)
+        log.add(learners.num_timesteps, finished)
+        for episode in finished:
+            by_agent = episode.agents_regret or (episode.regret,)
+            for model, regret in zip(learners.models.values(), by_agent, strict=True):
+                model.logger.record_mean("rollout/regret", regret)
+
+    def on_rollout() -> None:
+        if log.is_checkpoint_due():
+            _save_checkpoint(learners, log)
+
+    learners.learn(record.steps, on_step, on_rollout)
+
+
+def _save_checkpoint(model: Any, log: RunLog) -> None:
+    independent = isinstance(model, IndependentLearners)
+    log.save_checkpoint(
+        model.save_checkpoint if independent else lambda path: checkpoint.save(model, path)
+    )
+
+
+def _write_model(model: Any, folder: Path) -> None:
+    if isinstance(model, IndependentLearners):
+        model.save(folder / MODELS)
+        return
+    write_atomically(folder / MODEL, saved_sb3(model))
+
+
+class RunLog:
+    """The log, the record and the displayed progress of a run, while it trains.
+
+    Args:
+      record: the run's plan.
+      folder: its folder.
+      first_step: of the checkpoint that it continues from; 0 for a new run.
+      total: steps at its end.
+      progress: whether to show progress.
+      console: where.
     """
 
     def __init__(
-        self, model: Any, record: RunRecord, folder: Path, log: EpisodeLog, progress: Progress
+        self,
+        record: RunRecord,
+        folder: Path,
+        first_step: int,
+        total: int,
+        progress: bool,
+        console: Console | None,
     ) -> None:
-        super().__init__()
-        self.model = model
+        team = record.spec.team
+        names = () if team is None else tuple(agent.name for agent in team.agents)
         self._record, self._folder = record, folder
-        self._log, self._progress = log, progress
-        self._wall_before = log.episodes[-1].wall_seconds if log.episodes else 0.0
+        self._log = EpisodeLog(folder / episode_files.FILE, first_step, names)
+        self._wall_before = self.episodes[-1].wall_seconds if self.episodes else 0.0
+        self._steps = self._last_checkpoint = first_step
+        name = short_name(record.algorithm)
+        if progress and total > max(first_step, record.steps):
+            (console or Console(stderr=True)).print(
+                f"{name} collects whole rollouts: {total:,} steps, not {record.steps:,}.",
+                style="dim",
+            )
+        self._progress = Progress(
+            f"training {name}", total, done=first_step, console=console, enabled=progress
+        )
+
+    def __enter__(self) -> RunLog:
+        self._progress.__enter__()
         self._start = time.monotonic()
+        self._note = self._running_mean()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._wall_before, self._start = self._wall_seconds, time.monotonic()
+        self._progress.__exit__(*error)
+        self._log.close()
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """All finished episodes, also those of earlier sessions."""
+        return self._log.episodes
+
+    def add(self, steps: int, finished: Sequence[EpisodeRegret]) -> None:
+        """Log the episodes that finished after so many environment steps of the whole run."""
+        self._steps = steps
+        for episode in finished:
+            by_agent = episode.agents_regret or (episode.regret,)
+            self._log.add(
+                Episode(
+                    episode=len(self.episodes) + 1,
+                    step=steps,
+                    episode_return=episode.episode_return,
+                    length=episode.length,
+                    regret=episode.regret,
+                    similarity=episode.similarity,
+                    terminated=int(episode.terminated),
+                    wall_seconds=round(self._wall_seconds, 3),
+                    agents_regret=by_agent if self._log.agents else (),
+                )
+            )
+        if finished:
+            self._note = self._running_mean()
+        self._progress.update(steps, self._note)
 
     def record(self) -> RunRecord:
         """The record with its present progress."""
-        steps, seconds = self._steps_done, self._wall_seconds
+        seconds = self._wall_seconds
         return self._record.updated(
-            steps_done=steps,
-            episodes=len(self._log.episodes),
+            steps_done=self._steps,
+            episodes=len(self.episodes),
             wall_seconds=round(seconds, 3),
-            steps_per_second=round(steps / max(seconds, 1e-9), 3),
+            steps_per_second=round(self._steps / max(seconds, 1e-9), 3),
         )
 
-    def save_checkpoint(self) -> None:
-        """Write the checkpoint and the record."""
+    def is_checkpoint_due(self) -> bool:
+        """Whether enough steps have passed since the last checkpoint."""
+        return self._steps - self._last_checkpoint >= self._record.checkpoint_every
+
+    def save_checkpoint(self, save: Callable[[Path], None]) -> None:
+        """Write the checkpoint with `save`, and the record."""
         with defer_interrupts():
-            checkpoint.save(self.model, self._folder / checkpoint.FILE)
+            save(self._folder / checkpoint.FILE)
             self.record().write(self._folder)
+        self._last_checkpoint = self._steps
 
     @property
     def _wall_seconds(self) -> float:
         """Seconds of training over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
-    @property
-    def _steps_done(self) -> int:
-        """Environment steps of the whole run over all environments."""
-        return int(self.model.num_timesteps) // self._record.agents
-
-    def _on_training_start(self) -> None:
-        # return, length, sum of regret and sum of similarity of the current episode in each lane
-        self._sums = np.zeros((4, self.training_env.num_envs))
-        self._last_checkpoint = self._steps_done
-        self._start = time.monotonic()
-        self._note = self._running_mean()
-
-    def _on_rollout_start(self) -> None:
-        # Between rollouts the model is consistent: it has learnt from all transitions, and they are
-        # in its replay buffer. For off-policy algorithms that is after each environment step.
-        if self._steps_done - self._last_checkpoint >= self._record.checkpoint_every:
-            self.save_checkpoint()
-            self._last_checkpoint = self._steps_done
-
-    def _on_step(self) -> bool:
-        infos, dones = self.locals["infos"], self.locals["dones"]
-        self._sums[0] += self.locals["rewards"]
-        self._sums[1] += 1.0
-        self._sums[2] += [info["regret"] for info in infos]
-        self._sums[3] += [info["similarity"] for info in infos]
-        # The lanes of a team end together, so checking the first one is enough.
-        agents = self._record.agents
-        for lane in np.flatnonzero(dones[::agents]) * agents:
-            self._log_episode(int(lane), int(not infos[lane]["TimeLimit.truncated"]))
-        if dones.any():
-            self._note = self._running_mean()
-        self._progress.update(self._steps_done, self._note)
-        return True
-
-    def _log_episode(self, lane: int, terminated: int) -> None:
-        """Log the episode that ended in this lane, or in a team's lanes from this one on."""
-        lanes = slice(lane, lane + self._record.agents)
-        returned, length, regret, similarity = self._sums[:, lanes].mean(axis=1).tolist()
-        regrets = (self._sums[2, lanes] / length).tolist() if self._log.agents else []
-        self._sums[:, lanes] = 0.0
-        self._log.add(
-            Episode(
-                episode=len(self._log.episodes) + 1,
-                step=self._steps_done,
-                episode_return=returned,
-                length=int(length),
-                regret=regret / length,
-                similarity=similarity / length,
-                terminated=terminated,
-                wall_seconds=round(self._wall_seconds, 3),
-                agents_regret=tuple(regrets),
-            )
-        )
-        self.logger.record_mean("sme/regret", regret / length)
-        self.logger.record_mean("sme/similarity", similarity / length)
-        for agent, value in zip(self._log.agents, regrets, strict=True):
-            self.logger.record_mean(f"sme/regret/{agent}", value)
-
     def _running_mean(self) -> str:
-        recent = self._log.episodes[-_RECENT:]
+        recent = self.episodes[-_RECENT:]
         if not recent:
             return ""
         regret = np.mean([episode.regret for episode in recent])
@@ -173,33 +254,65 @@ class _Callback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped w
         return f"{whose} {regret:.3f} (last {len(recent)} episodes)"
 
 
-def _new_env(record: RunRecord) -> Any:
-    env_class = SMEVecEnv if record.spec.team is None else SMETeamVecEnv
-    return VecMonitor(env_class(record.spec, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
+class _Callback(RegretCallback):
+    """Logs finished episodes, saves checkpoints and updates the progress during SB3's training."""
+
+    def __init__(self, model: Any, log: RunLog) -> None:
+        super().__init__()
+        self.model, self._log, self._logged = model, log, 0
+
+    def _on_rollout_start(self) -> None:
+        # Between rollouts the model is consistent: it has learnt from all transitions, and they are
+        # in its replay buffer. For off-policy algorithms that is after each environment step.
+        if self._log.is_checkpoint_due():
+            _save_checkpoint(self.model, self._log)
+
+    def _on_step(self) -> bool:
+        super()._on_step()
+        self._log.add(self.steps, self.episodes[self._logged :])
+        self._logged = len(self.episodes)
+        return True
 
 
-def _model(record: RunRecord, env: Any, folder: Path) -> Any:
-    """A new model, or that of the checkpoint if the run is resumed."""
-    algorithm = load_algorithm(record.algorithm)
-    settings: dict[str, Any] = {
-        "tensorboard_log": str(folder / TENSORBOARD) if is_installed("tensorboard") else None,
-        **replay_settings(algorithm, (record.steps + record.num_envs) * record.agents),
-    }
-    n_steps = rollout_steps(record.spec, record.algorithm, record.num_envs)
-    if n_steps is not None:
-        settings["n_steps"] = n_steps
+def _continued(model: Any, record: RunRecord, folder: Path) -> Any:
+    """The model of the checkpoint if the run is resumed, or the new one."""
     path = folder / checkpoint.FILE
     if record.sessions == 1 or not path.exists():
-        return algorithm("MlpPolicy", env, seed=record.seed, device="cpu", **settings)
-    model = checkpoint.load(algorithm, path, env, **settings)
+        return model
+    if isinstance(model, IndependentLearners):
+        model.load_checkpoint(path)
+        return model
+    changes: dict[str, Any] = {}
+    if hasattr(model, "buffer_size"):
+        changes["buffer_size"] = model.buffer_size
+    model = checkpoint.load(type(model), path, model.env, **changes)
     # Another stream than the first session's, but the same whenever this session is repeated.
     sequence = np.random.SeedSequence([record.seed, model.num_timesteps])
     model.set_random_seed(int(sequence.generate_state(1)[0] >> 1))
     return model
 
 
+def _models(model: Any) -> list[Any]:
+    return list(model.models.values()) if isinstance(model, IndependentLearners) else [model]
+
+
+def _set_loggers(model: Any, folder: Path) -> None:
+    """Log to TensorBoard in a folder if it is installed, or nowhere; each agent in its own."""
+    for each in _models(model):
+        silence(each)
+    if is_installed("tensorboard"):
+        folders = (
+            {folder / name: each for name, each in model.models.items()}
+            if isinstance(model, IndependentLearners)
+            else {folder: model}
+        )
+        for own_folder, each in folders.items():
+            each.set_logger(configure(str(own_folder), ["tensorboard"]))
+
+
 def _total_steps(record: RunRecord, model: Any, first_step: int) -> int:
     """Steps at the end of the run: on-policy algorithms collect whole rollouts."""
-    rollout = 1 if hasattr(model, "replay_buffer") else model.n_steps
+    on_policy = record.independent or hasattr(model, "rollout_buffer")
+    rollout = model.n_steps if on_policy else 1
     chunk = rollout * record.num_envs
     return first_step + int(-(-max(0, record.steps - first_step) // chunk)) * chunk

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, JsonValue
 
 from sme_registry.errors import OptionError
-from sme_registry.io import read_json, to_json, write_atomically
+from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel
 
 RECORD = "run.json"
-MODEL = "model.zip"
+MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
 TENSORBOARD = "tensorboard"
-DEFAULTS = "stable-baselines3 defaults"
 PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch")
+
+
+def versions_for(uses: str) -> dict[str, str]:
+    """Installed versions that the numbers depend on, including the algorithm's own package."""
+    package = uses.partition(":")[0].partition(".")[0]
+    return versions([*PACKAGES, package])
+
+
+def _from_text(value: Any) -> Any:
+    """The changes in the text of older records, "…, but n_steps=256"."""
+    if not isinstance(value, str):
+        return value
+    return {name: int(number) for name, number in re.findall(r"(\w+)=(\d+)", value)}
 
 
 class RunRecord(StrictModel):
@@ -32,11 +45,16 @@ class RunRecord(StrictModel):
     spec_digest: str
     task: str = ""  # what the task's file calls it
     algorithm: str
-    hyperparameters: str = DEFAULTS  # whose defaults, and the changes to them
+    # Those that differ from the algorithm's defaults. `sme train` sets some for several
+    # environments and for teams; see `hyperparameters.for_lanes`.
+    hyperparameters: Annotated[dict[str, JsonValue], BeforeValidator(_from_text)] = Field(
+        default_factory=dict
+    )
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
     agents: Integer = 1
+    independent: bool = False  # a team with one model for each agent
     steps: Integer  # requested, of the environment, over all environments
     # At the last checkpoint, and at the end. On-policy algorithms finish their last rollout, so it
     # can exceed `steps`.
@@ -64,16 +82,34 @@ class RunRecord(StrictModel):
         """Write the record into the run's folder; raises OptionError if that fails."""
         write_atomically(folder / RECORD, to_json(self.to_dict()))
 
+    @property
+    def model_name(self) -> str:
+        """Name of the trained model in the run's folder: a file, or the folder of its models."""
+        return MODELS if self.independent else MODEL
+
     def updated(self, **changes: Any) -> RunRecord:
         """This record with some fields changed."""
         return self.model_copy(update=changes)
 
-    def check_same_plan(self, plan: RunRecord, folder: Path) -> None:
-        """Raise OptionError if a run to be resumed has another plan."""
-        for field in ("spec_digest", "algorithm", "seed", "action_range", "num_envs"):
-            before, now = getattr(self, field), getattr(plan, field)
+    def continuing(self, previous: RunRecord, folder: Path) -> RunRecord:
+        """This plan, with the progress and the hyperparameters of the run that it continues.
+
+        Raises:
+          OptionError: the run has another plan. Hyperparameters may be left out of this one.
+        """
+        fields = ("spec_digest", "algorithm", "seed", "action_range", "num_envs", "independent")
+        pairs = {field: (getattr(previous, field), getattr(self, field)) for field in fields}
+        for name, value in self.hyperparameters.items():
+            before = previous.hyperparameters.get(name, "the algorithm's default")
+            pairs[f"hyperparameters.{name}"] = (before, value)
+        for field, (before, now) in pairs.items():
             if before != now:
                 raise OptionError(
                     f"{field}={now!r}: the run in {folder} has {before!r}. Resume it with the same "
                     "value, or train into another folder."
                 )
+        return self.updated(
+            hyperparameters=previous.hyperparameters,
+            sessions=previous.sessions + 1,
+            steps_done=previous.steps_done,
+        )

@@ -5,6 +5,7 @@ The folder of a run, which `resume` continues after an interruption:
     episodes.csv      one row for each finished episode
     checkpoint.zip    model and replay buffer, for resuming
     model.zip         the trained model
+    model/            instead: one model for each agent of a team, `<agent>.zip`
     evaluation.json   its evaluation
     *.png             figures, if matplotlib is installed
     tensorboard/      if TensorBoard is installed
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
-from sme_registry.io import choice, claim_folder, integer_in, is_installed, versions
+from sme_registry.io import choice, claim_folder, integer_in, is_installed
 from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.progress import Progress
@@ -31,14 +33,15 @@ from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
     default_algorithm,
     default_num_envs,
-    known_algorithm,
+    find_algorithm,
+    full_name,
     one_thread,
     quiet,
-    require_sb3,
-    rollout_steps,
+    short_name,
 )
 from sme_registry.training.episodes import Episode
-from sme_registry.training.record import DEFAULTS, MODEL, PACKAGES, RECORD, TENSORBOARD, RunRecord
+from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
+from sme_registry.training.record import MODEL, MODELS, RECORD, TENSORBOARD, RunRecord, versions_for
 
 EVALUATION = "evaluation.json"
 DECAY_CURVE = "decay_curve.png"
@@ -46,7 +49,7 @@ TRAINING_CURVE = "training_curve.png"
 SIMILARITY_MAP = "similarity_map.png"
 REPORT = "report.md"  # written by `sme demo`
 _FILES = (
-    RECORD, episode_files.FILE, checkpoint.FILE, MODEL, EVALUATION,
+    RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, EVALUATION,
     TRAINING_CURVE, DECAY_CURVE, SIMILARITY_MAP, REPORT, TENSORBOARD,
 )  # fmt: skip
 
@@ -67,8 +70,8 @@ class TrainingResult:
 
     @property
     def model_path(self) -> Path:
-        """Path of the trained model, for SB3's `load`."""
-        return self.folder / MODEL
+        """Path of the trained model, for SB3's `load`; of independent agents, of their folder."""
+        return self.folder / self.record.model_name
 
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""
@@ -82,6 +85,8 @@ def train(
     steps: int = 20_000,
     seed: int = 0,
     folder: str | os.PathLike[str],
+    hyperparameters: Mapping[str, Any] | None = None,
+    independent: bool = False,
     action_range: ActionRange = "symmetric",
     num_envs: int | None = None,
     checkpoint_every: int | None = None,
@@ -91,10 +96,11 @@ def train(
     resume: bool = False,
     force: bool = False,
 ) -> TrainingResult:
-    """Train one SB3 algorithm with SB3's default hyperparameters on the CPU.
+    """Train one algorithm of Stable-Baselines3's kind on the CPU.
 
-    One exception: for a team, PPO's rollout of 2,048 transitions is divided among the agents of all
-    teams, with at least 16 steps each, instead of 2,048 for each agent.
+    Hyperparameters that are not given have the algorithm's defaults, except in several environments
+    or for a team, where `n_steps` or `gradient_steps` keep the algorithm what it is in one; see
+    `hyperparameters.for_lanes`. `run.json` records all that differ from the defaults.
 
     A resumed run continues from its last checkpoint, with the same networks, optimisers, replay
     buffer and step count. It does not reproduce the uninterrupted run bit for bit: random streams
@@ -103,16 +109,20 @@ def train(
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
-      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; None takes TD3, and PPO for a
-        team.
+      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; "module:Class", such as
+        "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); None takes TD3, and
+        PPO for a team.
       steps: environment steps over all environments, at least 1. One step of a team is a step of
         all its n agents and gives n transitions. PPO and A2C finish their last rollout.
       seed: of the algorithm and of the environment's starts, in [0, 2**32 - num_envs].
       folder: output folder, created if it is missing.
+      hyperparameters: those that differ from the algorithm's defaults, as JSON values, such as
+        {"learning_rate": 1e-4, "policy_kwargs": {"net_arch": [64, 64]}}. Dotted names are nested.
+      independent: whether each agent of a team has a model of its own, which learns from its
+        observations and rewards; otherwise they share one. For on-policy algorithms.
       action_range: of the policy's actions, "symmetric" [−1, 1] or "unit" [0, 1].
       num_envs: environments (or teams) stepped in parallel, in [1, 4096]; None takes 1, and 8 for a
-        team with PPO or A2C. Off-policy algorithms update once for each parallel step, so more
-        environments mean fewer updates.
+        team and an on-policy algorithm.
       checkpoint_every: steps between checkpoints; None takes a twentieth of `steps`, at least
         1,000.
       protocol: of the final evaluation.
@@ -132,16 +142,28 @@ def train(
       ResourceLimitError: the task would not fit in memory.
       MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
     """
-    plan = _plan(spec, algorithm, steps, seed, action_range, num_envs, checkpoint_every, protocol)
-    require_sb3()
+    plan = _plan(
+        spec,
+        steps=steps,
+        seed=seed,
+        action_range=action_range,
+        checkpoint_every=checkpoint_every,
+        protocol=protocol,
+        independent=independent,
+    )
+    with quiet():
+        plan = _with_algorithm(plan, algorithm, num_envs, hyperparameters or {})
     materialize(plan.spec)  # fails before the folder is created
     folder = Path(folder)
-    record = _claim(folder, plan, resume=resume, force=force)
-    record.write(folder)
+    record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread():
-        from sme_registry.training.learn import learn
+        from sme_registry.training.learn import learn, new_model
 
-        record, episodes, model = learn(record, folder, progress, console)
+        model = new_model(record)  # rejects values of hyperparameters before the folder is created
+        if record.sessions == 1:
+            _claim(folder, force=force)
+        record.write(folder)
+        record, episodes, model = learn(model, record, folder, progress, console)
         report, figures = _evaluate(model, record, folder, progress, console)
     record = record.updated(status="finished")
     record.write(folder)
@@ -150,57 +172,72 @@ def train(
 
 def _plan(
     task: SpecLike,
-    algorithm: str | None,
+    *,
     steps: int,
     seed: int,
     action_range: ActionRange,
-    num_envs: int | None,
     checkpoint_every: int | None,
     protocol: ProtocolLike,
+    independent: bool,
 ) -> RunRecord:
-    """The record of a new run, from the arguments of `train`."""
+    """The record of a new run, still without its algorithm."""
     spec = load_spec(task)
-    algorithm = known_algorithm(default_algorithm(spec) if algorithm is None else algorithm)
+    if independent and spec.team is None:
+        raise OptionError(
+            "independent=True: must be False for a task of a single agent. Leave it out, or give a "
+            "team, such as Team4."
+        )
     steps = integer_in("steps", steps, 1, MAX_STEPS)
-    if num_envs is None:
-        num_envs = default_num_envs(spec, algorithm)
-    num_envs = integer_in("num_envs", num_envs, 1, 4096)
-    seed = integer_in("seed", seed, 0, 2**32 - num_envs)
     if checkpoint_every is None:
         checkpoint_every = max(_MIN_STEPS_BETWEEN_CHECKPOINTS, steps // _CHECKPOINTS)
-    checkpoint_every = integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS)
     choice("action_range", action_range, ACTION_RANGES)
     resolved_protocol = resolve_protocol(protocol)
-    n_steps = rollout_steps(spec, algorithm, num_envs)
     return RunRecord(
         status="running",
-        hyperparameters=DEFAULTS if n_steps is None else f"{DEFAULTS}, but n_steps={n_steps}",
         spec=spec,
         spec_digest=spec.digest,
         task=spec.name,
-        algorithm=algorithm,
-        seed=seed,
+        algorithm="",
+        seed=integer_in("seed", seed, 0, 2**32 - 1),
         action_range=action_range,
-        num_envs=num_envs,
+        num_envs=1,
         agents=1 if spec.team is None else len(spec.team.agents),
+        independent=independent,
         steps=steps,
-        checkpoint_every=checkpoint_every,
+        checkpoint_every=integer_in("checkpoint_every", checkpoint_every, 1, MAX_STEPS),
         protocol=resolved_protocol,
         protocol_digest=resolved_protocol.digest,
-        versions=versions(PACKAGES),
+        versions={},
     )
 
 
-def _claim(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
-    """Prepare the folder; returns the plan, with the progress of a run that is resumed."""
+def _with_algorithm(
+    plan: RunRecord, uses: str | None, num_envs: int | None, hyperparameters: Mapping[str, Any]
+) -> RunRecord:
+    """A plan with its algorithm, the hyperparameters that the user set, and its environments."""
+    uses = default_algorithm(plan.spec) if uses is None else full_name(uses)
+    algorithm = find_algorithm(uses, "algorithm")
+    settings = nested_hyperparameters(hyperparameters)
+    refuse_unknown(algorithm, uses, settings)
+    if num_envs is None:
+        num_envs = default_num_envs(plan.spec, algorithm)
+    num_envs = integer_in("num_envs", num_envs, 1, 4096)
+    integer_in("seed", plan.seed, 0, 2**32 - num_envs)
+    return plan.updated(
+        algorithm=uses,
+        hyperparameters=settings,
+        num_envs=num_envs,
+        versions=versions_for(uses),
+    )
+
+
+def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
+    """The plan with all its hyperparameters, and with the progress of a run that is resumed."""
     previous = None if force else RunRecord.read(folder)
     if previous is None:
-        claim_folder(folder, _FILES if force else (), force=force)
-        for name in _FILES:
-            if name != TENSORBOARD:
-                (folder / name).unlink(missing_ok=True)
-        shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
-        return plan
+        lanes = plan.num_envs * (1 if plan.independent else plan.agents)
+        settings = for_lanes(find_algorithm(plan.algorithm), lanes, plan.hyperparameters)
+        return plan.updated(hyperparameters={**settings, **plan.hyperparameters})
     if previous.status == "finished":
         raise OptionError(
             f"{folder}: contains a finished run of {previous.algorithm}. Give another folder, or "
@@ -212,8 +249,17 @@ def _claim(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRe
             "continue it from its last checkpoint, or --force to replace it (in Python, "
             "resume=True or force=True)."
         )
-    previous.check_same_plan(plan, folder)
-    return plan.updated(sessions=previous.sessions + 1, steps_done=previous.steps_done)
+    return plan.continuing(previous, folder)
+
+
+def _claim(folder: Path, *, force: bool) -> None:
+    """Prepare the folder of a new run; with `force`, remove the run in it."""
+    claim_folder(folder, _FILES if force else (), force=force)
+    for name in _FILES:
+        if name in (MODELS, TENSORBOARD):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        else:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _evaluate(
@@ -227,7 +273,7 @@ def _evaluate(
             record.spec,
             record.protocol,
             action_range=record.action_range,
-            name=record.algorithm,
+            name=f"{'independent ' * record.independent}{short_name(record.algorithm)}",
             progress=lambda done, total: bar.update(done),
         )
     figures = write_evaluation(report, folder)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sme_registry import SMESpec
 from sme_registry.training import TrainingResult, train
 
@@ -29,3 +31,25 @@ def copy_files(source: Path, target: Path) -> None:
     for path in source.iterdir():
         if path.is_file():
             (target / path.name).write_bytes(path.read_bytes())
+
+
+def narrow(env: Any, *, seed: int, width: int = 8) -> Any:
+    """An algorithm given as a function."""
+    from stable_baselines3 import PPO
+
+    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 1}
+    return PPO("MlpPolicy", env, seed=seed, policy_kwargs={"net_arch": [width]}, **settings)
+
+
+class Still:
+    """A learner that is no model of Stable-Baselines3."""
+
+    def __init__(self, env: Any, *, seed: int) -> None:
+        self.shape = env.action_space.shape
+
+    def learn(self, total_timesteps: int) -> None:
+        """Learn nothing."""
+
+    def predict(self, observation: Any, *, deterministic: bool) -> Any:
+        """The centre."""
+        return np.zeros((len(observation), *self.shape))

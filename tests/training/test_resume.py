@@ -29,7 +29,7 @@ from sme_registry import SMESpec
 from sme_registry.training import train
 spec = SMESpec(state_dim=2, action_dim=2, horizon=20, seed=5)
 train(spec, steps=100_000, seed=3, folder=sys.argv[1], checkpoint_every=50,
-      protocol={"states_per_region": 50}, progress=False)
+      hyperparameters={"gamma": 0.9}, protocol={"states_per_region": 50}, progress=False)
 """
 
 
@@ -137,6 +137,8 @@ def test_resuming_twice_from_one_checkpoint_gives_the_same_run(
         ({"algorithm": "SAC"}, "algorithm"),
         ({"action_range": "unit"}, "action_range"),
         ({"num_envs": 2}, "num_envs"),
+        ({"hyperparameters": {"gamma": 0.5}}, r"hyperparameters\.gamma"),
+        ({"hyperparameters": {"tau": 0.5}}, r"hyperparameters\.tau"),
     ],
 )
 def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], field: str) -> None:
@@ -144,6 +146,19 @@ def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], fi
     with pytest.raises(OptionError, match=f"^{field}="):
         short(killed, **{"seed": 3, "resume": True, **change})
     assert (killed / "run.json").read_bytes() == before
+
+
+def test_hyperparameters_are_kept_and_may_be_left_out(killed: Path, tmp_path: Path) -> None:
+    from stable_baselines3 import TD3
+
+    copy_files(killed, tmp_path / "run")
+    record = RunRecord.read(killed)
+    assert record is not None
+    assert record.hyperparameters == {"gamma": 0.9}
+    steps = record.steps_done + 20
+    result = short(tmp_path / "run", seed=3, steps=steps, resume=True)
+    assert result.record.hyperparameters == {"gamma": 0.9}
+    assert TD3.load(result.model_path, device="cpu").gamma == 0.9
 
 
 def test_a_broken_checkpoint_is_refused_with_a_remedy(killed: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import (
@@ -114,6 +115,67 @@ def test_every_algorithm_trains(algorithm: str, tmp_path: Path) -> None:
     assert result.report.regions[0].similarity > 0.4
 
 
+def test_several_environments_leave_an_algorithm_what_it_is(tmp_path: Path) -> None:
+    """PPO's rollout is divided; TD3 still updates once for each step."""
+    result = short(tmp_path / "ppo", algorithm="PPO", steps=2048, num_envs=8)
+    assert result.record.hyperparameters == {"n_steps": 256}
+    assert result.record.steps_done == 2048
+    td3 = short(tmp_path / "td3", steps=110, num_envs=2)
+    assert td3.record.hyperparameters == {"gradient_steps": -1}
+    from stable_baselines3 import TD3
+
+    assert TD3.load(td3.model_path, device="cpu")._n_updates == 10  # after 100 random steps
+
+
+def test_more_steps_than_asked_for_are_announced(tmp_path: Path) -> None:
+    console = Console(file=io.StringIO())
+    short(tmp_path / "a", algorithm="A2C", steps=7, progress=True, console=console)
+    assert "whole rollouts: 10 steps, not 7" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+SETTINGS = {
+    "learning_rate": 0.002,
+    "policy_kwargs": {"net_arch": [16], "activation_fn": "torch.nn:ELU"},
+}
+
+
+def test_hyperparameters_reach_the_model_and_the_record(tmp_path: Path) -> None:
+    import sb3_contrib
+
+    result = short(
+        tmp_path / "run",
+        algorithm="sb3_contrib:TQC",
+        hyperparameters={**SETTINGS, "top_quantiles_to_drop_per_net": 1},
+        steps=30,
+    )
+    record = RunRecord.read(result.folder)
+    assert record is not None
+    assert (record.algorithm, result.report.policy) == ("sb3_contrib:TQC", "TQC")
+    assert record.hyperparameters == {**SETTINGS, "top_quantiles_to_drop_per_net": 1}
+    assert "sb3_contrib" in record.versions
+    model = sb3_contrib.TQC.load(result.model_path, device="cpu")
+    assert (model.learning_rate, model.top_quantiles_to_drop_per_net) == (0.002, 1)
+    assert model.policy.net_arch == [16]
+
+
+def test_a_function_that_returns_a_model_of_sb3_is_trained(tmp_path: Path) -> None:
+    result = short(
+        tmp_path / "run",
+        algorithm="tests.training.runs:narrow",
+        hyperparameters={"width": 4},
+        steps=64,
+    )
+    assert result.record.steps_done == 64
+    with pytest.raises(OptionError, match="no model of Stable-Baselines3"):
+        short(tmp_path / "other", algorithm="tests.training.runs:Still")
+    assert not (tmp_path / "other").exists()
+
+
+def test_records_of_older_versions_are_read(run: TrainingResult) -> None:
+    plain = {**run.record.to_dict(), "hyperparameters": "stable-baselines3 defaults, but n_steps=8"}
+    assert RunRecord.from_dict(plain, "run.json").hyperparameters == {"n_steps": 8}
+
+
 def test_the_thread_count_of_torch_is_restored(run: TrainingResult, tmp_path: Path) -> None:
     import torch
 
@@ -149,6 +211,8 @@ def test_a_folder_with_other_files_is_never_touched(force: bool, tmp_path: Path)
     ("change", "message"),
     [
         ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
+        ({"hyperparameters": {"gama": 0.9}}, "Did you mean 'gamma'"),
+        ({"hyperparameters": {"learning_rate": "fast"}}, "rejects the task or"),
         ({"steps": 0}, "steps=0"),
         ({"steps": 10.5}, r"steps=10\.5"),
         ({"steps": True}, "steps=True"),
@@ -218,7 +282,7 @@ def test_importing_the_package_of_training_imports_no_torch() -> None:
 
 def test_the_run_file_is_strict_json(run: TrainingResult) -> None:
     plain = json.loads((run.folder / "run.json").read_text())
-    assert plain["hyperparameters"] == "stable-baselines3 defaults"
+    assert plain["hyperparameters"] == {}
     with zipfile.ZipFile(run.model_path) as archive:
         assert "policy.pth" in archive.namelist()
     assert os.access(run.model_path, os.R_OK)

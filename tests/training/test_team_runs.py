@@ -39,7 +39,7 @@ def test_a_team_is_trained_by_ppo_and_the_record_has_its_settings(team_run: Trai
         "finished", "PPO", 8, 2,
     )  # fmt: skip
     # 2,048 transitions for an update, of 8 teams of 2 agents: 128 steps each, 1,024 of teams.
-    assert record.hyperparameters == "stable-baselines3 defaults, but n_steps=128"
+    assert record.hyperparameters == {"n_steps": 128}
     assert record.steps_done == 1024
     from stable_baselines3 import PPO
 

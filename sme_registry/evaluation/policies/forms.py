@@ -49,7 +49,8 @@ def as_policy(
         the path of an .onnx file, or of the .npz of an offline policy;
         `module:function`, imported from the working directory or an installed package;
         the name of a reference policy, one of `references.POLICIES`;
-        for a team, a dict from each agent's name to its own policy, from the agent's observations
+        for a team, a dict from each agent's name to its own policy (or a folder of such files,
+        `<agent>.zip`), from the agent's observations
         `[B, |O_i| + 2]` to its actions `[B, a_i]`; or one of the above that all agents share,
         from shared observations `[B, S + 2 + n]` (`envs.shared`) to `[B, max a_i]`, of which the
         agent's first a_i entries count.
@@ -95,7 +96,7 @@ def _named(text: str, spec: SMESpec) -> Any:
     if text.endswith(_SUFFIXES) or os.path.isfile(text):
         return Path(text)
     if os.path.isdir(text):
-        raise PolicyError(f"policy={text!r}: is a folder. Give the policy's file in it.")
+        return _of_agents(Path(text), spec)
     if ":" not in text:
         raise UnknownNameError(
             f"policy={text!r}: must be the path of a .zip, .onnx or .npz file, module:function, or "
@@ -116,6 +117,17 @@ def _of_algorithm(policy: Any, algorithm: str) -> Any:
             f"algorithm={algorithm!r}: is for the path of a model's .zip. Leave it out."
         )
     return load_sb3(policy, algorithm)
+
+
+def _of_agents(folder: Path, spec: SMESpec) -> dict[str, Path]:
+    """The policies in a folder by agent: `<agent>.zip`, `.onnx` or `.npz`."""
+    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in _SUFFIXES}
+    if spec.team is None or not files:
+        raise PolicyError(
+            f"policy={str(folder)!r}: is a folder. Give the policy's file in it; for a team, a "
+            "folder with the policy of each agent, such as agent_0.zip."
+        )
+    return files
 
 
 def _display_name(text: str) -> str:

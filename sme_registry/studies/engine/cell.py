@@ -19,7 +19,7 @@ from sme_registry.evaluation import Policy, evaluate
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.io import versions, write_atomically
+from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
@@ -29,7 +29,7 @@ from sme_registry.training import ALGORITHMS
 from sme_registry.training.algorithms import is_sb3, one_thread, quiet, require_sb3
 from sme_registry.training.learners import new_learner
 from sme_registry.training.numpy_policy import numpy_policy
-from sme_registry.training.record import PACKAGES
+from sme_registry.training.record import versions_for
 
 ReportSteps = Callable[[int, int], None]
 
@@ -214,12 +214,6 @@ def _saved(learner: Any, save: Callable[[Any], Any]) -> bytes:
     archive = io.BytesIO()
     save(archive)
     return archive.getvalue()
-
-
-def versions_for(uses: str) -> dict[str, str]:
-    """Installed versions that the numbers depend on, including the algorithm's own package."""
-    package = uses.partition(":")[0].partition(".")[0]
-    return versions([*PACKAGES, package])
 
 
 def refuse_unknown_algorithm(uses: str) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, integer_in
 from sme_registry.spec import Cell, PlannedCell, StudyFile
-from sme_registry.studies.engine.cell import refuse_unknown_algorithm, run_cell, versions_for
+from sme_registry.studies.engine.cell import refuse_unknown_algorithm, run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
 from sme_registry.studies.engine.ledger import Ledger
@@ -27,6 +27,7 @@ from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.studies.engine.scaling import selected
 from sme_registry.studies.engine.status import StudyStatus, label, plan_status
 from sme_registry.terminal import Progress, duration
+from sme_registry.training.record import versions_for
 
 EXECUTORS = ("processes", "in-process", "ray")
 

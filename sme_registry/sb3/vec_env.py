@@ -1,13 +1,4 @@
-"""A batch of one task as a Stable-Baselines3 `VecEnv`, stepped by machine code.
-
-    from stable_baselines3 import PPO, TD3
-    from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
-    TD3("MlpPolicy", SMEVecEnv("Default", num_envs=4)).learn(20_000)
-    PPO("MlpPolicy", SMETeamVecEnv("Team4", num_envs=8)).learn(20_000)  # one policy for all agents
-
-Bit for bit the numbers of SB3's `DummyVecEnv` of as many single environments or, for a team, of as
-many `SMETeamEnv`s stepped in a loop.
-"""
+"""A batch of one task as a Stable-Baselines3 `VecEnv`, stepped by machine code."""
 
 from __future__ import annotations
 
@@ -18,6 +9,8 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sme_registry.envs import arguments
 from sme_registry.envs.base import renamed_by_content
@@ -26,19 +19,10 @@ from sme_registry.envs.lanes import Lane
 from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
-from sme_registry.io import integer_in, require_packages
+from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
 from sme_registry.spec import ActionRange, SMESpec, SpecLike
 from sme_registry.task import Task
-
-try:
-    from stable_baselines3.common.vec_env import VecEnv
-    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
-except ImportError:
-    require_packages("sme_registry.sb3", {"stable_baselines3": "Stable-Baselines3"}, "train")
-    raise
-
-__all__ = ["LanesVecEnv", "SMETeamVecEnv", "SMEVecEnv"]
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""

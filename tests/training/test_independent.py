@@ -1,0 +1,134 @@
+"""Independent learners of a team: the same updates as SB3's, one model for each agent, resuming."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import EvaluationReport, SMESpec, evaluate
+from sme_registry.errors import OptionError
+from sme_registry.training import TrainingResult, train
+from sme_registry.training.episodes import read_episodes
+from tests.training.runs import PROTOCOL, TINY, copy_files
+from tests.training.test_team_runs import TEAM
+
+pytest.importorskip("stable_baselines3")
+
+SETTINGS: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
+
+
+def independent(folder: Path, **changes: Any) -> TrainingResult:
+    settings: dict[str, Any] = {
+        "independent": True,
+        "steps": 128,
+        "num_envs": 2,
+        "hyperparameters": SETTINGS,
+        "protocol": PROTOCOL,
+        "progress": False,
+    }
+    return train(TEAM, folder=folder, **{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def team_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+    return independent(tmp_path_factory.mktemp("independent") / "run")
+
+
+def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run: TrainingResult) -> None:
+    """The same weights, bit for bit, after three rollouts with episodes cut off at the horizon."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.utils import set_random_seed
+
+    from sme_registry.sb3 import SMEVecEnv
+    from sme_registry.training.algorithms import silence
+    from sme_registry.training.independent import IndependentLearners
+
+    spec = TINY.derive(team={"agents": [{"action_dim": 2}]})
+    record = team_run.record.updated(spec=spec, agents=1, num_envs=2, seed=4)
+    learners = IndependentLearners(record)
+    learners.learn(192, lambda *step: None, lambda: None)
+    (ours,) = learners.models.values()
+
+    env = SMEVecEnv(TINY, 2)
+    theirs = PPO("MlpPolicy", env, seed=ours.seed, device="cpu", **SETTINGS)
+    silence(theirs)
+    set_random_seed(4)
+    env.seed(4)
+    theirs.learn(192)
+    for name, weights in theirs.policy.state_dict().items():
+        np.testing.assert_array_equal(ours.policy.state_dict()[name].numpy(), weights.numpy(), name)
+
+
+def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run: TrainingResult) -> None:
+    from stable_baselines3 import PPO
+
+    folder = team_run.model_path
+    assert sorted(path.name for path in folder.iterdir()) == ["agent_0.zip", "agent_1.zip"]
+    shapes = []
+    for path in sorted(folder.iterdir()):
+        model = PPO.load(path, device="cpu")
+        shapes.append((model.observation_space.shape, model.action_space.shape))
+        assert model.num_timesteps == 128
+    assert shapes == [((4,), (1,)), ((5,), (2,))]
+    assert team_run.record.hyperparameters == SETTINGS
+
+
+def test_the_log_has_each_agents_regret_and_the_folder_is_evaluated(
+    team_run: TrainingResult,
+) -> None:
+    episodes = read_episodes(team_run.folder / "episodes.csv")
+    assert [episode.step for episode in episodes] == [40, 40, 80, 80, 120, 120]
+    for episode in episodes:
+        assert episode.regret == pytest.approx(np.mean(episode.agents_regret))
+    report = EvaluationReport.read(team_run.folder / "evaluation.json")
+    assert report.policy == "independent PPO"
+    again = evaluate(str(team_run.model_path), TEAM, PROTOCOL, name="independent PPO")
+    assert (again.regions, again.agents) == (report.regions, report.agents)
+
+
+def test_independent_runs_resume(team_run: TrainingResult, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    copy_files(team_run.folder, folder)
+    team_run.record.updated(status="running").write(folder)
+    with pytest.raises(OptionError, match=r"^independent=False: the run in"):
+        independent(folder, resume=True, independent=False)
+    result = independent(folder, steps=192, resume=True)
+    assert (result.record.sessions, result.record.steps_done) == (2, 192)
+    assert [e.step for e in result.episodes[:6]] == [e.step for e in team_run.episodes]
+    assert len(result.episodes) > 6
+
+
+def test_independent_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:
+    spec = SMESpec.from_dict(
+        {"state_dim": 1, "action_dim": 2, "horizon": 16, "seed": 2,
+         "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}}
+    )  # fmt: skip
+    settings = {"learning_rate": 0.003, "gamma": 0, "n_steps": 64, "batch_size": 128}
+    result = train(spec, independent=True, steps=2560, num_envs=8, hyperparameters=settings,
+                   folder=tmp_path / "run", protocol=PROTOCOL, progress=False)  # fmt: skip
+    regrets = np.array([episode.agents_regret for episode in result.episodes])
+    assert (regrets[-16:].mean(axis=0) < 0.8 * regrets[:16].mean(axis=0)).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algorithm": "TD3", "hyperparameters": {}}, "on-policy algorithm"),
+        ({"algorithm": "sb3_contrib:RecurrentPPO", "hyperparameters": {}}, "on-policy algorithm"),
+        ({"hyperparameters": {"use_sde": True}}, "without use_sde"),
+    ],
+)
+def test_other_algorithms_are_rejected(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        independent(tmp_path / "run", **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_single_agent_has_no_independent_learners(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="single agent"):
+        train(TINY, independent=True, folder=tmp_path / "run")
