@@ -13,11 +13,9 @@ from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url
 from leaderboard.documents.result import Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
-from sme_registry.terminal import Progress, err, fixed, out, print_json, print_pairs, table
+from sme_registry.terminal import Progress, Table, err, fixed, out, print_json, print_pairs
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.result import Estimate, Result
     from leaderboard.public_view import PublicView
@@ -91,17 +89,12 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
     caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()]
     if board.practice:
         caption.append(f"A practice board: {board.runs_to_rank} runs in each class give a rank.")
-    ranking = table(
+    columns = {"rank": "number", "method": "text", "submitter": "text"}
+    ranking = Table(
         f"{LABELS[metric]} on {board.suite_name} (0 optimal, 1 the constant ½; 95 % intervals)",
-        {},
+        {**columns, **dict.fromkeys(SYMBOLS.values(), "number"), "runs": "number"},
         caption="\n".join(caption),
     )
-    ranking.add_column("rank", justify="right", no_wrap=True)
-    ranking.add_column("method")
-    ranking.add_column("submitter")
-    for name, symbol in SYMBOLS.items():
-        ranking.add_column(symbol, justify="right", no_wrap=True, style="bold" * (name == metric))
-    ranking.add_column("runs", justify="right")
     for row in rows:
         entry = row.entry
         scores = {name: getattr(entry.scores, name) for name in SYMBOLS}
@@ -109,7 +102,10 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
             row.ranks or notes.get(row.reason, ""),
             escape(f"{entry.method} {entry.version}".strip()),
             escape(entry.submitter),
-            *(_interval(v) if name == metric else fixed(v.value) for name, v in scores.items()),
+            *(
+                f"[bold]{_interval(value)}[/]" if name == metric else fixed(value.value)
+                for name, value in scores.items()
+            ),
             str(entry.runs),
             style="dim" if row.first is None else None,
         )
@@ -207,7 +203,7 @@ def _printable(text: str) -> str:
 
 def _scores_table(result: Result) -> Table:
     assert result.scores is not None
-    scores = table(
+    scores = Table(
         "normalised regret (0 optimal, 1 the constant ½)",
         {"": "text", "θ": "number", "low": "number", "high": "number"},
     )
@@ -220,7 +216,7 @@ def _scores_table(result: Result) -> Table:
 
 
 def _class_table(result: Result) -> Table:
-    classes = table("by class", {"class": "text", "runs": "number", "N₀": "number", "N̄": "number"})
+    classes = Table("by class", {"class": "text", "runs": "number", "N₀": "number", "N̄": "number"})
     for member in result.classes:
         scores = (fixed(member.wd_regret, 4), fixed(member.ood_regret, 4))
         classes.add_row(escape(member.name), str(member.runs), *scores)

@@ -10,7 +10,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.errors import UnknownNameError
 from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile
-from sme_registry.terminal import err, out, print_json, table
+from sme_registry.terminal import Table, err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.task.certify import Certificate
@@ -102,7 +102,7 @@ def _print_certificate(label: str, certificate: Certificate) -> None:
         for check in certificate.checks
     ]
     columns = {"": "name", "check": "name", "value": "number", "passes in": "name"}
-    out().print(table(f"Certificate of {escape(label)}", columns, rows))
+    out().print(Table(f"Certificate of {escape(label)}", columns, rows))
     out().print()
     for check in certificate.checks:
         out().print(f"[bold]{check.name}[/]: {escape(check.meaning)}")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry import load
 from sme_registry.cli.arguments import (
@@ -24,7 +23,7 @@ from sme_registry.cli.arguments import (
 )
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import catalogue
-from sme_registry.terminal import Progress, err, failure, out, print_json, print_pairs, table
+from sme_registry.terminal import Progress, Table, err, failure, out, print_json, print_pairs
 
 if TYPE_CHECKING:
     from sme_registry.datasets import Dataset
@@ -235,7 +234,7 @@ def _datasets_table(datasets: Sequence[Dataset]) -> Table:
         )
         for dataset in datasets
     ]
-    return table(
+    return Table(
         "Data sets",
         {"id": "text", **dict.fromkeys(numbers, "number")},
         rows,
@@ -278,7 +277,7 @@ def _print(dataset: Dataset, json: bool) -> None:
             _score_row(f"  {behaviour.label}", score, f"{behaviour.weight:g}")
             for behaviour, score in zip(recipe.behaviours, scores.behaviours, strict=True)
         ]
-    scores_table = table(
+    scores_table = Table(
         "Scores",
         {"policy": "text", **dict.fromkeys(("weight", "r̃", "r", "return"), "number")},
         [*rows, _score_row("optimum", scores.optimum)],

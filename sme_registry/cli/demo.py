@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.cli.arguments import Force
 from sme_registry.io import write_atomically
-from sme_registry.terminal import err, out, table
+from sme_registry.terminal import Table, err, out
 from sme_registry.terminal.templates import environment
 
 if TYPE_CHECKING:
@@ -99,7 +98,7 @@ def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
         (f"{first:,}–{last:,}", f"{regret:.3f}", "█" * round(30 * regret))
         for first, last, regret in stages
     ]
-    return table("Mean regret during training (0 is optimal)", columns, rows)
+    return Table("Mean regret during training (0 is optimal)", columns, rows)
 
 
 def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str:

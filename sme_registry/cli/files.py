@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.errors import OptionError
 from sme_registry.io import install_command, is_installed, refuse_existing
-from sme_registry.terminal import err, out, print_json
+from sme_registry.terminal import Table, err, out, print_json
 
 
 def check_document_path(path: Path, *, force: bool) -> None:

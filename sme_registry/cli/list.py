@@ -8,13 +8,12 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.cli.arguments import KINDS, Json, kind_of
 from sme_registry.errors import UnknownNameError
 from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
 from sme_registry.spec.envelope import Envelope
-from sme_registry.terminal import out, print_json, table
+from sme_registry.terminal import Table, out, print_json
 
 Kind = enum.StrEnum("Kind", ["env", "suite", "protocol", "study"])
 
@@ -85,7 +84,7 @@ def _env_table(files: list[EnvFile]) -> Table:
         )  # fmt: skip
         name = f"{catalogue.NAMESPACE}/{file.versioned_name}"
         rows.append((name, *(f"{value:g}" for value in values), " ".join(file.tags)))
-    return table(
+    return Table(
         "Environments",
         {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
         rows,
@@ -97,13 +96,13 @@ def _env_table(files: list[EnvFile]) -> Table:
 def _suite_table(files: list[SuiteFile]) -> Table:
     columns = {"name": "name", "classes": "number", "tasks": "number", "description": "text"}
     counts = ((len(file.suite.classes), len(file.suite.instances)) for file in files)
-    return table("Suites", columns, _rows(files, counts))
+    return Table("Suites", columns, _rows(files, counts))
 
 
 def _protocol_table(files: list[ProtocolFile]) -> Table:
     columns = {"name": "name", "regions": "number", "states each": "number", "description": "text"}
     counts = ((len(file.protocol.edges), file.protocol.states_per_region) for file in files)
-    return table("Protocols", columns, _rows(files, counts))
+    return Table("Protocols", columns, _rows(files, counts))
 
 
 def study_table(files: list[StudyFile]) -> Table:
@@ -119,7 +118,7 @@ def study_table(files: list[StudyFile]) -> Table:
         )
         for file in files
     )
-    return table("Studies", columns, _rows(files, counts))
+    return Table("Studies", columns, _rows(files, counts))
 
 
 def _rows(

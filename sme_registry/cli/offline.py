@@ -7,11 +7,10 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.cli.arguments import DatasetsFolder, Force, Json, Out, changes
 from sme_registry.cli.files import print_training
-from sme_registry.terminal import Progress, err, table
+from sme_registry.terminal import Progress, Table, err
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
@@ -98,7 +97,7 @@ def _scores(record: Any) -> Table:
             (f"{algorithm}, {record.episodes} episodes", last),
         )
     ]
-    return table(
+    return Table(
         f"{algorithm} on {escape(record.dataset)}",
         {"": "text", "r̃": "number", "SD over steps": "number"},
         [*rows, ("improvement", f"{record.improvement:+.3f}", "")],

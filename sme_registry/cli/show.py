@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.cli.list import study_table, summary
@@ -30,7 +29,7 @@ from sme_registry.spec import (
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import known_specs
-from sme_registry.terminal import out, print_json, print_pairs, table
+from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
     "Schema", "spec env-file suite suite-file protocol protocol-file study study-file"
@@ -211,7 +210,7 @@ def _agents_table(agents: list[dict[str, Any]]) -> Table:
         )
         for agent in agents
     ]
-    return table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")}, rows)
+    return Table("Agents", {"agent": "name", **dict.fromkeys(wrapped, "text")}, rows)
 
 
 def _ranges(channels: list[int]) -> str:
@@ -240,7 +239,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
         )
         for member in file.suite.classes
     ]
-    out().print(table(_title(file), {**columns, "task": "name"}, rows, caption=file.digest))
+    out().print(Table(_title(file), {**columns, "task": "name"}, rows, caption=file.digest))
     first = file.suite.instances[0].digest
     if first in known_specs():  # tasks of a file outside the catalogue have no name to train by
         out().print(f"To train on a task: sme train {first[:_SHORT]}", soft_wrap=True)

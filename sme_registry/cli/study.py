@@ -15,7 +15,7 @@ from sme_registry.cli.arguments import Json, Out, find_file
 from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
 from sme_registry.errors import OptionError
 from sme_registry.spec import StudyFile
-from sme_registry.terminal import duration_range, err, out, print_json, table
+from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 if TYPE_CHECKING:
     from sme_registry.studies.engine.status import CellStatus, State, StudyStatus
@@ -201,7 +201,7 @@ def _print_status(status: StudyStatus, json: bool) -> None:
         (class_name, *(_counts(counts.get((class_name, name))) for name in algorithms))
         for class_name in unique(cell.planned.class_name for cell in status.cells)
     )
-    out().print(table(title, columns, rows))
+    out().print(Table(title, columns, rows))
     out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")
     parts = [f"{status.count(state):,} {state}" for state in STATES if status.count(state)]
     out().print(f"{len(status.cells):,} cells: {', '.join(parts)}")

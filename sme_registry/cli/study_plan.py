@@ -8,13 +8,12 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sme_registry.cli.arguments import Json, find_file
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import PlannedCell, StudyFile, catalogue
-from sme_registry.terminal import duration_range, err, out, print_json, table
+from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 Steps = Annotated[
     list[str] | None,
@@ -157,7 +156,7 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
                 duration_range(min(span.low for span in spans), max(span.high for span in spans)),
             )
         )
-    return table(
+    return Table(
         f"[bold]{file.versioned_name}[/]  {escape(file.description)}",
         {"algorithm": "name", **dict.fromkeys(numbers, "number")},
         rows,

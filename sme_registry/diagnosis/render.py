@@ -66,13 +66,15 @@ def title(diagnosis: Diagnosis) -> str:
 def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
     """What `sme diagnose` prints, part by part."""
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Table as RichTable
+
+    from sme_registry.terminal import Table
 
     yield f"[bold]{escape(title(diagnosis))}[/]"
     yield escape(headline(diagnosis))
     yield ""
     for heading, rows in _rows(diagnosis).items():
-        table = Table(title=heading, title_justify="left", show_header=False, box=None)
+        table = RichTable(title=heading, title_justify="left", show_header=False, box=None)
         table.add_column(style="cyan", no_wrap=True, min_width=19)
         table.add_column(no_wrap=True, min_width=11)
         table.add_column(overflow="fold")
@@ -82,14 +84,12 @@ def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
     if diagnosis.comparison is not None:
         yield ""
         heading = escape(_words("comparison", diagnosis.comparison))
-        table = Table(title=heading, title_justify="left", box=None)
-        table.add_column("")
-        for column in ("this run", "other run", "difference"):
-            table.add_column(column, justify="right")
+        numbers = ("this run", "other run", "difference")
+        differences = Table(heading, {"": "text", **dict.fromkeys(numbers, "number")})
         for row in diagnosis.comparison.differences:
             values = (f"{row.value:.3f}", f"{row.other:.3f}", f"{row.value - row.other:+.3f}")
-            table.add_row(label(row.quantity), *values)
-        yield table
+            differences.add_row(label(row.quantity), *values)
+        yield differences
 
 
 def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:

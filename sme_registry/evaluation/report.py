@@ -28,7 +28,8 @@ from sme_registry.spec.document import Integer, Real, StrictModel
 
 if TYPE_CHECKING:
     import pandas
-    from rich.table import Table
+
+    from sme_registry.terminal import Table
 
 NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "
@@ -264,11 +265,11 @@ class EvaluationReport(StrictModel):
         """
         from rich.markup import escape
 
-        from sme_registry.terminal.output import table as empty_table
+        from sme_registry.terminal import Table
 
         spec, policy = self.spec, escape(self.policy)
         team = f", {len(self.agents)} agents" if self.agents else ""
-        table = empty_table(
+        table = Table(
             f"{policy} on {escape(self.title)} (S={spec.state_dim}, "
             f"A={spec.action_dim}, L={spec.complexity}{team})\n"
             f"{spec.digest}\n{self.regions[0].states:,} states per region; "

@@ -3,12 +3,14 @@
 from sme_registry.terminal.commands import CommandGroup, application
 from sme_registry.terminal.latex import escape_latex
 from sme_registry.terminal.numbers import duration, duration_range, fixed
-from sme_registry.terminal.output import err, failure, out, print_json, print_pairs, table
+from sme_registry.terminal.output import err, failure, out, print_json, print_pairs
 from sme_registry.terminal.progress import Progress
+from sme_registry.terminal.tables import Table
 
 __all__ = [
     "CommandGroup",
     "Progress",
+    "Table",
     "application",
     "duration",
     "duration_range",
@@ -19,5 +21,4 @@ __all__ = [
     "out",
     "print_json",
     "print_pairs",
-    "table",
 ]

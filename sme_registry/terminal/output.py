@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TextIO
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from sme_registry.io import to_json
 
+_UNLIMITED = 100_000  # columns: lines of a file or a pipe are never wrapped
 
-class _Out(Console):
-    """Leaves a broken pipe to `CommandGroup`; Rich would exit with code 1."""
+
+class _Console(Console):
+    """Never wraps lines of output that is no terminal, and leaves broken pipes to `CommandGroup`.
+
+    Rich would wrap at 80 columns, and exit with code 1 if the pipe breaks.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        super().__init__(file=file, highlight=False)
+        if not self.is_terminal:
+            self.width = _UNLIMITED
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
@@ -22,12 +33,12 @@ class _Out(Console):
 
 def out() -> Console:
     """Standard output as it is now: tests and pipes replace it."""
-    return _Out(file=sys.stdout, highlight=False)
+    return _Console(sys.stdout)
 
 
 def err() -> Console:
     """Standard error, for progress and errors."""
-    return Console(file=sys.stderr, highlight=False)
+    return _Console(sys.stderr)
 
 
 def failure(message: str) -> None:
@@ -41,44 +52,20 @@ def print_json(value: Any) -> None:
 
 
 def print_pairs(title: str, pairs: dict[str, object]) -> None:
-    """Names and values, one per line, under a title."""
-    out().print(title)
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="cyan", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in pairs.items():
-        table.add_row(name, escape(str(value)))
-    out().print(table)
+    """Names and values, one per line, under a title.
 
-
-def table(
-    title: str,
-    columns: Mapping[str, str],
-    rows: Iterable[Sequence[str]] = (),
-    *,
-    caption: str = "",
-) -> Table:
-    """A table.
-
-    Args:
-      title: above it.
-      columns: heading → "name" (never wrapped), "number" (to the right) or "text" (wrapped).
-      rows: their cells, with Rich's markup.
-      caption: below it.
+    A value with a word that is too long for the rest of the line, such as a digest, starts on a
+    line of its own.
     """
-    result = Table(
-        title=title or None,
-        caption=caption or None,
-        title_justify="left",
-        caption_justify="left",
-    )
-    for heading, kind in columns.items():
-        result.add_column(
-            heading,
-            justify="right" if kind == "number" else "left",
-            no_wrap=kind == "name",
-            overflow="fold" if kind == "text" else "ellipsis",
-        )
-    for row in rows:
-        result.add_row(*row)
-    return result
+    console = out()
+    console.print(title)
+    column = 1 + max(map(cell_len, pairs), default=0)
+    for name, value in pairs.items():
+        text = str(value)
+        if console.width - column < max(map(cell_len, text.split()), default=0):
+            console.print(f"[cyan]{escape(name)}[/]\n  {escape(text)}", soft_wrap=True)
+            continue
+        line = Table.grid()
+        line.add_column(width=column, style="cyan")
+        line.add_row(name, Text(text))
+        console.print(line)

@@ -299,12 +299,13 @@ def test_a_notebook_shows_a_reports_table_and_a_line_elsewhere(report):
 
 def test_printing_a_report_shows_its_table(report):
     text = str(report)
-    assert text == "\n".join(line.rstrip() for line in rendered(report).splitlines())
+    rows = [line.split() for line in text.splitlines()]
+    assert ["optimal", *["1.000"] * len(report.regions)] in rows
     assert "\x1b" not in text
 
 
 def rendered(report):
-    console = Console(width=80, file=io.StringIO())
+    console = Console(width=80, file=io.StringIO(), force_terminal=True, color_system=None)
     console.print(report.table())
     return console.file.getvalue()
 

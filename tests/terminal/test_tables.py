@@ -1,0 +1,114 @@
+"""Tables at any width: nothing is cut, broken or dropped."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from sme_registry.cli import app
+from sme_registry.terminal import Table, out
+
+WIDTHS = (60, 80, 200)
+COLUMNS = {"id": "name", "n": "number", "of all": "number", "about it": "text"}
+ROWS = [
+    ("SME/Default-v1", "1", "12,345", "paper axis-action_dim"),
+    ("SME/ALongNameThatNobodyMayCut-v1", "10", "0.125 (0.100 to 0.150)", "word " * 30),
+    ("[bold]SME/Empty-v1[/]", "100", "", ""),
+]
+
+
+def printed(table: Table, width: int | None) -> list[str]:
+    """The lines on a terminal of this width, or in a pipe."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        if width is None:
+            out().print(table)
+        else:
+            Console(file=text, width=width, force_terminal=True, color_system=None).print(table)
+    return text.getvalue().splitlines()
+
+
+def words(lines: list[str]) -> str:
+    return f" {' '.join(re.sub('[│┃]', ' ', ' '.join(lines)).split())} "
+
+
+@pytest.mark.parametrize("width", [40, *WIDTHS, None])
+def test_every_cell_is_whole_at_every_width(width: int | None) -> None:
+    lines = printed(Table("A title", COLUMNS, ROWS, caption="A caption"), width)
+    shown = words(lines)
+    assert "…" not in shown
+    assert width is None or max(map(len, lines)) <= width
+    cells = [re.sub(r"\[.*?\]", "", cell) for row in ROWS for cell in row]
+    for word in " ".join((*list(COLUMNS)[1:], *cells)).split():
+        assert f" {word} " in shown
+    assert shown.count(" word") == 30
+    assert lines[0].strip() == "A title"
+    assert lines[-1].strip() == "A caption"
+
+
+def test_a_table_loses_its_lines_before_anything_wraps() -> None:
+    columns = {"name": "name", "a": "number", "tags": "text"}
+    table = Table("", columns, [("x" * 20, "1", "two tags that fit")])
+    assert any("┃" in line for line in printed(table, 80))
+    narrow = printed(table, 44)
+    assert not any("┃" in line for line in narrow)
+    assert len(narrow) == 2
+    assert len(printed(table, 39)) == 3  # the tags wrap
+    blocks = [line.rstrip() for line in printed(table, 24)]
+    assert blocks == ["x" * 20, "  a 1", "  tags two tags that fit"]
+
+
+def test_in_a_pipe_each_row_is_one_line_without_trailing_space() -> None:
+    lines = printed(Table("", COLUMNS, ROWS), None)
+    assert len(lines) == 1 + len(ROWS)
+    assert lines[1].split("  ")[-1] == "paper axis-action_dim"
+    assert not any(line.endswith(" ") for line in lines)
+    assert not any(sign in "".join(lines) for sign in "│┃━")
+
+
+def test_sections_and_missing_cells_are_kept() -> None:
+    table = Table("", {"": "name", "a": "number"})
+    table.add_row("heading", style="italic")
+    table.add_section()
+    table.add_row("x", "1")
+    assert printed(table, None) == ["         a", "heading", "", "x        1"]
+    assert any("├" in line for line in printed(table, 60))
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    "command",
+    [
+        "list",
+        "show core",
+        "show Team4",
+        "show Default",
+        "certify Default",
+        "study plan",
+        "study plan smoke",
+        "evaluate linear Default --protocol quick-v1",
+    ],
+)
+def test_commands_cut_nothing(command: str, width: int) -> None:
+    settings = {"FORCE_COLOR": "1", "COLUMNS": str(width)}
+    wide = CliRunner().invoke(app, command.split(), env=settings | {"COLUMNS": "1000"})
+    shown = CliRunner().invoke(app, command.split(), env=settings)
+    assert shown.exit_code == 0, shown.output
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", shown.stdout)
+    assert "…" not in plain
+    numbers = re.findall(
+        r"(?<![\w.])\d[\d,.]*\d(?![\w.])", re.sub(r"\x1b\[[0-9;]*m", "", wide.stdout)
+    )
+    assert all(number in plain for number in numbers)
+
+
+def test_lines_of_a_pipe_are_never_wrapped() -> None:
+    result = CliRunner().invoke(app, ["list", "--kind", "env"], env={"COLUMNS": "20"})
+    (row,) = [line for line in result.stdout.splitlines() if "SME/ActionDim1-v1" in line]
+    assert row.split()[1:9] == ["1", "8", "1", "1", "1", "0", "0", "100"]
+    assert row.endswith("paper axis-action_dim")
