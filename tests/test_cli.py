@@ -24,7 +24,7 @@ from sme_registry.task.certify import certify
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
 KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
 COMMANDS = [
-    *("list", "show", "new", "validate", "certify"),
+    *("list", "show", "new", "suite", "validate", "certify"),
     *("evaluate", "train", "diagnose", "study", "demo"),
 ]
 
@@ -54,6 +54,30 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("PYTHONPATH", str(Path(sme_registry.__file__).parents[1]))
+
+
+def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: Path) -> None:
+    good("new", "k2.json", "--k", "2", "--seed", "7")
+    printed = good(
+        "suite", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3"
+    ).stdout
+    file = SuiteFile.read(tmp_path / "mine.json")
+    assert file.digest in printed
+    assert file.suite.instances[3:] == tuple(SMESpec(k=2, seed=seed) for seed in (7, 8, 9))
+    good("suite", "wider.json", "--suite", "mine.json", "-t", "Plane10")
+    wider = SuiteFile.read(tmp_path / "wider.json").suite
+    assert [member.name for member in wider.classes] == ["Default", "k2", "Plane10"]
+    good("suite", "axis.json", "-t", "Default", "--sweep", "k=1,5")
+    axis = SuiteFile.read(tmp_path / "axis.json").suite
+    assert [spec.k for spec in axis.instances] == [1, 5]
+    good("study", "new", "plan.json", "--suite", "wider.json", "-a", "reference:linear")
+    assert StudyFile.read(tmp_path / "plan.json").plan.classes == wider.classes
+    before = (tmp_path / "mine.json").read_bytes()
+    assert "--force" in refused("suite", "mine.json", "-t", "Default")
+    assert "twice" in refused("suite", "other.json", "-t", "Default", "-t", "Default")
+    assert "--task" in refused("suite", "other.json")
+    assert (tmp_path / "mine.json").read_bytes() == before
+    assert not (tmp_path / "other.json").exists()
 
 
 def test_help_lists_every_command_and_the_version_is_the_packages() -> None:
@@ -252,7 +276,7 @@ class TestNew:
         given = {name.strip("-").replace("-", "_"): value for name, value in fields.items()}
         assert file.spec == SMESpec(**given)  # type: ignore[arg-type]
         assert (file.name, file.description, file.tags) == ("Mine", "A task.", ("a",))
-        good("validate", "mine.json")
+        assert file.digest in good("validate", "mine.json").stdout
         good("new", "plain.json")
         assert load(tmp_path / "plain.json") == SMESpec()
 

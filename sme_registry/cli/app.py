@@ -14,6 +14,7 @@ from sme_registry.cli.evaluate import evaluate
 from sme_registry.cli.list import list_
 from sme_registry.cli.new import new
 from sme_registry.cli.show import show
+from sme_registry.cli.suite import suite
 from sme_registry.cli.train import train
 from sme_registry.cli.validate import validate
 from sme_registry.terminal import application
@@ -28,7 +29,7 @@ app = application(
     """,
 )
 app.command("list")(list_)
-for _command in (show, new, validate, certify, evaluate, train, diagnose, demo):
+for _command in (show, new, suite, validate, certify, evaluate, train, diagnose, demo):
     app.command()(_command)
 app.add_typer(study.app, name="study")
 app.add_typer(dataset.app, name="dataset")

@@ -1,4 +1,4 @@
-"""The options that describe a plan, shared by the commands that make one."""
+"""The options that describe classes of tasks and plans, shared by the commands that make them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sme_registry.cli.arguments import Protocol, find_file, json_or_text
 from sme_registry.cli.study_plan import scaled_plan
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import integer_in, parse_json
-from sme_registry.spec import SMESpec, StudyFile, StudyPlan, SuiteFile, catalogue
+from sme_registry.spec import SMESpec, StudyFile, StudyPlan, SuiteClass, SuiteFile, catalogue
 from sme_registry.spec.sweep import sweep
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions:
-    """Options of a command, each with its help."""
+class ClassOptions:
+    """Options of a command that describe classes of tasks, each with its help."""
 
     suite: Annotated[str | None, typer.Option(help="A suite of classes: name or path.")] = None
     task: Annotated[
@@ -42,6 +42,29 @@ class PlanOptions:
     instances: Annotated[
         int, typer.Option(help="Draws of each --task: its seed and those that follow.")
     ] = 1
+
+    def classes(self) -> tuple[SuiteClass, ...]:
+        """The classes of a suite, one for each task, or those of the sweeps."""
+        tasks = self.task or ()
+        if self.sweep and (self.suite is not None or len(tasks) != 1):
+            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
+        if self.suite is None and not tasks:
+            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
+        instances = integer_in("instances", self.instances, 1, 10_000)
+        axes = sweep_axes(self.sweep or ())
+        classes: list[SuiteClass] = []
+        if self.suite is not None:
+            classes += find_file(SuiteFile, self.suite).suite.classes
+        for task in tasks:
+            spec = load(task)
+            classes += sweep(spec, axes, name=_title(spec), instances=instances)
+        return tuple(classes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(ClassOptions):
+    """Options of a command that describe a plan, each with its help."""
+
     algorithm: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,7 +93,7 @@ class PlanOptions:
         from sme_registry.evaluation import resolve_protocol
 
         fields = {
-            "classes": self._classes(),
+            "classes": [member.to_dict() for member in self.classes()],
             "algorithms": self._algorithms(),
             "seeds": self.seeds,
             "evaluations": self.evaluations,
@@ -80,21 +103,6 @@ class PlanOptions:
         plan = StudyPlan.from_dict(fields, source)
         draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
         return scaled_plan(draft, self.steps, None, None).plan
-
-    def _classes(self) -> list[dict[str, Any]]:
-        """The classes of a suite, one for each task, or those of the sweeps."""
-        tasks = self.task or ()
-        if self.sweep and (self.suite is not None or len(tasks) != 1):
-            raise OptionError("--sweep: needs exactly one --task, and no --suite.")
-        if self.suite is None and not tasks:
-            raise OptionError("Give --suite or --task, such as --suite smoke or --task Default.")
-        instances = integer_in("instances", self.instances, 1, 10_000)
-        axes = sweep_axes(self.sweep or ())
-        classes = [] if self.suite is None else find_file(SuiteFile, self.suite).suite.classes
-        for task in tasks:
-            spec = load(task)
-            classes = [*classes, *sweep(spec, axes, name=_title(spec), instances=instances)]
-        return [member.to_dict() for member in classes]
 
     def _algorithms(self) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""

@@ -35,7 +35,8 @@ def validate(
     else:
         for result in results:
             if result["valid"]:
-                line = f"[green]valid[/]    {result['kind']:8}  {escape(result['path'])}"
+                name = f"{result['kind']:8}  {escape(result['path'])}"
+                line = f"[green]valid[/]    {name}  {result['digest']}"
             else:
                 line = f"[red]invalid[/]  {escape(result['error'])}"
             out().print(line, soft_wrap=True)

@@ -41,7 +41,8 @@ class Envelope(StrictModel):
     content: ClassVar[str]
     remedy: ClassVar[str] = (
         "write the changed {content} as a new file, in Python "
-        "`{kind}(name=…, digest={content}.digest, {content}={content}).write(path)`"
+        "`sme_registry.spec.{kind}(name=…, digest={content}.digest, {content}={content})"
+        ".write(path)`"
     )
 
     name: Name

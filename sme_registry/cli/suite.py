@@ -1,0 +1,48 @@
+"""`sme suite`: write a suite's file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli.arguments import Force
+from sme_registry.cli.files import check_document_path
+from sme_registry.cli.plan_options import ClassOptions, with_options
+from sme_registry.spec import Suite, SuiteFile
+from sme_registry.terminal import err, out
+
+
+@with_options(ClassOptions)
+def suite(
+    path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
+    options: ClassOptions,
+    name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
+    description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
+    force: Force = False,
+) -> None:
+    """Write a suite's file: classes of tasks, each with several instances.
+
+    A class is one setting under several seeds, so that a method is judged on a kind of task and not
+    on one draw. Studies, leaderboards and --suite accept the file like the name of a suite.
+
+    Examples:
+
+      sme suite mine.json -t Default -t HardSparse -t k2.json --instances 5
+
+      sme suite intervals.json -t Default --sweep k=1,5,25 --instances 3
+
+      sme suite more.json --suite smoke -t Complexity50
+    """
+    check_document_path(path, force=force)
+    members = Suite(classes=options.classes())
+    file = SuiteFile(
+        name=name or path.stem, description=description, digest=members.digest, suite=members
+    )
+    file.write(path)
+    tasks = f"{len(members.classes)} classes, {len(members.instances)} instances"
+    out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
+    hint = f"{tasks}. To run an algorithm on them: sme study new plan.json --suite {path} -a PPO"
+    err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)
