@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import Json
-from sme_registry.terminal import out, print_json, table
+from sme_registry.terminal import Table, out, print_json
 
 
 def compare(
@@ -59,6 +59,6 @@ def compare(
     for each in comparison.comparison_tables(differences):
         columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
         rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
-        out().print(table(f"[bold]{escape(each.title)}[/]", columns, rows))
+        out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
     if files:
         out().print(f"{escape(str(out_folder))}  {len(files)} files", soft_wrap=True)

@@ -6,17 +6,16 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from rich.table import Table
 from rich.text import Text
+
+from sme_registry.terminal.tables import Table
 
 
 def table_html(table: Table) -> str:
     """A table of the terminal as HTML: title, headings, rows and caption, without their styles."""
-    columns = table.columns
-    heads = [_text(column.header) for column in columns]
-    rows = zip(*(column.cells for column in columns), strict=True)
-    body = [[_text(cell) for cell in row] for row in rows]
-    numbers = [column.justify == "right" for column in columns]
+    heads = [_text(column.heading) for column in table.columns]
+    body = [[_text(cell) for cell in row.cells] for row in table.rows if row is not None]
+    numbers = [column.kind == "number" for column in table.columns]
     lines = [f"<caption>{_text(table.title)}</caption>"] if table.title else []
     lines.append(_row("th", heads, numbers))
     lines.extend(_row("td", cells, numbers) for cells in body)
@@ -42,9 +41,9 @@ def _row(tag: str, cells: list[str], numbers: list[bool]) -> str:
     return f"<tr>{''.join(aligned)}</tr>"
 
 
-def _text(cell: Any) -> str:
+def _text(cell: Text | str) -> str:
     """A cell, heading or title without markup; spaces at its start and line breaks are kept."""
-    text = cell if isinstance(cell, Text) else Text.from_markup(str(cell))
+    text = cell if isinstance(cell, Text) else Text.from_markup(cell)
     html = escape(text.plain)
     indent = len(html) - len(html.lstrip(" "))
     return "&nbsp;" * indent + html.lstrip(" ").replace("\n", "<br>")

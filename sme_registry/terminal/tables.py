@@ -23,12 +23,16 @@ _STYLES = ((box.HEAVY_HEAD, 1), (None, 2), (None, 1))
 """From wide to narrow: lines, and spaces after each column (with lines, also before it)."""
 
 
-class _Column(NamedTuple):
+class Column(NamedTuple):
+    """A column, and how it is set: as a name, a number or a text."""
+
     heading: str
     kind: str
 
 
-class _Row(NamedTuple):
+class Row(NamedTuple):
+    """A row's cells, and Rich's style of all of them."""
+
     cells: tuple[Text, ...]
     style: str
 
@@ -51,35 +55,36 @@ class Table:
         *,
         caption: str = "",
     ) -> None:
-        self._title, self._caption = title, caption
-        self._columns = [_Column(heading, kind) for heading, kind in columns.items()]
-        self._rows: list[_Row | None] = []  # None separates sections
+        self.title, self.caption = title, caption
+        self.columns = [Column(heading, kind) for heading, kind in columns.items()]
+        self.rows: list[Row | None] = []
+        """None separates sections."""
         for row in rows:
             self.add_row(*row)
 
     def add_row(self, *cells: str, style: str | None = None) -> None:
         """Add a row; missing cells are empty."""
-        missing = ("",) * (len(self._columns) - len(cells))
+        missing = ("",) * (len(self.columns) - len(cells))
         texts = tuple(Text.from_markup(cell, emoji=False) for cell in (*cells, *missing))
-        self._rows.append(_Row(texts, style or ""))
+        self.rows.append(Row(texts, style or ""))
 
     def add_section(self) -> None:
         """Separate the rows so far from the next ones."""
-        self._rows.append(None)
+        self.rows.append(None)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        if self._title:
-            yield Text.from_markup(self._title, style="italic", emoji=False)
+        if self.title:
+            yield Text.from_markup(self.title, style="italic", emoji=False)
         if console.is_terminal:
             yield from self._fitted(options.max_width)
         else:
             yield Text("\n".join(self._lines()), no_wrap=True, overflow="ignore")
-        if self._caption:
-            yield Text.from_markup(self._caption, style="dim italic", emoji=False)
+        if self.caption:
+            yield Text.from_markup(self.caption, style="dim italic", emoji=False)
 
     def _fitted(self, width: int) -> RenderResult:
         """The widest style in which nothing wraps, else in which texts wrap, else blocks."""
-        least, most = zip(*map(self._limits, range(len(self._columns))), strict=True)
+        least, most = zip(*map(self._limits, range(len(self.columns))), strict=True)
         for needed, (lines, gap) in itertools.product((most, least), _STYLES):
             borders = (2 * gap + 1) * len(most) + 1 if lines else gap * (len(most) - 1)
             if sum(needed) + borders <= width:
@@ -89,8 +94,8 @@ class Table:
 
     def _limits(self, i: int) -> tuple[int, int]:
         """The least width of a column in which its cells are readable, and its full width."""
-        heading, kind = self._columns[i]
-        cells = [row.cells[i].plain for row in self._rows if row is not None]
+        heading, kind = self.columns[i]
+        cells = [row.cells[i].plain for row in self.rows if row is not None]
         most = max(map(_width, cells), default=0)
         least = most
         if kind == "text":
@@ -100,9 +105,9 @@ class Table:
     def _drawn(self, lines: box.Box | None, gap: int, widths: Sequence[int]) -> RichTable:
         padding = (0, gap, 0, gap if lines else 0)
         table = RichTable(box=lines, padding=padding, pad_edge=lines is not None)
-        for (heading, kind), width in zip(self._columns, widths, strict=True):
+        for (heading, kind), width in zip(self.columns, widths, strict=True):
             table.add_column(heading, justify="right" if kind == "number" else "left", width=width)
-        for row in self._rows:
+        for row in self.rows:
             if row is not None:
                 table.add_row(*row.cells, style=row.style)
             elif lines:
@@ -113,11 +118,11 @@ class Table:
 
     def _blocks(self) -> RenderResult:
         """Each row as a block: its name, its numbers, its texts."""
-        kinds = [kind for _, kind in self._columns]
+        kinds = [kind for _, kind in self.columns]
         named = 1 + next((i for i, kind in enumerate(kinds) if kind != "number"), 0)
-        for row in filter(None, self._rows):
+        for row in filter(None, self.rows):
             yield Text(" ", style=f"bold {row.style}").join(filter(None, row.cells[:named]))
-            rest = list(zip(self._columns, row.cells, strict=True))[named:]
+            rest = list(zip(self.columns, row.cells, strict=True))[named:]
             given = [(heading, kind, text) for (heading, kind), text in rest if text]
             numbers = [_pair(heading, text) for heading, kind, text in given if kind == "number"]
             texts = [_pair(heading, text) for heading, kind, text in given if kind != "number"]
@@ -126,15 +131,15 @@ class Table:
 
     def _lines(self) -> Iterator[str]:
         """The lines of the table as plain text of full width."""
-        widths = [self._limits(i)[1] for i in range(len(self._columns))]
-        header = tuple(Text(heading) for heading, _ in self._columns)
-        for row in (_Row(header, ""), *self._rows):
+        widths = [self._limits(i)[1] for i in range(len(self.columns))]
+        header = tuple(Text(heading) for heading, _ in self.columns)
+        for row in (Row(header, ""), *self.rows):
             if row is None:
                 yield ""
                 continue
             parts = [cell.plain.split("\n") for cell in row.cells]
             for line in itertools.zip_longest(*parts, fillvalue=""):
-                cells = zip(line, widths, self._columns, strict=True)
+                cells = zip(line, widths, self.columns, strict=True)
                 padded = (_padded(text, width, column.kind) for text, width, column in cells)
                 yield "  ".join(padded).rstrip()
 
