@@ -42,11 +42,26 @@ def env(
     spec: SpecLike = "Team2-v1", **kwargs: Any
 ) -> AECEnv[str, Observation, npt.NDArray[np.float64]]:
     """A team's task as a PettingZoo AEC environment; arguments and errors as in `parallel_env`."""
-    return _TurnBasedTeam(parallel_to_aec_wrapper(SMETeamEnv(spec, **kwargs)))
+    return TurnBasedTeam(SMETeamEnv(spec, **kwargs))
 
 
-class _TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
-    """Rejects an invalid action in its agent's own turn, when it can still be corrected."""
+class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
+    """A team whose agents act in turn.
+
+    It rejects an invalid action in its agent's own turn, when it can still be corrected. Until the
+    first step its infos are empty: PettingZoo's `seed_test` compares them, and NaN equals nothing.
+
+    Args:
+      parallel: the team's parallel environment, an `SMETeamEnv`.
+    """
+
+    def __init__(self, parallel: Any) -> None:
+        super().__init__(parallel_to_aec_wrapper(parallel))
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed=seed, options=options)
+        for info in self.infos.values():
+            info.clear()
 
     def step(self, action: npt.NDArray[Any] | None) -> None:
         if not self._has_reset:

@@ -58,6 +58,8 @@ def assert_same(got: Any, expected: Any) -> None:
         assert len(got) == len(expected)
         for mine, other in zip(got, expected, strict=True):
             assert_same(mine, other)
+    elif isinstance(got, np.generic):
+        np.testing.assert_array_equal(got, expected)
     else:
         assert got == expected
 
@@ -84,6 +86,7 @@ def test_every_number_is_that_of_a_dummy_vec_env_of_singles(spec: Any, action_ra
         action = low + (1 - low) * (0.6 * optimal + 0.4 * rng.random(optimal.shape))
         got, expected = ours.step(action.astype(np.float32)), theirs.step(action.astype(np.float32))
         assert_same(got, expected)
+        assert_same(ours.reset_infos, theirs.reset_infos)
         ends += int(got[2].sum())
     assert ends >= 6
     assert_same(ours.reset(), theirs.reset())

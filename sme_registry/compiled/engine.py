@@ -18,9 +18,11 @@ import numpy.typing as npt
 
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
+    LANE_STATE,
+    LANE_T,
+    LANE_VALUES,
     REGRET,
     REWARD,
-    ROWS,
     SIMILARITY,
     STEP_REWARD,
 )
@@ -39,12 +41,12 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 StepLane: TypeAlias = Callable[
     [Array, npt.NDArray[Any], Array, Observation],
-    tuple[float, float, float, float, float, float],
+    tuple[float, float],
 ]
 """One step of one lane of a single agent; see `kernels.step_lane` without its packed task.
 
-From a lane's buffer and an action to similarity, step reward, regret, reward, r_cum, and the end;
-it writes `optimal` `[A]` and the observation `[S + 2]`.
+From a lane's buffer and an action to the reward and the end; it writes the buffer, `optimal` `[A]`
+and the observation `[S + 2]`.
 """
 
 StepMany: TypeAlias = Callable[
@@ -60,7 +62,7 @@ class Engine:
     Attributes:
       backend: "numba" or "numpy".
       new_lane: makes a buffer for a single lane at t = 0, to pass to its steps, and the view of
-        that buffer that holds t, r_cum and s, `[2 + S]`.
+        that buffer that holds the entries of `compiled.values`, `[LANE_STATE + S]`.
       step_float32: one step of one lane, for float32 actions.
       step_float64: the same for float64 actions.
       step_many: one step of a batch of lanes.
@@ -142,7 +144,7 @@ def _numba_engine(task: Task) -> Engine:
 
     def new_lane() -> tuple[Array, Array]:
         buffer = np.concatenate([prefix, np.zeros(kernels.lane_size(packed))])
-        return buffer, buffer[prefix.size : prefix.size + 2 + task.spec.state_dim]
+        return buffer, buffer[prefix.size : prefix.size + LANE_STATE + task.spec.state_dim]
 
     step_many = functools.partial(kernels.step_many.get_overload(kernels.STEP_MANY), packed)
     return Engine("numba", new_lane, steps[0], steps[1], step_many, optimal_action)
@@ -152,7 +154,7 @@ def _numpy_engine(task: Task) -> Engine:
     S = task.spec.state_dim
 
     def new_lane() -> tuple[Array, Array]:
-        lane = np.zeros(2 + S)
+        lane = np.zeros(LANE_STATE + S)
         return lane, lane
 
     def step_one(
@@ -160,20 +162,18 @@ def _numpy_engine(task: Task) -> Engine:
         action: npt.NDArray[Any],
         optimal: Array,
         observation: Observation,
-    ) -> tuple[float, float, float, float, float, float]:
-        values, ends = np.empty((ROWS, 1, 1)), np.empty((2, 1), dtype=bool)
-        s, moved = lane[2:, None], np.empty((S, 1))
-        t = lane[:1].astype(np.int64)
+    ) -> tuple[float, float]:
+        values, ends = lane[LANE_VALUES:LANE_STATE, None, None], np.empty((2, 1), dtype=bool)
+        s, moved = lane[LANE_STATE:, None], np.empty((S, 1))
+        t, accumulated = lane[[LANE_T]].astype(np.int64), values[ACCUMULATED_REWARD]
         if action.size != task.spec.action_dim or not step_many(
-            s, t, lane[1:2, None], action.astype(np.float64)[None], moved,
+            s, t, accumulated, action.astype(np.float64)[None], moved,
             observation[None], optimal[None], values, ends,
         ):  # fmt: skip
-            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
-        lane[0] += 1.0
-        lane[2:] = moved[:, 0]
-        similarity, step_reward, regret, reward, accumulated = values[:, 0, 0].tolist()
-        end = float(ends[0, 0] + 2 * ends[1, 0])
-        return similarity, step_reward, regret, reward, accumulated, end
+            return 0.0, -1.0
+        lane[LANE_T] += 1.0
+        lane[LANE_STATE:] = moved[:, 0]
+        return values[REWARD].item(), float(ends[0, 0] + 2 * ends[1, 0])
 
     def step_many(
         s: Array,

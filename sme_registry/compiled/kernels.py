@@ -12,7 +12,8 @@ A task travels as one flat float64 array, because each array argument costs a ca
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
 A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
 stand alone where it is not, so that lanes can share it:
-    t, r_cum, s [S], room for two layers [2 × widest].
+    t, the values of the last step [5] (of `compiled.values`; r_cum is among them), s [S],
+    room for two layers [2 × widest].
 
 Numba's disk cache does not know a function's flags: never compile one of these a second way.
 """
@@ -26,6 +27,9 @@ from numba import boolean, float32, float64, int64, njit, types, void
 from sme_registry.compiled.normal_cdf import normal_cdf
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
+    LANE_STATE,
+    LANE_T,
+    LANE_VALUES,
     REGRET,
     REWARD,
     SIMILARITY,
@@ -59,10 +63,13 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
 
 def lane_size(packed: npt.NDArray[np.float64]) -> int:
     """The size of one lane's own part."""
-    return 2 + int(packed[0]) + 2 * int(packed[7])
+    return LANE_STATE + int(packed[0]) + 2 * int(packed[7])
 
 
 _U0, _U1, _U2 = np.uint64(0), np.uint64(1), np.uint64(2)
+_T, _S, _VALUES = np.uint64(LANE_T), np.uint64(LANE_STATE), np.uint64(LANE_VALUES)
+_SIMILARITY, _STEP_REWARD = np.uint64(SIMILARITY), np.uint64(STEP_REWARD)
+_REGRET, _REWARD, _R_CUM = np.uint64(REGRET), np.uint64(REWARD), np.uint64(ACCUMULATED_REWARD)
 _PACKED = types.Array(float64, 1, "C", readonly=True)
 
 
@@ -103,12 +110,12 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
     S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
     r_min, D, widest = p[4], p[5], np.uint64(p[7])
     if np.uint64(action.size) != A:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
+        return 0.0, -1.0
     for i in range(A):
         if action[i] - action[i] != 0.0:  # NaN for NaN and for infinities
-            return 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
+            return 0.0, -1.0
 
-    s = start + _U2
+    s = start + _S
     at = np.uint64(_HEADER) + A * S + S
     channels, layers = np.uint64(p[at]), np.uint64(p[at + _U1])
     at += _U2
@@ -156,21 +163,26 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
         lane[s + j] = folded
         observation[j] = folded
 
-    t = int(lane[start]) + 1
-    accumulated = lane[start + _U1] + step_reward
+    t = int(lane[start + _T]) + 1
+    v = start + _VALUES
+    accumulated = lane[v + _R_CUM] + step_reward
     truncated = t >= T
     end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
     reward = 0.0
     if truncated or t % k == 0:
         reward, accumulated = accumulated, 0.0
-    lane[start] = t
-    lane[start + _U1] = accumulated
+    lane[start + _T] = t
+    lane[v + _SIMILARITY] = similarity
+    lane[v + _STEP_REWARD] = step_reward
+    lane[v + _REGRET] = 1.0 - step_reward
+    lane[v + _REWARD] = reward
+    lane[v + _R_CUM] = accumulated
     observation[S] = t / T
     observation[S + _U1] = accumulated / k
-    return similarity, step_reward, 1.0 - step_reward, reward, accumulated, end
+    return reward, end
 
 
-_RESULT = types.UniTuple(float64, 6)
+_RESULT = types.UniTuple(float64, 2)
 _REST = (float64[::1], float32[::1])
 LANE_FLOAT32 = _RESULT(_PACKED, float64[::1], float32[:], *_REST)
 LANE_FLOAT64 = _RESULT(_PACKED, float64[::1], float64[:], *_REST)
@@ -190,9 +202,8 @@ def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped
       observation: `[S + 2]`, written.
 
     Returns:
-      `(similarity, step_reward, regret, reward, accumulated_reward, end)`; end is 1 for
-      terminated plus 2 for truncated, or −1 where the action is of another size or not finite:
-      nothing has moved then.
+      `(reward, end)`; end is 1 for terminated plus 2 for truncated, or −1 where the action is of
+      another size or not finite: nothing has moved then.
     """
     return _step_lane(p, lane, _U0, action, optimal, observation)
 

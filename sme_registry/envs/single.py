@@ -8,7 +8,15 @@ import gymnasium
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.envs import arguments
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    LANE_STATE,
+    LANE_VALUES,
+    REGRET,
+    SIMILARITY,
+    STEP_REWARD,
+)
+from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import (
     RENDER_MODES,
     GymnasiumMixin,
@@ -31,7 +39,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     `info` of each step, about the state acted in: `optimal_action` `[A]`, in the environment's
     action range; `similarity` r̃, `step_reward` r and `regret` 1 − r, each in [0, 1]; and
-    `accumulated_reward` r_cum after a payout's reset. At reset `info` is empty.
+    `accumulated_reward` r_cum after a payout's reset. At reset the same keys hold NaN.
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
@@ -69,8 +77,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         compiled = engine(self._task)
         self._step_float32, self._step_float64 = compiled.step_float32, compiled.step_float64
         self._buffer, self._lane = compiled.new_lane()  # the second is a view of the first
-        self._optimal_rows: list[Array] = []
-        self._observation_rows: list[Observation] = []
+        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
+        # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
+        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in rows)
+        self._rows: list[tuple[Array, Observation]] = []
         self._prepare_step()
 
     def _prepare_step(self) -> None:
@@ -80,20 +90,20 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         running, where actions are rescaled, or frames are rendered.
         """
         plain = self._state == "running" and not self._rescaled and self.render_mode is None
-        self._fast_step = (
+        self._fast_step: tuple[Any, ...] = (
             _FLOAT32 if plain else None,
             self._step_float32,
             self._buffer,
-            self._optimal_rows.pop,
-            self._observation_rows.pop,
+            self._rows.pop,
+            *self._values,
         )
 
     def _refill(self) -> None:
-        """Allocate rows for later steps; each is used once. Half the cost of `np.empty` a step."""
+        """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
         S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
         count = max(1, _POOL_BYTES // (8 * max(S + 2, A)))
-        self._optimal_rows.extend(np.empty((count, A)))
-        self._observation_rows.extend(np.empty((count, S + 2), np.float32))
+        optimal, observations = np.empty((count, A)), np.empty((count, S + 2), np.float32)
+        self._rows.extend(zip(optimal, observations, strict=True))
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
@@ -101,9 +111,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             "_step_float32",
             "_step_float64",
             "_buffer",
+            "_values",
             "_fast_step",
-            "_optimal_rows",
-            "_observation_rows",
+            "_rows",
         )
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
@@ -115,7 +125,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     @property
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy)."""
-        return self._lane[2:].copy()
+        return self._lane[LANE_STATE:].copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -127,7 +137,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           options: `{"state": s}` begins at s `[S]`, each entry in [0, 1].
 
         Returns:
-          The observation `[S + 2]` and an empty dict.
+          The observation `[S + 2]`, and an info of NaN.
 
         Raises:
           StateError: the state has the wrong shape or lies outside the cube.
@@ -142,15 +152,15 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             start = arguments.initial_states(options["state"], (S,))
         super().reset(seed=seed)  # nothing changes before every argument is checked
         s = self.np_random.random(S) if start is None else start
-        self._lane[:2] = 0.0
-        self._lane[2:] = s
+        self._lane[:LANE_STATE] = 0.0
+        self._lane[LANE_STATE:] = s
         observation = np.zeros(S + 2, np.float32)
         observation[:S] = s
         self._state = "running"
         self._prepare_step()
         if self.render_mode is not None:
             self._record(self, None)
-        return observation, {}
+        return observation, infos.at_reset(self._action_shape[0])
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -166,31 +176,30 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           EpisodeError: no episode is running.
         """
         # Written for speed: each look-up and branch here costs one percent of a step.
-        plain_dtype, step_float32, buffer, optimal_row, observation_row = self._fast_step
+        (
+            plain_dtype, step_float32, buffer, next_rows,
+            similarity, step_reward, regret, accumulated_reward,
+        ) = self._fast_step  # fmt: skip
         try:
-            optimal, observation = optimal_row(), observation_row()
+            optimal, observation = next_rows()
         except IndexError:
             self._refill()
-            optimal, observation = optimal_row(), observation_row()
+            optimal, observation = next_rows()
         try:
             plain = action.dtype is plain_dtype and action.ndim == 1
         except AttributeError:
             plain = False
         if plain:
-            similarity, step_reward, regret, reward, accumulated, end = step_float32(
-                buffer, action, optimal, observation
-            )
+            reward, end = step_float32(buffer, action, optimal, observation)
         else:
             action = self._checked(action)
-            similarity, step_reward, regret, reward, accumulated, end = self._step_float64(
-                buffer, action, optimal, observation
-            )
+            reward, end = self._step_float64(buffer, action, optimal, observation)
         info = {
             "optimal_action": optimal,
-            "similarity": similarity,
-            "step_reward": step_reward,
-            "regret": regret,
-            "accumulated_reward": accumulated,
+            "similarity": similarity[()],
+            "step_reward": step_reward[()],
+            "regret": regret[()],
+            "accumulated_reward": accumulated_reward[()],
         }
         if end or not plain:
             self._after(end, action, info)

@@ -17,8 +17,15 @@ import numpy as np
 import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
-from sme_registry.compiled.values import REWARD
-from sme_registry.envs import arguments
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    REGRET,
+    REWARD,
+    ROWS,
+    SIMILARITY,
+    STEP_REWARD,
+)
+from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import RENDER_MODES, RenderMixin
 from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.types import Array, Lanes, Observation
@@ -42,8 +49,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
     """A team in parallel: every agent acts at every step, and all end together.
 
     Observation of agent i: `[|O_i| + 2]` float32 in [0, 1]. Action: `[a_i]`, in [0, 1]
-    (`action_range="unit"`) or [−1, 1] (`"symmetric"`), clipped. `infos[agent]` of each step has the
-    keys of `SMEEnv`, that agent's own; `similarity` is always over its own channels, while
+    (`action_range="unit"`) or [−1, 1] (`"symmetric"`), clipped. `infos[agent]` has the keys of
+    `SMEEnv`, NaN at reset, that agent's own; `similarity` is always over its own channels, while
     `step_reward`, `regret` and `accumulated_reward` are those that it is paid for.
 
     Args:
@@ -97,15 +104,21 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self.state_space = gymnasium.spaces.Box(0.0, 1.0, (self.sme_spec.state_dim,), np.float64)
 
     def _allocate(self) -> None:
-        """The joint action `[1, A]`, and each agent's part of it: a view to write into."""
+        """The joint action `[1, A]` and the step's values `[5, n, 1]`, and each agent's views."""
         self._joint_action = np.zeros((1, self.sme_spec.action_dim))
         row = self._joint_action[0]
         views = [(name, row[channels]) for _, name, channels in self._parts]
         self._slots = [(name, view.shape, view) for name, view in views]
+        self._values = np.zeros((ROWS, len(self._parts), 1))
+        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
+        self._numbers: list[tuple[Any, ...]] = [
+            (name, channels, *(self._values[row, agent, 0, ...] for row in rows))
+            for agent, name, channels in self._parts
+        ]
 
     # The copy of a view is no view: the copy allocates both again.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_joint_action", "_slots")
+        dropped = ("_joint_action", "_slots", "_values", "_numbers")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -136,7 +149,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
             in PettingZoo, except those that look like a mistyped "state".
 
         Returns:
-          Each agent's observation, and an empty info for each.
+          Each agent's observation, and for each an info of NaN.
 
         Raises:
           StateError: the state has the wrong shape or lies outside the cube.
@@ -157,7 +170,9 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         self._begun = True
         if self.render_mode is not None:
             self._record(self._joint_view(), None)
-        return self._by_agent(observation), {name: {} for name in self.agents}
+        return self._by_agent(observation), {
+            name: infos.at_reset(len(view)) for name, _, view in self._slots
+        }
 
     def step(
         self, actions: dict[str, npt.NDArray[Any]]
@@ -188,8 +203,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         except ActionError:
             raise self._not_finite(joint) from None
         terminated, truncated = done.terminated.item(), done.truncated.item()
-        values = done.values[:, :, 0].tolist()  # of the only lane
-        infos = self._infos(done.optimal[0].copy(), values)
+        np.copyto(self._values, done.values)
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
@@ -197,26 +211,25 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         names = self.possible_agents
         return (
             self._by_agent(done.observation),
-            dict(zip(names, values[REWARD])),  # noqa: B905  # a keyword costs a percent
+            dict(zip(names, self._values[REWARD, :, 0].tolist())),  # noqa: B905  # costs a percent
             dict.fromkeys(names, terminated),
             dict.fromkeys(names, truncated),
-            infos,
+            self._infos(done.optimal[0].copy()),
         )
 
-    def _infos(self, optimal: Array, values: list[list[float]]) -> dict[str, dict[str, Any]]:
-        """Each agent's info, from the values `[5][n]` of a `BatchStep`."""
+    def _infos(self, optimal: Array) -> dict[str, dict[str, Any]]:
+        """Each agent's info of the last step, from its joint optimal action `[A]`."""
         if self._rescaled:
             optimal = arguments.from_unit(optimal, self._rescaled)
-        similarity, step_reward, regret, _, accumulated = values
         return {
             name: {
                 "optimal_action": optimal[channels],
-                "similarity": similarity[agent],
-                "step_reward": step_reward[agent],
-                "regret": regret[agent],
-                "accumulated_reward": accumulated[agent],
+                "similarity": similarity[()],
+                "step_reward": step_reward[()],
+                "regret": regret[()],
+                "accumulated_reward": accumulated_reward[()],
             }
-            for agent, name, channels in self._parts
+            for name, channels, similarity, step_reward, regret, accumulated_reward in self._numbers
         }
 
     def _by_agent(self, observation: Observation) -> dict[str, Observation]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sme_registry.envs import arguments
+from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import GymnasiumMixin, check_time_limit
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.lanes import Lane
@@ -99,7 +99,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             the lanes where `mask` `[B]` is True and leaves the others as they are.
 
         Returns:
-          Observations `[B, S + 2]` and an empty dict.
+          Observations `[B, S + 2]`, and infos of NaN in the lanes that are reset.
 
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
@@ -124,7 +124,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._begin(lanes, observation, states)
         self._begun[lanes] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
-        return observation, {}
+        info = infos.batch_at_reset(self.num_envs, self.sme_spec.action_dim)
+        return observation, infos.masked(info, mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
@@ -165,27 +166,33 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             "regret": regret,
             "accumulated_reward": accumulated,
         }
-        live = None
         if any_ended_before:
-            live = ~ended_before
             for array in (reward, terminated, truncated):
                 array[ended_before] = 0
-            self._begin(np.flatnonzero(ended_before), observation)
+            self._begin(np.flatnonzero(ended_before), observation, info=info)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
-        if any_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
-            infos = _masked(info, ~ended)
-            final = np.full(B, None, dtype=object)
-            for lane in np.flatnonzero(ended):
-                final[lane] = observation[lane].copy()
-            final_infos = {"final_obs": final, "final_info": _masked(info, ended)}
-            infos |= {**final_infos, "_final_obs": ended.copy(), "_final_info": ended.copy()}
-            self._begin(np.flatnonzero(ended), observation)
-        else:
-            infos = _masked(info, live)
-            if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-                self._ended, self._any_ended = ended, any_ended
-        return observation, reward, terminated, truncated, infos
+        last: dict[str, Any] = {}
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            self._ended, self._any_ended = ended, any_ended
+        elif any_ended:
+            last = self._last(observation, info, ended)
+            self._begin(np.flatnonzero(ended), observation, info=info)
+        return observation, reward, terminated, truncated, last | infos.masked(info)
+
+    def _last(
+        self, observation: Observation, info: dict[str, Array], ended: Mask
+    ) -> dict[str, Any]:
+        """Gymnasium's `final_obs` and `final_info` of the lanes `ended` `[B]`."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for lane in np.flatnonzero(ended):
+            final[lane] = observation[lane].copy()
+        return {
+            "final_obs": final,
+            "_final_obs": ended.copy(),
+            "final_info": infos.masked(info, ended),
+            "_final_info": ended.copy(),
+        }
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each lane, or read an attribute; see `get_attr`."""
@@ -222,10 +229,18 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
         return self._lanes
 
-    def _begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
-        """Put lanes at the start of an episode, and write their observations."""
+    def _begin(
+        self,
+        lanes: Lanes,
+        observation: Observation,
+        states: Array | None = None,
+        info: dict[str, Array] | None = None,
+    ) -> None:
+        """Put lanes at the start of an episode, and write their observations and infos."""
         self._batch.begin(lanes, observation, states)
         self._ended[lanes] = False
+        for value in (info or {}).values():
+            value[lanes] = np.nan
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""
@@ -251,17 +266,3 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if not mask.any():
             raise OptionError("reset_mask: must be True for at least one lane.")
         return mask
-
-
-def _masked(info: dict[str, Array], mask: Mask | None) -> dict[str, Any]:
-    """Gymnasium's form of batched info: each key with its mask; zero where the mask is False."""
-    masked: dict[str, Any] = {}
-    if mask is None:
-        everywhere = np.ones(len(info["similarity"]), bool)
-        for key, value in info.items():
-            masked[key], masked[f"_{key}"] = value, everywhere
-        return masked
-    for key, value in info.items():
-        columns = mask.reshape(-1, *[1] * (value.ndim - 1))
-        masked[key], masked[f"_{key}"] = np.where(columns, value, 0.0), mask.copy()
-    return masked

@@ -12,7 +12,15 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sme_registry.envs import arguments
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    REGRET,
+    REWARD,
+    ROWS,
+    SIMILARITY,
+    STEP_REWARD,
+)
+from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import renamed_by_content
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.lanes import Lane
@@ -59,7 +67,6 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
     def _clear_reset_arguments(self) -> None:
         """Forget seeds and options: every lane has begun an episode with them."""
-        self.reset_infos = [{} for _ in self._lanes]
         self._reset_seeds()
         self._reset_options()
 
@@ -104,7 +111,7 @@ class _SingleLane(Lane):
         """Begin an episode in this lane alone; see `SMEEnv.reset`."""
         start = self._owner._start([options or {}])
         observations = self._owner._begin({self._index: (seed, start)})
-        return observations[self._index], {}
+        return observations[self._index], self._owner._info_at_reset(self._index)
 
 
 class _BatchVecEnv(LanesVecEnv):
@@ -142,6 +149,30 @@ class _BatchVecEnv(LanesVecEnv):
                 for name in self.agents
             ]
         )
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """The values of a step, `[5, n, teams]`, and for each key of infos a view of each lane."""
+        self._values = np.zeros((ROWS, len(self.agents), self.num_teams))
+        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
+        places = list(np.ndindex(self.num_teams, len(self.agents)))
+        self._numbers = {
+            key: [self._values[row, agent, team, ...] for team, agent in places]
+            for key, row in zip(infos.NUMBERS, rows, strict=True)
+        }
+
+    # The copy of a view is no view: the copy allocates both again.
+    def __getstate__(self) -> dict[str, Any]:
+        dropped = ("_values", "_numbers")
+        return {name: value for name, value in vars(self).items() if name not in dropped}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._allocate()
+
+    def _info_at_reset(self, lane: int) -> dict[str, Any]:
+        owned = self._owned[lane % len(self.agents)]
+        return infos.at_reset(owned.stop - owned.start)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Seed team e with seed + e at the next reset; None draws a seed.
@@ -166,6 +197,7 @@ class _BatchVecEnv(LanesVecEnv):
         options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
         starts = [self._start(of_team) for of_team in options]
         observations = self._begin(dict(enumerate(zip(self._seeds[::n], starts, strict=True))))
+        self.reset_infos = [self._info_at_reset(lane) for lane in range(self.num_envs)]
         self._clear_reset_arguments()
         return observations
 
@@ -210,29 +242,26 @@ class _BatchVecEnv(LanesVecEnv):
         unit = arguments.to_unit(actions, shape, self._rescaled)
         done = self._batch.advance(self._joint_actions(unit))
 
-        similarity, step_reward, regret, reward, accumulated = (
-            agents.T.reshape(-1) for agents in done.values
-        )
+        np.copyto(self._values, done.values)
+        reward = done.values[REWARD].T.reshape(-1)
         optimal = arguments.from_unit(done.optimal, self._rescaled)
         columns: dict[str, list[Any]] = {
             "optimal_action": [row[part] for row in optimal for part in self._owned],
-            "similarity": similarity.tolist(),
-            "step_reward": step_reward.tolist(),
-            "regret": regret.tolist(),
-            "accumulated_reward": accumulated.tolist(),
+            **{key: [view[()] for view in views] for key, views in self._numbers.items()},
             "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
         }
-        infos: list[dict[str, Any]] = [
+        lane_infos: list[dict[str, Any]] = [
             dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ]
         ended: Mask = done.terminated | done.truncated
         dones = np.repeat(ended, n)
         if ended.any():
             last = self._observations(done.observation.copy())
-            for lane in np.flatnonzero(dones):
-                infos[lane]["terminal_observation"] = last[lane]
+            for lane in np.flatnonzero(dones).tolist():
+                lane_infos[lane]["terminal_observation"] = last[lane]
+                self.reset_infos[lane] = self._info_at_reset(lane)
             self._batch.begin(np.flatnonzero(ended), done.observation)
-        return self._observations(done.observation), reward.astype(np.float32), dones, infos
+        return self._observations(done.observation), reward.astype(np.float32), dones, lane_infos
 
     def _observations(self, joint: Observation) -> Observation:
         """Each lane's observation, from joint observations `[teams, S + 1 + n]`."""

@@ -18,8 +18,11 @@ class ConformanceError(AssertionError):
 
 
 def expect_equal(what: str, got: Any, expected: Any) -> None:
-    """Check that two values are equal, arrays in every entry."""
-    same = np.array_equal(got, expected) if isinstance(got, np.ndarray) else got == expected
+    """Check that two values are equal, arrays in every entry; NaN equals NaN."""
+    if isinstance(got, np.ndarray | np.generic):
+        same = np.array_equal(got, expected, equal_nan=True)
+    else:
+        same = got == expected
     if not same:
         raise ConformanceError(f"{what}: expected {expected!r:.200}, got {got!r:.200}.")
 
@@ -48,39 +51,20 @@ def expect_passes(what: str, test: Callable[[], Any], ignored: Collection[str] =
 
 
 def expect_same(what: str, got: Any, expected: Any) -> None:
-    """Check equality in every bit, type and key; ignores masked entries of a batched info."""
+    """Check equality in every bit, type and key; NaN equals NaN."""
     if isinstance(got, dict) and isinstance(expected, dict):
-        for key in got.keys() | expected.keys():
-            if not key.startswith("_"):
-                _expect_same_entries(f"{what}: {key}", key, got, expected)
+        expect_equal(f"{what}: the keys", sorted(got), sorted(expected))
+        for key in got:
+            expect_same(f"{what}: {key}", got[key], expected[key])
     elif isinstance(got, list | tuple) and isinstance(expected, list | tuple):
         expect_equal(f"{what}: the number of values", len(got), len(expected))
         for ours, theirs in zip(got, expected, strict=True):
             expect_same(what, ours, theirs)
-    elif isinstance(got, np.ndarray) and got.dtype != object:
-        expect_equal(f"{what}: dtype", got.dtype, np.asarray(expected).dtype)
-        expect_equal(what, got, expected)
-    elif isinstance(got, np.ndarray):
+    elif isinstance(got, np.ndarray) and got.dtype == object:
         expect_same(what, list(got), list(expected))
+    elif isinstance(got, np.ndarray | np.generic):
+        expect_equal(f"{what}: type", type(got), type(expected))
+        expect_equal(f"{what}: dtype", got.dtype, expected.dtype)
+        expect_equal(what, got, expected)
     else:
         expect_equal(what, got, expected)
-
-
-def _expect_same_entries(
-    what: str, key: str, got: dict[str, Any], expected: dict[str, Any]
-) -> None:
-    """Compare one key of two infos, single or batched."""
-    mask, other = got.get(f"_{key}"), expected.get(f"_{key}")
-    if mask is None and other is None:
-        expect_same(what, got.get(key), expected.get(key))
-        return
-    # An absent key equals one whose mask is False in every lane.
-    lanes = len(mask if mask is not None else other)  # type: ignore[arg-type]
-    masks = [np.zeros(lanes, bool) if m is None else np.asarray(m) for m in (mask, other)]
-    expect_equal(f"{what}: mask", masks[0], masks[1])
-    if not masks[0].any():
-        return
-    if isinstance(got[key], dict):
-        expect_same(what, got[key], expected[key])
-    else:
-        expect_same(what, got[key][masks[0]], expected[key][masks[0]])

@@ -20,6 +20,14 @@ LONGEST_HORIZON = 10_000  # that the optimal policy is followed to
 INFO_KEYS = {"optimal_action", "similarity", "step_reward", "regret", "accumulated_reward"}
 
 
+def expect_info_of_reset(what: str, info: dict[str, Any], action_dim: int) -> None:
+    """The info of a reset has the keys, shapes and types of a step's, and is NaN."""
+    expect_equal(f"{what}: the keys", set(info), INFO_KEYS)
+    expect_same(f"{what}: optimal_action", info["optimal_action"], np.full(action_dim, np.nan))
+    for key in sorted(INFO_KEYS - {"optimal_action"}):
+        expect_same(f"{what}: {key}", info[key], np.float64(np.nan))
+
+
 def mixed_actions(optimal: npt.NDArray[Any], rng: np.random.Generator) -> npt.NDArray[np.float32]:
     """Actions of the unit range between optimal and random ones, some slightly outside of it."""
     shape = optimal.shape

@@ -70,12 +70,16 @@ def _create_and_check(make: Make) -> None:
 
 
 def check_info(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
-    """`info` is flat and numeric, has the documented keys and ranges, and is new at each step."""
+    """`info` is flat and numeric, has the documented keys and ranges, and is new at each step.
+
+    At reset it has the same keys, with NaN of the same type.
+    """
     spec = load_spec(task)
     for action_range in ACTION_RANGES:
         env, untouched = (single(spec, action_range=action_range) for _ in range(2))
         for each in (env, untouched):
-            expect_equal("info at reset", each.reset(seed=seed)[1], {})
+            reset_info = each.reset(seed=seed)[1]
+            episodes.expect_info_of_reset("info at reset", reset_info, spec.action_dim)
         rng = np.random.default_rng(seed)
         overwritten: list[npt.NDArray[Any]] = []
         for _ in range(min(spec.horizon, 5)):
@@ -106,8 +110,8 @@ def _check_info_entries(info: dict[str, Any], spec: SMESpec, low: npt.NDArray[An
         raise ConformanceError(f"optimal_action={optimal}: outside the action range.")
     for key in sorted(INFO_KEYS - {"optimal_action"}):
         top = spec.k if key == "accumulated_reward" else 1.0
-        if not (isinstance(info[key], float) and 0.0 <= info[key] <= top):
-            raise ConformanceError(f"{key}={info[key]!r}: must be a float in [0, {top}].")
+        if not (isinstance(info[key], np.float64) and 0.0 <= info[key] <= top):
+            raise ConformanceError(f"{key}={info[key]!r}: must be a float64 in [0, {top}].")
 
 
 def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:

@@ -15,6 +15,7 @@ from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.spec import ACTION_RANGES, SpecLike
 from sme_registry.task import Task, load_spec, materialize, observe, step
+from sme_registry.teams import TurnBasedTeam
 from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
     TOLERANCE,
@@ -72,7 +73,7 @@ def check_pettingzoo(task: SpecLike, *, parallel: Make = SMETeamEnv) -> None:
         make = functools.partial(parallel, spec, action_range=action_range)
 
         def make_aec(make: Make = make) -> Any:
-            return parallel_to_aec(make())
+            return TurnBasedTeam(make())
 
         tests: dict[str, Callable[[], Any]] = {
             "parallel_api_test": functools.partial(parallel_api_test, make(), num_cycles=MAX_STEPS),
@@ -97,7 +98,10 @@ def check_team_definition(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: 
         env = parallel(spec, action_range=action_range)
         observations, infos = env.reset(seed=seed)
         expect_equal("the agents", tuple(env.agents), definition.names)
-        expect_equal("infos at reset", infos, {name: {} for name in definition.names})
+        expect_equal("the agents of infos at reset", tuple(infos), definition.names)
+        for name, owned in zip(definition.names, definition.owned, strict=True):
+            width = owned.stop - owned.start
+            episodes.expect_info_of_reset(f"{name}: info at reset", infos[name], width)
         s, r_cum = env.state()[None], np.zeros((1, len(definition.names)))
         _check_observations(definition, observations, s, 0, r_cum)
         for t in range(min(spec.horizon, MAX_STEPS)):

@@ -42,7 +42,8 @@ class MonitoredVecEnv(LanesVecEnv):
 
     def reset(self) -> Observation:
         """Begin an episode with the seed and options set before; observations `[1, S + 2]`."""
-        observation, _ = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        observation, info = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self.reset_infos = [info]
         self._clear_reset_arguments()
         return observation[None]
 
@@ -55,7 +56,7 @@ class MonitoredVecEnv(LanesVecEnv):
         info["TimeLimit.truncated"] = truncated and not terminated
         if ended:
             info["terminal_observation"] = observation
-            observation, _ = self._env.reset()
+            observation, self.reset_infos[0] = self._env.reset()
         rewards, dones = np.array([reward], np.float32), np.array([ended])
         self.steps += 1
         self.seconds += time.thread_time() - begun

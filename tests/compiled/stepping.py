@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import Engine
+from sme_registry.compiled.values import LANE_STATE, LANE_VALUES, REWARD
 from sme_registry.task import Task
 
 
@@ -35,17 +36,19 @@ class Lane:
     ) -> None:
         self.task, self.engine = task, engine
         self.buffer, self.numbers = engine.new_lane()
-        self.numbers[2:] = state
+        self.numbers[LANE_STATE:] = state
 
     def step(self, action: Any) -> Result | None:
         """One step with a float32 or float64 action; None where it was refused."""
         A, S = self.task.spec.action_dim, self.task.spec.state_dim
         optimal, observation = np.empty(A), np.empty(S + 2, np.float32)
         entry = self.engine.step_float32 if action.dtype == np.float32 else self.engine.step_float64
-        *values, end = entry(self.buffer, action, optimal, observation)
+        reward, end = entry(self.buffer, action, optimal, observation)
         if end < 0:
             return None
-        state = self.numbers[2:].copy()
+        state = self.numbers[LANE_STATE:].copy()
+        values = self.numbers[LANE_VALUES:LANE_STATE].tolist()
+        assert values[REWARD] == reward
         return Result(state, observation, optimal, *values, end in (1.0, 3.0), end >= 2.0)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, testing
+from sme_registry.compiled.values import ACCUMULATED_REWARD, LANE_STATE, LANE_VALUES
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.testing import ConformanceError
 
@@ -35,7 +36,7 @@ class Drifts(SMEEnv):
 
     def step(self, action: Any) -> Any:
         returned = super().step(action)
-        self._lane[2] = np.nextafter(self._lane[2], 0.5)
+        self._lane[LANE_STATE] = np.nextafter(self._lane[LANE_STATE], 0.5)
         return returned
 
 
@@ -56,6 +57,21 @@ class Leaks(SMEEnv):
         return *returned, {**info, "state": self.state}
 
 
+class SaysNothingAtReset(SMEEnv):
+    """Has no info at reset, where collectors expect the keys of a step."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=seed, options=options)[0], {}
+
+
+class PythonNumbers(SMEEnv):
+    """Has numbers without a dtype in its info."""
+
+    def step(self, action: Any) -> Any:
+        *returned, info = super().step(action)
+        return *returned, {**info, "regret": float(info["regret"])}
+
+
 class Unseeded(SMEEnv):
     """Ignores its seed."""
 
@@ -68,7 +84,7 @@ class Forgets(SMEEnv):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._lane[1] = 0.0
+        self._lane[LANE_VALUES + ACCUMULATED_REWARD] = 0.0
 
 
 class Shares(SMEEnv):
@@ -115,12 +131,21 @@ class MislaysLast(SMEVectorEnv):
         return observations, *rest, infos
 
 
-class NeverMasks(SMEVectorEnv):
-    """Says of resting lanes that their info counts."""
+class KeepsTheLastRegret(SMEVectorEnv):
+    """Has a regret of 0, not NaN, in lanes that were reset."""
 
     def step(self, actions: Any) -> Any:
         *rest, infos = super().step(actions)
-        return *rest, {k: v | True if k == "_regret" else v for k, v in infos.items()}
+        return *rest, {k: np.nan_to_num(v) if k == "regret" else v for k, v in infos.items()}
+
+
+class EmptyFinals(SMEVectorEnv):
+    """Has the keys of last observations where no episode has ended."""
+
+    def step(self, actions: Any) -> Any:
+        *rest, infos = super().step(actions)
+        nothing = {"final_obs": np.full(3, None), "_final_obs": np.zeros(3, bool)}
+        return *rest, nothing | infos
 
 
 class CopiesLate(SMEVectorEnv):
@@ -140,6 +165,8 @@ class CopiesLate(SMEVectorEnv):
         (testing.check_optimum, Swallows, "the optimum's return"),
         (testing.check_info, Reuses, "later step reuses an array"),
         (testing.check_info, Leaks, "keys"),
+        (testing.check_info, SaysNothingAtReset, "info at reset: the keys"),
+        (testing.check_info, PythonNumbers, "regret=.*must be a float64"),
         (testing.check_determinism, Unseeded, "two runs of one seed"),
         (testing.check_pickling, Forgets, "pickled copy of the single"),
         (testing.check_pickling, Shares, "deep copy of the single"),
@@ -158,7 +185,8 @@ def test_a_faulty_environment_is_seen(check: Any, faulty: type[SMEEnv], words: s
     [
         (testing.check_vector, OffByOneBit, "NextStep, unit: step 1"),
         (testing.check_vector, MislaysLast, "SameStep.*final_obs"),
-        (testing.check_vector, NeverMasks, "regret: mask"),
+        (testing.check_vector, KeepsTheLastRegret, "regret: expected"),
+        (testing.check_vector, EmptyFinals, "NextStep, unit: step 1: the keys"),
         (testing.check_pickling, CopiesLate, "vector"),
     ],
 )

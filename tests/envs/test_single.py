@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry.envs import SMEEnv
+from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import ActionError, EpisodeError, OptionError, StateError
 
 START = np.array([0.3, 0.6, 0.9])
@@ -239,10 +240,28 @@ def test_a_step_before_reset_or_after_the_end_is_refused() -> None:
 def test_an_episode_begins_at_the_state_that_is_given() -> None:
     env = SMEEnv("Plane1")
     for state in ([0.25, 0.75], (0, 1), np.array([1.0, 0.0], np.float32)):
-        observation, info = env.reset(options={"state": state})
+        observation, _ = env.reset(options={"state": state})
         assert observation.tolist() == [*map(float, state), 0.0, 0.0]
         assert env.state.tolist() == [*map(float, state)]
-        assert info == {}
+
+
+@pytest.mark.parametrize("make", [SMEEnv, SMETeamEnv, SMEVectorEnv])
+def test_infos_of_reset_and_step_have_the_same_keys_shapes_and_types(make: Any) -> None:
+    env = make("Plane1")
+    observations, at_reset = env.reset(seed=0)
+    middle = np.full((2,), 0.5, np.float32)
+    if isinstance(observations, dict):
+        at_step = env.step({"agent_0": middle})[-1]["agent_0"]
+        at_reset = at_reset["agent_0"]
+    else:
+        at_step = env.step(np.broadcast_to(middle, env.action_space.shape))[-1]
+    assert at_reset.keys() == at_step.keys()
+    for key, value in at_step.items():
+        assert type(at_reset[key]) is type(value)
+        assert (at_reset[key].shape, at_reset[key].dtype) == (value.shape, value.dtype)
+        if not key.startswith("_"):
+            assert np.isfinite(value).all()
+            assert np.isnan(at_reset[key]).all()
 
 
 def test_a_given_state_takes_nothing_from_the_generator() -> None:

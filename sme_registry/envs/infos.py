@@ -1,0 +1,46 @@
+"""`info`: the keys of every step and every reset, of a single environment and of a batch.
+
+At a step the values are those of `SMEEnv`, float64 of NumPy, since some libraries ask for a dtype.
+At a reset no action was taken: the same keys hold NaN, so that every info has one structure.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sme_registry.envs.types import Array, Mask
+
+NUMBERS = "similarity", "step_reward", "regret", "accumulated_reward"
+"""The keys whose values are numbers; `optimal_action` `[A]` is the fifth."""
+
+_NAN = np.float64(np.nan)
+
+
+def at_reset(action_dim: int) -> dict[str, Any]:
+    """The info of a reset: NaN for every key, `optimal_action` a fresh array `[A]`."""
+    return {"optimal_action": np.full(action_dim, np.nan), **dict.fromkeys(NUMBERS, _NAN)}
+
+
+def batch_at_reset(lanes: int, action_dim: int) -> dict[str, Array]:
+    """The info of `B` resets: fresh arrays of NaN, `optimal_action` `[B, A]`, others `[B]`."""
+    numbers = {key: np.full(lanes, np.nan) for key in NUMBERS}
+    return {"optimal_action": np.full((lanes, action_dim), np.nan), **numbers}
+
+
+def masked(info: dict[str, Array], mask: Mask | None = None) -> dict[str, Any]:
+    """Gymnasium's form of batched info: each key with its mask `_key`; None is every lane.
+
+    Copies arrays only where there is a mask, and writes 0 where it is False.
+    """
+    infos: dict[str, Any] = {}
+    if mask is None:
+        every_lane = np.ones(len(info["similarity"]), bool)
+        for key, value in info.items():
+            infos[key], infos[f"_{key}"] = value, every_lane
+        return infos
+    for key, value in info.items():
+        columns = mask.reshape(-1, *[1] * (value.ndim - 1))
+        infos[key], infos[f"_{key}"] = np.where(columns, value, 0.0), mask.copy()
+    return infos
