@@ -42,7 +42,10 @@ class GymnasiumMixin(TaskMixin):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's spec; a derived task has an id of its own, by its content."""
+        """Gymnasium's spec; a derived task has an id of its own, by its content.
+
+        Its `max_episode_steps` is the horizon.
+        """
         return self._env_spec
 
     @spec.setter
@@ -116,7 +119,8 @@ def check_time_limit(max_episode_steps: int, horizon: int) -> None:
         raise WrapperError(
             f"max_episode_steps={max_episode_steps}: must be at least the horizon, {horizon}: a "
             "shorter TimeLimit would end the episode before its last payout. Make the task itself "
-            f"shorter: horizon={max_episode_steps}."
+            f"shorter, horizon={max_episode_steps}; or, where the limit comes from the EnvSpec of "
+            f"another horizon, pass max_episode_steps={horizon}."
         )
 
 
@@ -129,7 +133,8 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
     """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
     `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
-    from which it was derived.
+    from which it was derived. Its `max_episode_steps` is the horizon, which wrappers ask for; a
+    TimeLimit that Gymnasium makes of it changes nothing, as the environment ends by itself.
     """
     if env_spec is None:
         return None
@@ -143,8 +148,9 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
     plain.kwargs = {
         key: value.value if isinstance(value, Enum) else value
         for key, value in plain.kwargs.items()
-        if key not in fields
+        if key not in fields and key != "max_episode_steps"
     }
+    plain.max_episode_steps = spec.horizon
     if not named or not isinstance(task, str | dict):
         plain.kwargs["spec"] = spec.to_dict()
     if not named:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
@@ -21,7 +22,10 @@ from sme_registry.errors import (
     SpecError,
     UnexpectedKeywordError,
     UnknownNameError,
+    WrapperError,
 )
+from sme_registry.testing.comparing import expect_same
+from sme_registry.testing.episodes import mixed_actions
 
 ROOT = Path(sme_registry.__file__).resolve().parents[1]
 
@@ -130,6 +134,54 @@ def test_no_catalogue_id_carries_a_time_limit() -> None:
         if env_id.startswith("SME/")
     }
     assert limits == {None}
+
+
+@pytest.mark.parametrize("overrides", [{}, {"horizon": 7}], ids=["named", "derived"])
+def test_env_specs_present_the_horizon_as_the_episodes_longest_length(overrides: Any) -> None:
+    horizon = overrides.get("horizon", 100)
+    made = [
+        gymnasium.make("SME/Default-v1", **overrides),
+        gymnasium.make_vec("SME/Default-v1", num_envs=2, **overrides),
+        sme_registry.make(sme_registry.load("Default").derive(**overrides)),
+    ]
+    for env in made:
+        assert env.spec is not None
+        assert env.spec.max_episode_steps == horizon
+        recreate: Any = gymnasium.make_vec if env is made[1] else gymnasium.make
+        for spec in (env.spec, EnvSpec.from_json(env.spec.to_json())):
+            again = recreate(spec)
+            assert again.spec == env.spec
+            assert recreate(EnvSpec.from_json(again.spec.to_json())).spec == env.spec
+
+
+def test_the_time_limit_of_a_recreated_environment_changes_no_number() -> None:
+    # Episodes are terminated early, truncated with a pending payout, or both at once.
+    env = gymnasium.make("SME/Default-v1", horizon=12, k=5, D=0.2)
+    assert env.spec is not None
+    limited = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(limited, gymnasium.wrappers.TimeLimit)
+    rng, ends = np.random.default_rng(0), set()
+    for seed in range(20):
+        expect_same("reset", limited.reset(seed=seed), env.reset(seed=seed))
+        ended = False
+        while not ended:
+            unwrapped: Any = env.unwrapped
+            action = mixed_actions(unwrapped.task.optimal_action(unwrapped.state), rng)
+            step = env.step(action)
+            expect_same("step", limited.step(action), step)
+            ended = step[2] or step[3]
+        ends.add(step[2:4])
+    assert {(True, False), (False, True)} <= ends
+
+
+def test_an_env_spec_of_a_shorter_task_says_how_to_make_a_longer_one() -> None:
+    env = gymnasium.make("SME/Default-v1", horizon=5)
+    assert env.spec is not None
+    with pytest.raises(WrapperError, match="pass max_episode_steps=9"):
+        gymnasium.make(env.spec, horizon=9).reset()
+    longer = gymnasium.make(env.spec, horizon=9, max_episode_steps=9)
+    assert longer.spec is not None
+    assert longer.spec.max_episode_steps == 9
 
 
 @pytest.mark.parametrize(

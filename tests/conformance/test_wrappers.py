@@ -30,7 +30,7 @@ AROUND_SINGLES = {
     "RescaleAction": lambda env: wrappers.RescaleAction(env, LOW, HIGH),
     "RescaleObservation": lambda env: wrappers.RescaleObservation(env, LOW, HIGH),
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
-    "TimeAwareObservation": lambda env: wrappers.TimeAwareObservation(wrappers.TimeLimit(env, T)),
+    "TimeAwareObservation": wrappers.TimeAwareObservation,
     "TimeLimit": lambda env: wrappers.TimeLimit(env, T),
     "TransformAction": lambda env: wrappers.TransformAction(env, np.sqrt, env.action_space),
     "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: 2.0 * reward),
