@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from sme_registry import envs as envs
     from sme_registry import errors as errors
     from sme_registry import evaluation as evaluation
+    from sme_registry import export as export
     from sme_registry import offline as offline
     from sme_registry import plots as plots
     from sme_registry import sb3 as sb3
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from sme_registry import testing as testing
     from sme_registry import training as training
     from sme_registry.evaluation import EvaluationReport, evaluate
+    from sme_registry.export import export_onnx
     from sme_registry.spec import EvaluationProtocol, SMESpec
     from sme_registry.task import Task, materialize
 
@@ -54,6 +56,7 @@ __all__ = [
     "Task",
     "env_spec",
     "evaluate",
+    "export_onnx",
     "load",
     "make",
     "make_aec",
@@ -70,6 +73,7 @@ _LAZY = {
     "SMESpec": "sme_registry.spec",
     "Task": "sme_registry.task",
     "evaluate": "sme_registry.evaluation",
+    "export_onnx": "sme_registry.export",
     "materialize": "sme_registry.task",
 }
 
@@ -80,6 +84,7 @@ _SUBMODULES = (
     "envs",
     "errors",
     "evaluation",
+    "export",
     "offline",
     "plots",
     "sb3",

@@ -9,10 +9,10 @@ from sme_registry.diagnosis.comparison import compare
 from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
 from sme_registry.diagnosis.questions import THRESHOLDS
 from sme_registry.diagnosis.subject import Subject
+from sme_registry.evaluation.policies import Perceptron
 from sme_registry.io import integer_in, versions
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import materialize
-from sme_registry.training.numpy_policy import Perceptron
 
 __all__ = ["EPISODES", "STATES", "diagnose"]
 

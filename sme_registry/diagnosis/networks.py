@@ -21,10 +21,10 @@ from sme_registry.diagnosis.document import CapacityProbe
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy
+from sme_registry.evaluation.policies import Perceptron
 from sme_registry.io import require_packages
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
-from sme_registry.training.numpy_policy import Perceptron
 
 __all__ = ["DEFAULT_STATES", "GRADIENT_STEPS", "exploration", "exploration_sd", "probe_capacity"]
 
@@ -150,11 +150,11 @@ def _module(network: Perceptron) -> Any:
     """A new network of the same layers, whose outputs are actions in the unit range."""
     from torch import nn
 
-    activations: dict[Any, type[nn.Module]] = {np.tanh: nn.Tanh}
+    activations: dict[str, type[nn.Module]] = {"tanh": nn.Tanh}
     modules: list[nn.Module] = []
     for index, (W, _, activation) in enumerate(network.layers):
         modules.append(nn.Linear(*W.shape))
-        if activation is not None and index < len(network.layers) - 1:
+        if activation != "identity" and index < len(network.layers) - 1:
             modules.append(activations.get(activation, nn.ReLU)())
     if network.low is not None:  # squashed by tanh and scaled to the range: a sigmoid of 2 x
         modules.append(nn.Sigmoid())

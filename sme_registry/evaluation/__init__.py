@@ -3,6 +3,7 @@
 from sme_registry.evaluation.evaluate import evaluate, resolve_protocol
 from sme_registry.evaluation.policies import (
     OfflinePolicy,
+    Perceptron,
     Policy,
     TeamPolicy,
     as_policy,
@@ -21,6 +22,7 @@ __all__ = [
     "ChannelReport",
     "EvaluationReport",
     "OfflinePolicy",
+    "Perceptron",
     "Policy",
     "RegionReport",
     "TeamPolicy",

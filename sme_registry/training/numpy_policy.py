@@ -12,52 +12,21 @@ network, and one whose actions differ on a few probes, is called directly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from sme_registry.envs.types import Observation
-from sme_registry.errors import SpecError
+from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Policy, as_policy
+from sme_registry.evaluation.policies.perceptron import Layer, Perceptron
 from sme_registry.evaluation.policies.sb3 import torch_policy
 from sme_registry.spec import SMESpec
 from sme_registry.task import streams
 
-Weights = npt.NDArray[np.float32]
-Activation = Callable[..., Any]
-
 _PROBES = 16
 _TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e-6
-
-
-@dataclass(frozen=True)
-class Perceptron:
-    """A multilayer perceptron with a copy of a model's weights.
-
-    Attributes:
-      layers: `W [in, out]`, `b [out]` and the activation (None: identity) of each layer.
-      low: `[A]`, lower bound of the action space. None: the outputs are the actions.
-      high: `[A]`, upper bound. Outputs in [−1, 1] are then scaled to the action space.
-    """
-
-    layers: tuple[tuple[Weights, Weights, Activation | None], ...]
-    low: Weights | None = None
-    high: Weights | None = None
-
-    def __call__(self, observations: Observation) -> Weights:
-        """Actions `[B, A]` float32 for observations `[B, O]`, not clipped."""
-        x: Weights = np.asarray(observations, np.float32)
-        for W, b, activation in self.layers:
-            x = x @ W
-            x += b
-            if activation is not None:
-                activation(x, out=x)
-        if self.low is None or self.high is None:
-            return x
-        return self.low + 0.5 * (x + 1.0) * (self.high - self.low)
 
 
 def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Policy:
@@ -107,20 +76,21 @@ def _perceptron(network: Any) -> Perceptron | None:
         return None
     if type(extractor) is not FlattenExtractor:
         return None
-    functions: dict[type, Activation] = {nn.Tanh: np.tanh, nn.ReLU: _relu}
-    layers: list[tuple[Weights, Weights, Activation | None]] = []
+    names: dict[type, str] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
+    layers: list[Layer] = []
     for module in _flat(parts):
         if type(module) is nn.Linear and module.bias is not None:
             W, b = (part.detach().cpu().numpy() for part in (module.weight, module.bias))
-            layers.append((np.ascontiguousarray(W.T), b.copy(), None))
-        elif type(module) in functions and layers and layers[-1][2] is None:
-            layers[-1] = (*layers[-1][:2], functions[type(module)])
+            layers.append((W.T, b, "identity"))
+        elif type(module) in names and layers and layers[-1][2] == "identity":
+            layers[-1] = (*layers[-1][:2], names[type(module)])
         else:
             return None
-    if not network.squash_output:
-        return Perceptron(tuple(layers))
-    space: Any = network.action_space
-    return Perceptron(tuple(layers), space.low, space.high)
+    space: Any = network.action_space if network.squash_output else None
+    try:
+        return Perceptron(layers, *(() if space is None else (space.low, space.high)))
+    except PolicyError:  # weights that are not finite
+        return None
 
 
 def _parts(network: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -143,7 +113,3 @@ def _flat(modules: Iterable[Any]) -> Iterator[Any]:
             yield from _flat(module)
         else:
             yield module
-
-
-def _relu(x: Weights, out: Weights) -> Weights:
-    return np.maximum(x, 0.0, out=out)

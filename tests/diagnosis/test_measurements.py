@@ -88,14 +88,14 @@ def test_the_probe_fits_what_a_network_can_represent_and_fails_at_the_rest(
 ) -> None:
     torch = pytest.importorskip("torch")
     from sme_registry.diagnosis import networks
-    from sme_registry.training.numpy_policy import Perceptron
+    from sme_registry.evaluation.policies import Perceptron
 
     def network(*widths: int) -> Perceptron:
         pairs = itertools.pairwise(widths)
         *inner, last = [
-            (np.zeros(pair, np.float32), np.zeros(pair[1], np.float32), np.tanh) for pair in pairs
+            (np.zeros(pair, np.float32), np.zeros(pair[1], np.float32), "tanh") for pair in pairs
         ]
-        return Perceptron((*inner, (*last[:2], None)))
+        return Perceptron((*inner, (*last[:2], "identity")))
 
     def probe(network: Perceptron, spec: Any, states: int) -> Any:
         return networks.probe_capacity(network, materialize(spec), states, 0, lambda done: None)

@@ -14,10 +14,10 @@ import pytest
 import sme_registry
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
-from sme_registry.evaluation import as_policy
+from sme_registry.evaluation import Perceptron, as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.training.algorithms import one_thread
-from sme_registry.training.numpy_policy import Perceptron, numpy_policy
+from sme_registry.training.numpy_policy import numpy_policy
 
 PLAIN = SMESpec(state_dim=3, action_dim=2)
 # Payouts every 7 steps, a threshold, and an end at the first bad step.

@@ -9,7 +9,8 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
-from sme_registry.training.numpy_policy import Perceptron, numpy_policy
+from sme_registry.evaluation import Perceptron
+from sme_registry.training.numpy_policy import numpy_policy
 
 sb3 = pytest.importorskip("stable_baselines3")
 torch = pytest.importorskip("torch")

@@ -6,12 +6,14 @@ an offline policy · `module:function` · name of a reference policy · for team
 
 from sme_registry.evaluation.policies.forms import as_policy
 from sme_registry.evaluation.policies.npz import OfflinePolicy
+from sme_registry.evaluation.policies.perceptron import Perceptron
 from sme_registry.evaluation.policies.policy import Member, Policy, TeamPolicy
 from sme_registry.evaluation.policies.sb3_files import load_sb3, saved_sb3
 
 __all__ = [
     "Member",
     "OfflinePolicy",
+    "Perceptron",
     "Policy",
     "TeamPolicy",
     "as_policy",

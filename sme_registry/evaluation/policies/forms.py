@@ -82,11 +82,29 @@ def as_policy(
         policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
     if spec.team is None:
-        S, A = spec.state_dim, spec.action_dim
-        return _prepare(policy, Interface(S + 2, A, f"state_dim={S}, action_dim={A}"), range_, name)
+        return _prepare(policy, interface_of(spec), range_, name)
     if isinstance(policy, Mapping):
         return _separate_policies(policy, spec, range_, name)
     return _shared_policy(policy, spec, range_, name)
+
+
+def interface_of(spec: SMESpec) -> Interface:
+    """The widths of a policy for a task; of a team's, for the one that all agents share."""
+    if spec.team is None:
+        S, A = spec.state_dim, spec.action_dim
+        return Interface(S + 2, A, f"state_dim={S}, action_dim={A}")
+    agents = draw.agents(spec)
+    observation_dim = spec.state_dim + 2 + len(agents)
+    action_dim = max(agent.action_dim for agent in agents)
+    return Interface(
+        observation_dim,
+        action_dim,
+        f"a policy that all {len(agents)} agents share",
+        alternatives="a dict from each agent's name to its policy; or for all agents ",
+        hint=f"A policy that a team shares is called for each agent in turn, from its shared "
+        f"observation [B, {observation_dim}] to [B, {action_dim}]; for separate policies pass a "
+        "dict by agent.",
+    )
 
 
 def _named(text: str, spec: SMESpec) -> Any:
@@ -166,7 +184,7 @@ def _prepare(
         )
     return Policy(
         name or _name_of(policy),
-        action_range or "unit",
+        action_range or getattr(policy, "action_range", None) or "unit",
         act,
         interface.action_dim,
         interface.hint,
@@ -246,18 +264,7 @@ def _shared_policy(
 ) -> TeamPolicy:
     """A team policy from one policy that all agents share."""
     agents = draw.agents(spec)
-    observation_dim = spec.state_dim + 2 + len(agents)
-    action_dim = max(agent.action_dim for agent in agents)
-    interface = Interface(
-        observation_dim,
-        action_dim,
-        f"a policy that all {len(agents)} agents share",
-        alternatives="a dict from each agent's name to its policy; or for all agents ",
-        hint=f"A policy that a team shares is called for each agent in turn, from its shared "
-        f"observation [B, {observation_dim}] to [B, {action_dim}]; for separate policies pass a "
-        "dict by agent.",
-    )
-    prepared = _prepare(policy, interface, action_range, name)
+    prepared = _prepare(policy, interface_of(spec), action_range, name)
     members = tuple(
         Member(
             agent.name,

@@ -6,7 +6,6 @@ Open only files whose author you trust: the leaderboard runs others' in a sandbo
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,12 @@ from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.policies.policy import Interface
 from sme_registry.io import require_packages
+from sme_registry.spec import ACTION_RANGES
+
+ACTION_RANGE = "action_range"  # a field of a file's metadata: "unit" or "symmetric"
 
 
-def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[Observation], Any]:
+def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork:
     """Load an ONNX file's network, on one thread of the CPU: a function of observations.
 
     The file has one float32 input `[B, O]` and one output `[B, A]`.
@@ -28,23 +30,7 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[O
     path = Path(path)
     if not path.is_file():
         raise PolicyError(f"{path} does not exist. Give the path of an .onnx file.")
-    require_packages(f"running {path}", {"onnxruntime": "onnxruntime"}, "onnx")
-    # From version 1.31 on its telemetry is on by default; an evaluation must not send any.
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # errors are raised instead
-    try:
-        session = onnxruntime.InferenceSession(
-            os.fspath(path), options, providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:
-        raise PolicyError(
-            f"{path}: not a network that onnxruntime can load: {error}. Export it again "
-            "with an opset from 13 to 23, or pass a callable."
-        ) from error
+    session = start_session(path)
     ends = {"input": session.get_inputs(), "output": session.get_outputs()}
     for (what, tensors), width in zip(ends.items(), interface[:2], strict=True):
         shape = tensors[0].shape if len(tensors) == 1 else []
@@ -58,5 +44,50 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> Callable[[O
                 f"[batch, {width}] for {interface.description}, the batch of any size. Evaluate it "
                 "on the task it was trained for, and export it with a dynamic batch axis."
             )
-    observation = session.get_inputs()[0].name
-    return lambda observations: session.run(None, {observation: observations})[0]
+    return OnnxNetwork(session)
+
+
+class OnnxNetwork:
+    """An ONNX network: a function of observations.
+
+    Attributes:
+      action_range: the range of its actions, if its metadata record one.
+    """
+
+    def __init__(self, session: Any) -> None:
+        self._session, self._input = session, session.get_inputs()[0].name
+        recorded = session.get_modelmeta().custom_metadata_map.get(ACTION_RANGE)
+        self.action_range = recorded if recorded in ACTION_RANGES else None
+
+    def __call__(self, observations: Observation) -> Any:
+        """Actions `[B, A]` for observations `[B, O]`."""
+        return self._session.run(None, {self._input: observations})[0]
+
+
+def start_session(model: Path | bytes) -> Any:
+    """A session of onnxruntime for a file or its content.
+
+    Raises:
+      PolicyError: onnxruntime rejects it.
+      MissingDependencyError: onnxruntime is not installed.
+    """
+    name = "model" if isinstance(model, bytes) else str(model)
+    require_packages(f"running {name}", {"onnxruntime": "onnxruntime"}, "onnx")
+    # From version 1.31 on its telemetry is on by default; an evaluation must not send any.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # errors are raised instead
+    try:
+        return onnxruntime.InferenceSession(
+            model if isinstance(model, bytes) else os.fspath(model),
+            options,
+            providers=["CPUExecutionProvider"],
+        )
+    except Exception as error:
+        raise PolicyError(
+            f"{name}: not a network that onnxruntime can load: {error}. Export it again "
+            "with an opset from 13 to 23, or pass a callable."
+        ) from error

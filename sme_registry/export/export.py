@@ -1,0 +1,213 @@
+"""`export_onnx`: the deterministic policy of a network as an ONNX file.
+
+    input `observations` [B, S + 2] float32  →  output `actions` [B, A] float32 in [0, 1]
+
+The graph contains every step from an observation to an action of the unit range, clipping
+included. Its actions are compared with the policy's, and a file that differs is never written.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.evaluation import OfflinePolicy, Perceptron, load_sb3
+from sme_registry.evaluation.policies.forms import interface_of
+from sme_registry.evaluation.policies.onnx import ACTION_RANGE, start_session
+from sme_registry.evaluation.policies.policy import Interface
+from sme_registry.evaluation.policies.sb3 import torch_policy
+from sme_registry.export import perceptron, torch_modules
+from sme_registry.export.network import INPUT, Network
+from sme_registry.io import choice, refuse_unwritable, require_packages, write_atomically
+from sme_registry.spec import ACTION_RANGES, ActionRange, SpecLike
+from sme_registry.task import load_spec
+
+TOLERANCE = 1e-6
+# Float32 networks are exact only up to rounding: trained TD3s differed from float64 by up to
+# 1.2e-6, and from themselves row by row by 7e-7. So 99 of 100 actions must be within the tolerance,
+# and the others within this.
+_LARGEST_DIFFERENCE = 1e-5
+_CHECKED_ROWS = 1024
+
+
+def export_onnx(
+    policy: Any,
+    spec: SpecLike,
+    path: str | os.PathLike[str],
+    *,
+    action_range: ActionRange | None = None,
+    vec_normalize: Any = None,
+) -> Path:
+    """Write a policy as an ONNX file, and check the file against the policy.
+
+    Args:
+      policy: a network from observations `[B, S + 2]` to actions `[B, A]`, one of
+        a `torch.nn.Module`, or a function of PyTorch tensors such as `lambda o: actor(o).mean`;
+        a `Perceptron` of arrays: a JAX network's parameters, or a linear map;
+        a Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
+        an offline policy, or the path of its .npz.
+        Modules are exported in evaluation mode. For a team, the policy that all agents share.
+      spec: the task: a spec, its fields, an id, a digest or a path.
+      path: the .onnx file. Its folder is created if it is missing, and an existing file is
+        replaced.
+      action_range: of the policy's actions, "unit" for [0, 1] or "symmetric" for [−1, 1]; None
+        takes an SB3 model's own action space, and "unit" for any other policy. The file's actions
+        are always in [0, 1], which its metadata records.
+      vec_normalize: of an SB3 model, the `VecNormalize` of its training, or the path of its saved
+        file (which can run code too). None takes that of the model's environment, if any. A
+        model's .zip does not contain it.
+
+    Returns:
+      The path: opset 17, weights inside, any batch size.
+
+    Raises:
+      UnknownNameError, SpecError: no such task, or a field out of range.
+      PolicyError: the policy is none of these, has another interface, or cannot be exported; or
+        the file's actions differ from its own by more than 1e-6 beyond float32 rounding.
+      OptionError: `action_range` is invalid, or the file cannot be written.
+      MissingDependencyError: onnx, ONNX Runtime or the policy's library is not installed.
+    """
+    if not os.fspath(path).endswith(".onnx"):
+        raise OptionError(f"path={os.fspath(path)!r}: must end in .onnx.")
+    refuse_unwritable(path)
+    data = onnx_bytes(policy, spec, action_range=action_range, vec_normalize=vec_normalize)
+    return write_atomically(path, data)
+
+
+def onnx_bytes(
+    policy: Any,
+    spec: SpecLike | None,
+    *,
+    action_range: ActionRange | None = None,
+    vec_normalize: Any = None,
+) -> bytes:
+    """The content of the file that `export_onnx` writes.
+
+    `spec` may be None for an SB3 model and for a policy of arrays, which know their widths.
+    """
+    libraries = {"onnx": "onnx", "onnxruntime": "ONNX Runtime"}
+    require_packages("exporting a policy", libraries, "onnx")
+    if action_range is not None:
+        choice("action_range", action_range, ACTION_RANGES)
+    interface = None if spec is None else interface_of(load_spec(spec))
+    network = _network(policy, interface, action_range, vec_normalize)
+    written = network.to_onnx()
+    # Without `Expand` if that makes no difference: boards accept no tensors of computed sizes.
+    for data in (_finished(written, expand=False), _finished(written, expand=True)):
+        try:
+            _refuse_difference(data, network)
+        except PolicyError as error:
+            difference = error
+        else:
+            return data
+    raise difference
+
+
+def _network(
+    policy: Any, interface: Interface | None, action_range: ActionRange | None, vec_normalize: Any
+) -> Network:
+    """The policy as a network that writes itself."""
+    policy = _loaded(policy)
+    if hasattr(policy, "predict"):
+        from sme_registry.export.sb3 import sb3_network
+
+        if torch_policy(policy) is None:
+            raise PolicyError(
+                f"policy={policy!r:.80}: predicts by other means than a PyTorch policy of "
+                "Stable-Baselines3, such as JAX or a recurrent state. Give its network as a "
+                "torch.nn.Module or its parameters as a `Perceptron`."
+            )
+        return sb3_network(policy, interface, action_range, vec_normalize)
+    if vec_normalize is not None:
+        raise PolicyError("vec_normalize: is for models of Stable-Baselines3. Leave it out.")
+    symmetric = action_range == "symmetric"
+    if isinstance(policy, OfflinePolicy):
+        policy = perceptron.of_offline_policy(policy)
+    if isinstance(policy, Perceptron):
+        if interface is not None:
+            widths = {
+                "observations": (policy.observation_dim,),
+                "actions": (policy.action_dim,),
+            }
+            interface.check("policy", **widths)
+        return perceptron.network(policy, symmetric)
+    if interface is None or not callable(policy):
+        raise PolicyError(
+            f"policy={policy!r:.80}: must be a torch.nn.Module, a function of PyTorch tensors, a "
+            "`Perceptron`, a Stable-Baselines3 model, or the path of a .zip or .npz."
+        )
+    return torch_modules.network(policy, interface, symmetric)
+
+
+def _loaded(policy: Any) -> Any:
+    """The policy itself, from its path."""
+    if not isinstance(policy, str | os.PathLike):
+        return policy
+    path = Path(policy)
+    if path.suffix == ".zip":
+        return load_sb3(path)
+    if path.suffix == ".npz":
+        return OfflinePolicy.load(path)
+    raise PolicyError(
+        f"policy={str(policy)!r}: must be the path of a .zip or an .npz, or a network."
+    )
+
+
+def _finished(data: bytes, expand: bool) -> bytes:
+    """The model with the range of its actions in its metadata, and unused nodes removed.
+
+    Args:
+      data: the model.
+      expand: False removes the operator `Expand`, of a distribution's parameters for example.
+        Operators that work entry by entry broadcast in any case.
+    """
+    import onnx
+
+    model = onnx.load_model_from_string(data)
+    if not expand:
+        for node in model.graph.node:
+            if node.op_type == "Expand":
+                node.op_type = "Identity"
+                del node.input[1:]
+    used, kept = {output.name for output in model.graph.output}, []
+    for node in reversed(model.graph.node):
+        if used.intersection(node.output):
+            used.update(node.input)
+            kept.append(node)
+    del model.graph.node[:]
+    model.graph.node.extend(reversed(kept))
+    onnx.helper.set_model_props(model, {ACTION_RANGE: "unit"})
+    return bytes(model.SerializeToString())
+
+
+def _refuse_difference(data: bytes, network: Network) -> None:
+    """Raise if the file's actions differ from the policy's, inside or outside the cube.
+
+    The second half of the observations covers the OOD shells up to ε = 1, [−½, 3/2].
+    """
+    random = np.random.default_rng(0)
+    inside = random.random((_CHECKED_ROWS, network.observation_dim), dtype=np.float32)
+    observations = np.concatenate([inside, 2.0 * inside[::-1] - np.float32(0.5)])
+    session = start_session(data)
+    try:
+        actions = session.run(None, {INPUT: observations})[0]
+    except Exception as error:
+        raise PolicyError(
+            f"policy: its ONNX file fails on {len(observations)} observations: {error}. The "
+            "network must treat the rows of a batch alike, whatever their number."
+        ) from error
+    expected = np.clip(network.act(observations), 0.0, 1.0)
+    same_shape = actions.shape == expected.shape
+    differences = np.abs(actions - expected) if same_shape else np.full(1, np.inf)
+    difference = float(differences.max())
+    typical = float(np.quantile(differences, 0.99))
+    if not (typical <= TOLERANCE and difference <= _LARGEST_DIFFERENCE):
+        raise PolicyError(
+            f"policy: its ONNX file differs from its own actions by {difference:.1e}: must be at "
+            f"most {TOLERANCE:g}. Check that it is deterministic and depends only on the "
+            "observation, or write the ONNX file yourself."
+        )

@@ -1,0 +1,123 @@
+"""Exported policies act as they did before, pass a board's checks, and what cannot is refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sme_registry
+from leaderboard.artefact.gate import inspect
+from sme_registry import SMESpec, evaluate, export_onnx
+from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
+from sme_registry.evaluation import OfflinePolicy, Perceptron
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+SPEC = SMESpec(state_dim=3, action_dim=2)
+PROTOCOL = {"states_per_region": 100}
+
+
+def arrays(*shape: int, scale: float = 1.0) -> Any:
+    return np.random.default_rng(sum(shape)).normal(scale=scale, size=shape).astype(np.float32)
+
+
+def same(policy: Any, path: Path, action_range: str = "unit", act: Any = None) -> None:
+    """The file scores as the policy does, and a board accepts it."""
+    exported = evaluate(path, SPEC, PROTOCOL)
+    own = evaluate(policy if act is None else act, SPEC, PROTOCOL, action_range=action_range)
+    assert exported.action_range == "unit"
+    for found, expected in zip(exported.regions, own.regions, strict=True):
+        assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=1e-5)
+    assert own.regions[0].similarity_sd > 0.02  # no constant
+    inspect(path.read_bytes(), SPEC.state_dim + 2, SPEC.action_dim)
+
+
+LAYERS = [(arrays(5, 16), arrays(16), "tanh"), (arrays(16, 2), arrays(2), "identity")]
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+@pytest.mark.parametrize("hidden", ["identity", "relu", "tanh", "sigmoid", "silu", "elu"])
+def test_arrays_are_exported_without_pytorch(
+    hidden: str, action_range: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    policy = Perceptron([(*LAYERS[0][:2], hidden), LAYERS[1]])
+    path = export_onnx(policy, SPEC, tmp_path / "a" / "policy.onnx", action_range=action_range)
+    same(policy, path, action_range)
+    model = onnx.load(path)
+    assert {prop.key: prop.value for prop in model.metadata_props} == {"action_range": "unit"}
+
+
+def test_a_linear_map_is_exported(tmp_path: Path) -> None:
+    policy = Perceptron([(arrays(5, 2), np.zeros(2), "identity")])
+    same(policy, export_onnx(policy, SPEC, tmp_path / "linear.onnx"))
+
+
+def test_an_offline_policy_is_exported(tmp_path: Path) -> None:
+    layers = [(arrays(16, 5), arrays(16)), (arrays(2, 16), arrays(2))]
+    policy = OfflinePolicy(layers)
+    same(policy, export_onnx(policy, SPEC, tmp_path / "policy.onnx"))
+    saved = policy.save(tmp_path / "policy.npz")
+    again = export_onnx(saved, SPEC, tmp_path / "again.onnx")
+    assert again.read_bytes() == (tmp_path / "policy.onnx").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("layers", "message"),
+    [
+        ([], "at least one"),
+        ([(np.ones((5, 2)), np.zeros(3), "tanh")], r"W has shape \(5, 2\) and b \(3,\)"),
+        ([LAYERS[0], (np.ones((2, 16)), np.zeros(2), "tanh")], r"must be \(16, out\).*Transpose"),
+        ([(np.ones((5, 2)), np.zeros(2), "tahn")], "activation='tahn': must be one of"),
+        ([(np.full((5, 2), np.nan), np.zeros(2), "tanh")], "NaN or infinity"),
+        ([(np.ones((5, 2)), np.zeros(2))], r"must be \(W, b, activation\)"),
+    ],
+)
+def test_arrays_that_are_no_network_are_refused(layers: Any, message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        Perceptron(layers)
+
+
+def refused(policy: Any, tmp_path: Path, message: str, spec: Any = SPEC, **options: Any) -> None:
+    target = tmp_path / "out" / "policy.onnx"
+    with pytest.raises(PolicyError, match=message):
+        export_onnx(policy, spec, target, **options)
+    assert not target.parent.exists()
+
+
+def test_a_policy_for_another_task_is_refused(tmp_path: Path) -> None:
+    refused(Perceptron(LAYERS), tmp_path, r"have shape \(5,\): must be \(10,\)", SMESpec())
+
+
+def test_other_names_and_places_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"must end in \.onnx"):
+        export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.pt")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OptionError, match="cannot be written"):
+        export_onnx(None, SPEC, tmp_path / "file" / "policy.onnx")
+    refused("policy.pt", tmp_path, r"must be the path of a \.zip or an \.npz")
+    refused(3, tmp_path, r"must be a torch\.nn\.Module")
+
+
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sme_registry.io.packages.is_installed", lambda name: name != "onnx")
+    with pytest.raises(MissingDependencyError, match=r"onnx is not installed.*\[onnx\]"):
+        export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.onnx")
+
+
+def test_the_recorded_range_of_a_file_is_used(tmp_path: Path) -> None:
+    path = export_onnx(Perceptron(LAYERS), SPEC, tmp_path / "policy.onnx")
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"action_range": "symmetric"})
+    path.write_bytes(model.SerializeToString())
+    assert evaluate(path, SPEC, PROTOCOL).action_range == "symmetric"
+    assert evaluate(path, SPEC, PROTOCOL, action_range="unit").action_range == "unit"
+
+
+def test_export_is_public() -> None:
+    assert "export_onnx" in sme_registry.__all__

@@ -1,0 +1,123 @@
+"""PyTorch networks as people write them, exported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import export_onnx
+from tests.export.test_export import SPEC, refused, same
+
+torch = pytest.importorskip("torch")
+nn = torch.nn
+
+
+class Squashed(nn.Module):
+    """An actor as of TD3, with actions in [−1, 1]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(5, 16), nn.Linear(16, 2)
+
+    def forward(self, x: Any) -> Any:
+        return torch.tanh(self.fc2(nn.functional.relu(self.fc1(x))))
+
+
+class Residual(nn.Module):
+    """Blocks with layer normalisation, GELU, dropout and skip connections."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.last = nn.Linear(5, 16), nn.Linear(16, 2)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(nn.LayerNorm(16), nn.Linear(16, 16), nn.GELU(), nn.Dropout(0.5))
+            for _ in range(3)
+        )
+
+    def forward(self, x: Any) -> Any:
+        x = self.first(x)
+        for block in self.blocks:
+            x = x + block(x)
+        return torch.sigmoid(self.last(x))
+
+
+class Gaussian(nn.Module):
+    """An actor as of PPO: a distribution around its mean."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mean, self.log_sd = nn.Linear(5, 2), nn.Parameter(torch.zeros(2))
+
+    def forward(self, x: Any) -> Any:
+        return torch.distributions.Normal(self.mean(x), self.log_sd.exp())
+
+    def act(self, x: Any) -> Any:
+        return self(x).mean
+
+
+class Agent:
+    def __init__(self) -> None:
+        self.actor = Squashed()
+
+    def act(self, x: Any) -> Any:
+        return self.actor(x)
+
+
+def made(name: str) -> tuple[Any, str]:
+    torch.manual_seed(3)
+    gaussian, agent, squashed = Gaussian(), Agent(), Squashed()
+    return {
+        "sequential": (nn.Sequential(nn.Linear(5, 8), nn.Tanh(), nn.Linear(8, 2)), "symmetric"),
+        "squashed": (squashed, "symmetric"),
+        "residual": (Residual(), "unit"),
+        "double": (Squashed().double(), "symmetric"),
+        "batch norm": (nn.Sequential(nn.Linear(5, 8), nn.BatchNorm1d(8), nn.Linear(8, 2)), "unit"),
+        "lambda": (lambda x: gaussian(x).mean, "unit"),
+        "method": (gaussian.act, "unit"),
+        "agent's method": (agent.act, "symmetric"),
+        "lambda of an agent": (lambda x: agent.act(x)[:, :2], "symmetric"),
+        "no parameters": (lambda x: x[:, :2], "unit"),
+    }[name]
+
+
+NAMES = (
+    "sequential", "squashed", "residual", "double", "batch norm", "lambda", "method",
+    "agent's method", "lambda of an agent", "no parameters",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_network_acts_as_before(name: str, tmp_path: Path) -> None:
+    policy, action_range = made(name)
+    modes = [part.training for part in policy.modules()] if isinstance(policy, nn.Module) else []
+    path = export_onnx(policy, SPEC, tmp_path / "policy.onnx", action_range=action_range)  # type: ignore[arg-type]
+    if modes:
+        assert [part.training for part in policy.modules()] == modes
+        policy.eval()
+
+    def act(observations: Any) -> Any:
+        with torch.no_grad():
+            x = torch.from_numpy(observations)
+            return policy(x.double() if name == "double" else x).numpy()
+
+    same(policy, path, action_range, act)
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (Gaussian(), r"returns a Normal .*lambda o: actor\(o\)\.mean"),
+        (lambda x: (x[:, :2], x), r"returns a tuple .*lambda o: actor\(o\)\[0\]"),
+        (lambda x: x[:, 0], r"returns a tensor \[3\] .*must be one tensor \[3, 2\]"),
+        (nn.Linear(4, 2), "fails on a PyTorch tensor"),
+        (lambda o: np.tanh(o @ np.ones((5, 2))), r"fails on a PyTorch tensor.*`Perceptron`"),
+        (lambda x: torch.rand_like(x[:, :2]), "differs from its own actions"),
+        (lambda x: x[:, :2] * (1.0 if x.sum() > 3.0 else 0.5), "differs from its own actions"),
+        (lambda x: torch.linalg.svd(x[:, :2])[0][:, :2], r"fails|cannot export|returns"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(policy: Any, message: str, tmp_path: Path) -> None:
+    refused(policy, tmp_path, message)
