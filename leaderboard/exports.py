@@ -154,4 +154,8 @@ def one_line(text: str) -> str:
 
 
 def _interval(estimate: Estimate) -> str:
-    return f"${fixed(estimate.value)}$ [${fixed(estimate.low)}$, ${fixed(estimate.high)}$]"
+    value = f"${fixed(estimate.value)}$"
+    if estimate.interval is None:
+        return value
+    low, high = estimate.interval
+    return f"{value} [${fixed(low)}$, ${fixed(high)}$]"

@@ -16,9 +16,10 @@ spread, Hesterberg 2015 ("narrowness bias"). Using the longer arm on both sides 
 percentile interval with its mirror image, the "basic" interval of Davison and Hinkley 1997, section
 5.2: with few runs that are skewed or bimodal, either interval alone covers too rarely.
 
-The run is the unit: its evaluation episodes and states are not independent evidence. Every interval
-is a function of its runs and a seed, which can be any text. Axis letters: `n` runs of a class, `K`
-columns.
+The run is the unit: its evaluation episodes and states are not independent evidence. The spread of
+a single run is unknown: where no class has more, there is no interval, and its ends are NaN. Every
+interval is a function of its runs and a seed, which can be any text. Axis letters: `n` runs of a
+class, `K` columns.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+
+from sme_registry.io import integer_in
 
 Array = npt.NDArray[np.float64]
 Statistic = Callable[[npt.ArrayLike], Array]  # of [n, …] over the first axis: […]
@@ -45,6 +48,9 @@ __all__ = [
     "optimality_gap",
     "performance_profile",
     "probability_of_improvement",
+    "running_median",
+    "smoothed",
+    "smoothing_window",
     "stratified_bootstrap",
 ]
 
@@ -59,8 +65,8 @@ class Estimate:
 
     Attributes:
       value: `[K]`.
-      low: `[K]` lower ends.
-      high: `[K]` upper ends.
+      low: `[K]` lower ends; NaN where each class has a single run.
+      high: `[K]` upper ends; NaN likewise.
     """
 
     value: Array
@@ -105,6 +111,55 @@ def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
     return mean(np.maximum(0.0, target - np.asarray(scores, dtype=np.float64)))
 
 
+def smoothing_window(rows: int) -> int:
+    """The entries in a median of a training curve of this many: a tenth, in [1, 50]."""
+    return min(50, max(1, rows // 10))
+
+
+def running_median(values: Array, window: int) -> Array:
+    """Medians of the last entries.
+
+    Args:
+      values: `[N]`, in order.
+      window: entries in each median, at least 1.
+
+    Returns:
+      `[N]` medians of the last `window` entries up to each, of fewer at the beginning.
+    """
+    N = len(values)
+    medians = [np.median(values[:end]) for end in range(1, min(window, N + 1))]
+    if window <= N:
+        windows = np.lib.stride_tricks.sliding_window_view(values, window)
+        rows = max(1, _MAX_NUMBERS // window)
+        for first in range(0, len(windows), rows):
+            medians.extend(np.median(windows[first : first + rows], axis=1))
+    return np.array(medians)
+
+
+def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Array, Array, int]:
+    """The line of a training curve.
+
+    Args:
+      step: `[N]` environment steps at which episodes ended, in any order.
+      values: `[N]`.
+      window: entries in each median; None for `smoothing_window`.
+
+    Returns:
+      `[P]` increasing steps, `[P]` medians of the last `window` values up to each, and the window.
+
+    Raises:
+      OptionError: `window` is not a positive integer.
+    """
+    order = np.argsort(step, kind="stable")
+    x, y = step[order], values[order]
+    last = np.flatnonzero(np.diff(x, append=np.inf))  # of all that ended at one step
+    if window is None:
+        window = max(smoothing_window(len(x)), int(np.diff(last, prepend=-1).max()))
+    window = min(integer_in("window", window, 1), len(x))
+    last = last[last >= window - 1]
+    return x[last], running_median(y, window)[last], window
+
+
 def aggregate(classes: Mapping[str, Array], statistic: Statistic = iqm) -> Array:
     """θ: the mean over classes, which have equal weight regardless of their number of runs.
 
@@ -123,7 +178,7 @@ def stratified_bootstrap(
 ) -> tuple[Array, Array]:
     """95 % intervals of `aggregate`, with the same resampled runs for all columns.
 
-    A class with a single run adds no spread, since its spread is unknown.
+    Beside classes of several runs, a class with a single run adds no spread: its spread is unknown.
 
     Args:
       classes: by name, `[n, K]` scores of its runs.
@@ -133,9 +188,12 @@ def stratified_bootstrap(
       statistic: applied within each class.
 
     Returns:
-      The lower and upper ends, `[K]` each, in the scores' units.
+      The lower and upper ends, `[K]` each, in the scores' units; NaN where each class has a
+      single run.
     """
     value = aggregate(classes, statistic)
+    if max(map(len, classes.values())) == 1:
+        return np.full_like(value, np.nan), np.full_like(value, np.nan)
     deviation = np.zeros((len(value), draws))
     for name, runs in classes.items():
         n = len(runs)
@@ -194,7 +252,7 @@ def probability_of_improvement(
       `[1]`, in [0, 1]; ½ if neither is better.
     """
     value, deviation = np.zeros(1), np.zeros((1, draws))
-    pairs, unanimous = 0, True
+    pairs, unanimous, known = 0, True, False
     for name in x:
         ours, others = (np.asarray(runs, dtype=np.float64) for runs in (x[name], y[name]))
         wins = (np.sign(ours[:, None] - others) + 1.0) / 2.0
@@ -204,6 +262,7 @@ def probability_of_improvement(
         unanimous = unanimous and wins.min() == wins.max() != 0.5
         if fewer == 1:
             continue
+        known = True
         # A sample's share of wins: the runs' counts in it, times who beats whom.
         counts = [
             _counts(_resampled(_stream(seed, f"{name}\n{side}"), n, draws)) / n
@@ -211,6 +270,8 @@ def probability_of_improvement(
         ]
         share = np.einsum("id,ij,jd->d", counts[0], wins, counts[1], optimize=True)
         deviation += math.sqrt(fewer / (fewer - 1)) / len(x) * (share - wins.mean())
+    if not known:
+        return Estimate(value, np.array([np.nan]), np.array([np.nan]))
     if unanimous and float(value[0]) in (0.0, 1.0):
         bound = np.array([((1.0 - LEVEL) / 2.0) ** (1.0 / pairs)])
         return Estimate(value, bound, value) if value[0] else Estimate(value, value, 1.0 - bound)

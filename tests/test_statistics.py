@@ -113,9 +113,16 @@ def test_every_statistic_is_resampled_as_the_whole_class_would_be(statistic: sta
     assert [low[0], high[0]] == pytest.approx([centre - arm, centre + arm])
 
 
-def test_a_single_run_adds_no_spread():
-    low, high = statistics.stratified_bootstrap({"": np.array([[0.3]])}, 100, "s")
-    assert low == high == 0.3
+@pytest.mark.parametrize("others", [{}, {"b": np.array([[0.1]])}])
+def test_single_runs_have_no_interval(others):
+    classes = {"a": np.array([[0.3]]), **others}
+    assert np.isnan(statistics.stratified_bootstrap(classes, 100, "s")).all()
+    columns = {name: runs[:, 0] for name, runs in classes.items()}
+    profile = statistics.performance_profile(columns, [0.2], 100, "s")
+    better = statistics.probability_of_improvement(columns, columns, 100, "s")
+    for estimate in (profile, better):
+        assert np.isfinite(estimate.value).all()
+        assert np.isnan([estimate.low, estimate.high]).all()
 
 
 def test_intervals_of_five_runs_hold_the_truth_as_often_as_they_say():

@@ -113,9 +113,9 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
 
 
 def _interval(value: Estimate) -> str:
-    if value.low == value.high:  # one run in each class: the spread is unknown
+    if value.interval is None or value.low == value.high:  # equal where runs cannot differ
         return fixed(value.value)
-    return f"{fixed(value.value)} ({fixed(value.low)} to {fixed(value.high)})"
+    return f"{fixed(value.value)} ({fixed(value.interval[0])} to {fixed(value.interval[1])})"
 
 
 def show(
@@ -211,7 +211,7 @@ def _scores_table(result: Result) -> Table:
     for m, value in enumerate(result.scores.normalised_regret):
         rows[f"N in OOD {m}" if m else "N in WD"] = value
     for label, value in rows.items():
-        scores.add_row(label, *(fixed(x, 4) for x in (value.value, value.low, value.high)))
+        scores.add_row(label, *(fixed(x, 4) for x in (value.value, *(value.interval or ()))))
     return scores
 
 

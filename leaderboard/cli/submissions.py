@@ -259,7 +259,12 @@ def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
 def _print_scores(result: Result) -> None:
     for name in SYMBOLS:
         value = getattr(result.scores, name)
-        out().print(f"{LABELS[name]:18s} {value.value:.4f}  ({value.low:.4f} to {value.high:.4f})")
+        ends = f"  ({value.low:.4f} to {value.high:.4f})" if value.interval else ""
+        out().print(f"{LABELS[name]:18s} {value.value:.4f}{ends}")
+    fewest = min(member.runs for member in result.classes)
+    known = result.scores is not None and result.scores.wd_regret.interval is not None
+    kind = "95 % intervals over runs" if known else "no intervals: the spread of one run is unknown"
+    out().print(f"{kind}; fewest runs in a class: n = {fewest}", style="dim")
     if not result.enough_runs:
         out().print("The board will list it without a rank: too few runs in a class.")
     if result.oracle_like:

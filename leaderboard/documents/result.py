@@ -65,11 +65,25 @@ class RunScore(StrictModel):
 
 
 class Estimate(StrictModel):
-    """A score over runs, with its 95 % stratified bootstrap interval."""
+    """A score over runs, with its 95 % stratified bootstrap interval.
+
+    Attributes:
+      low, high: null where each class has a single run, whose spread is unknown.
+    """
 
     value: Real
-    low: Real
-    high: Real
+    low: Real | None = None
+    high: Real | None = None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Both ends; None without an interval."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both ends; without an interval the value itself."""
+        return self.interval or (self.value, self.value)
 
 
 class ClassScore(StrictModel):

@@ -69,7 +69,8 @@ def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
     ]
     scored.sort(key=lambda row: (row[0].value, row[1].sequence))
     ranked = [estimate for estimate, _, reason in scored if not reason]
-    first, last = rank_ranges([each.low for each in ranked], [each.high for each in ranked])
+    ends = np.array([each.ends for each in ranked]).reshape(-1, 2)
+    first, last = rank_ranges(ends[:, 0], ends[:, 1])
     ranges = zip(first.tolist(), last.tolist(), strict=True)
     rows = []
     for _, entry, reason in scored:
@@ -145,6 +146,6 @@ def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> NotRanked:
         return "reference"
     if not entry.enough_runs:
         return "too_few_runs"
-    if metric == "ood_decay" and scores.wd_regret.high > LEARNED:
+    if metric == "ood_decay" and scores.wd_regret.ends[1] > LEARNED:
         return "not_learned"
     return ""

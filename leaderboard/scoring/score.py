@@ -293,9 +293,10 @@ def _scores(by_class: dict[str, list[RunScore]], draws: int, seed: str) -> Score
     # Regret is never negative, so a lower end below 0 carries no information.
     signed = [name in _SIGNED for name in METRICS] + [False] * (len(value) - len(METRICS))
     low = np.where(signed, low, np.maximum(low, 0.0))
+    ends = [(None, None)] * len(value) if np.isnan(low).any() else zip(low, high, strict=True)
     estimates = [
-        Estimate(value=value, low=low, high=high)
-        for value, low, high in zip(value.tolist(), low.tolist(), high.tolist(), strict=True)
+        Estimate(value=theta, low=low, high=high)
+        for theta, (low, high) in zip(value.tolist(), ends, strict=True)
     ]
     return Scores(
         **dict(zip(METRICS, estimates, strict=False)),

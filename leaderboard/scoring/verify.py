@@ -409,6 +409,9 @@ def _rescore(store: Store, id: str) -> None:
 def _close(one: Any, other: Any, tolerance: float) -> bool:
     """Whether two pieces of plain data are equal up to a tolerance of their numbers."""
     match one, other:
+        case {"low": None}, {"low": float(low), "high": float(high), "value": float(value)}:
+            # Earlier versions gave single runs an interval of zero width.
+            return low == high == value and _close(one["value"], value, tolerance)
         case dict(), dict():
             return one.keys() == other.keys() and all(
                 _close(value, other[key], tolerance) for key, value in one.items()

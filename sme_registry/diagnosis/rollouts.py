@@ -19,10 +19,11 @@ from sme_registry.diagnosis.subject import Log
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Mask, Observation
 from sme_registry.evaluation import Policy, references
+from sme_registry.statistics import smoothed
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
-__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "running_median", "training"]
+__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "training"]
 
 CONSTANTS = ("best_constant", "constant_half")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
@@ -167,17 +168,10 @@ def _coverage(values: Array) -> float:
     return float(len(np.unique(bins)) / _COVERAGE_BINS)
 
 
-def running_median(log: Log, window: int) -> tuple[Array, Array]:
-    """`[N − window + 1]` steps at the end of each window of rows, and the median regrets in it."""
-    windows = np.lib.stride_tricks.sliding_window_view(log.regret, window)
-    return log.step[window - 1 :], np.median(windows, axis=1)
-
-
 def training(log: Log, constant_regret: float) -> Training:
     """Summarise a training log of one or more rows, next to the regret of a constant policy."""
     rows = len(log.regret)
-    window = max(1, min(50, rows // 10))
-    steps, median = running_median(log, window)
+    steps, median, window = smoothed(log.step, log.regret)
     improved = np.flatnonzero(median < constant_regret - _MARGIN)
     recent = median[-max(1, len(median) // 3) :]
     best = int(np.argmin(median))

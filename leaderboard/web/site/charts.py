@@ -70,7 +70,7 @@ class Bars:
     """
 
     def __init__(self, estimates: Sequence[Estimate], references: Mapping[str, float]) -> None:
-        ends = (end for each in estimates for end in (each.low, each.high))
+        ends = (end for each in estimates for end in each.ends)
         self._scale = Scale.covering(*ends, *references.values())
         self._references = references
         self._lines = "".join(
@@ -80,7 +80,7 @@ class Bars:
 
     def bar(self, estimate: Estimate) -> Markup:
         """A 95 % interval as a bar with a dot at its value, visible even without width."""
-        low, high, value = map(self._at, (estimate.low, estimate.high, estimate.value))
+        low, high, value = map(self._at, (*estimate.ends, estimate.value))
         return Markup(
             f'<svg class="bar" aria-hidden="true" focusable="false">{self._lines}'
             f'<line class="ci" x1="{low}" x2="{high}" y1="50%" y2="50%"/>'
@@ -143,23 +143,25 @@ def regret_chart(regret: Sequence[Estimate], edges: Edges, name: str) -> Markup:
     """Normalised regret of an entry over the regions, WD first, with intervals."""
     axes = _Axes.covering(regret, edges)
     points = [
-        (f"{axes.x(index):.1f}", *(f"{axes.y(value):.1f}" for value in (e.low, e.value, e.high)))
+        (f"{axes.x(index):.1f}", *(f"{axes.y(y):.1f}" for y in (e.ends[0], e.value, e.ends[1])))
         for index, e in enumerate(regret)
     ]
     band = [f"{x},{high}" for x, _, _, high in points]
     band += [f"{x},{low}" for x, low, _, _ in reversed(points)]
     line = [f"{x},{y}" for x, _, y, _ in points]
+    known = all(e.interval for e in regret)  # not where each class has a single run
     marks = "".join(
-        f'<path class="whisker" d="M{x} {low}V{high}m-5 0h10M{x} {low}m-5 0h10"/>'
-        f'<circle class="dot" cx="{x}" cy="{y}" r="4.5"/>'
+        (f'<path class="whisker" d="M{x} {low}V{high}m-5 0h10M{x} {low}m-5 0h10"/>' * known)
+        + f'<circle class="dot" cx="{x}" cy="{y}" r="4.5"/>'
         for x, low, y, high in points
     )
     curve = (
-        f'<polygon class="band" points="{" ".join(band)}"/>'
-        f'<polyline class="line" points="{" ".join(line)}"/>{marks}'
+        f'<polygon class="band" points="{" ".join(band)}"/>' * known
+        + f'<polyline class="line" points="{" ".join(line)}"/>{marks}'
     )
     values = "; ".join(
-        f"{label}: {number(e.value)}, from {number(e.low)} to {number(e.high)}"
+        f"{label}: {number(e.value)}"
+        + (f", from {number(e.ends[0])} to {number(e.ends[1])}" if e.interval else "")
         for label, e in zip(region_labels(edges), regret, strict=True)
     )
     title = f"Normalised regret of {name} by region"
@@ -180,7 +182,7 @@ class _Axes:
 
     @classmethod
     def covering(cls, regret: Sequence[Estimate], edges: Edges) -> _Axes:
-        scale = Scale.covering(0.0, 1.0, *(e.low for e in regret), *(e.high for e in regret))
+        scale = Scale.covering(0.0, 1.0, *(end for e in regret for end in e.ends))
         return cls(scale, tuple(region_labels(edges)))
 
     @property

@@ -188,8 +188,9 @@ class Pages:
     def data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
 
-        def rounded(estimate: Estimate) -> list[float]:
-            return [round(x, 5) + 0.0 for x in (estimate.value, estimate.low, estimate.high)]
+        def rounded(estimate: Estimate) -> list[float | None]:
+            ends = estimate.interval or (None, None)
+            return [x if x is None else round(x, 5) + 0.0 for x in (estimate.value, *ends)]
 
         data = {
             "regions": charts.region_labels(self.document.protocol.edges),

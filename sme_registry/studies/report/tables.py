@@ -98,8 +98,6 @@ class Bootstrap:
         self, values: Array, *place: str, statistic: Statistic = statistics.iqm
     ) -> tuple[float, float]:
         """The interval of a statistic of `[n]` runs; NaN for a single run."""
-        if len(values) < 2:
-            return math.nan, math.nan
         column, seed = {"": np.asarray(values)[:, None]}, self.seed(*place)
         low, high = statistics.stratified_bootstrap(column, self.draws, seed, statistic)
         return float(low[0]), float(high[0])
@@ -285,7 +283,9 @@ def profiles(
             fewest = min(map(len, classes.values()))
             seed = bootstrap.seed("profile", algorithm, metric)
             shares = statistics.performance_profile(classes, THRESHOLDS, bootstrap.draws, seed)
-            shares_at = zip(THRESHOLDS.round(4), shares.value, shares.low, shares.high, strict=True)
+            known = 1.0 if fewest > 1 else math.nan  # whether the spread of each class is known
+            ends = known * shares.low, known * shares.high
+            shares_at = zip(THRESHOLDS.round(4), shares.value, *ends, strict=True)
             rows += [(group, metric, algorithm, fewest, *at) for at in shares_at]
     columns = "fewest_runs:int64 threshold share low high"
     return frame(rows, f"group:str metric:str algorithm:str {columns}")
@@ -312,7 +312,7 @@ def improvements(
 
 
 def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    """Median and quartiles over runs, then the mean over a window of evaluations."""
+    """Median and quartiles over runs, then the running median over a window of evaluations."""
     horizons = runs.groupby("class_name").horizon.first()
     columns = f"{_PLACE} measure:str step:int64 median q25 q75 runs:int64 window:int64"
     tables = [frame([], columns)]
@@ -325,7 +325,7 @@ def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
             if measure == "episode_return":
                 values *= 100.0 / horizons[class_name]
             quartiles = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-            q25, median, q75 = (_smoothed(line, window(P)) for line in quartiles)
+            q25, median, q75 = (statistics.running_median(line, window(P)) for line in quartiles)
             table = {
                 "class_name": class_name, "algorithm": algorithm, "measure": measure, "step": steps,
                 "median": median, "q25": q25, "q75": q75, "runs": len(each), "window": window(P),
@@ -372,11 +372,3 @@ def _compared(
 
 def _iqm(values: Any) -> float:
     return float(statistics.iqm(values))
-
-
-def _smoothed(line: Array, width: int) -> Array:
-    """Means over the last `width` entries, fewer at the beginning."""
-    total = np.concatenate([[0.0], np.cumsum(line)])
-    ends = np.arange(1, len(line) + 1)
-    begins = np.maximum(0, ends - width)
-    return np.asarray((total[ends] - total[begins]) / (ends - begins))

@@ -246,6 +246,21 @@ def test_no_interval_of_a_regret_reaches_below_zero() -> None:
     assert result.scores.ood_decay.low < 0.0  # a difference may be negative
 
 
+def test_single_runs_have_no_interval() -> None:
+    runs = [
+        each.model_copy(update={"class_name": name})
+        for name, each in zip(("shallow", "deep"), score(None, None, None).runs, strict=False)
+    ]
+    result = result_of(BOARD, "sha256:" + "0" * 64, runs, {})
+    assert result.scores is not None
+    for name in METRICS:
+        assert getattr(result.scores, name).to_dict() | {"value": 0} == {
+            "value": 0, "low": None, "high": None
+        }  # fmt: skip
+        assert getattr(result.scores, name).ends == (getattr(result.scores, name).value,) * 2
+    assert Result.from_dict(result.to_dict()) == result
+
+
 def test_ranking_needs_enough_runs_in_each_class() -> None:
     assert not score(None, None, None).enough_runs
     assert score(None, None, None, runs_started={"deep": 2}).enough_runs

@@ -189,10 +189,9 @@ function drawCurves(svg, chosen, label) {
     curve.append(make("polyline", { class: "line", points: points.join(" ") }));
     entry.normalised_regret.forEach(([value, low, high], region) => {
       const at = x(region);
-      curve.append(
-        make("path", { class: "whisker", d: `M${at} ${y(low)}V${y(high)}M${at - 3} ${y(low)}h6M${at - 3} ${y(high)}h6` }),
-        mark(series, at, y(value)),
-      );
+      const ends = `M${at} ${y(low)}V${y(high)}M${at - 3} ${y(low)}h6M${at - 3} ${y(high)}h6`;
+      if (low !== null) curve.append(make("path", { class: "whisker", d: ends }));
+      curve.append(mark(series, at, y(value)));
     });
     svg.append(curve);
   });
@@ -206,11 +205,14 @@ function table(chosen, regions, metrics) {
   const row = (name, estimates, digits) => {
     const [base] = estimates;
     const cells = estimates.map(([value, low, high], index) => {
-      const range = make("span", {}, `${formatted(low, digits)} to ${formatted(high, digits)}`);
+      // An entry with a single run in each class has no interval: its ends are null.
+      const known = low !== null;
+      const text = known ? `${formatted(low, digits)} to ${formatted(high, digits)}` : "no interval";
+      const range = make("span", {}, text);
       const cell = make("td", { class: "n estimate" }, make("strong", {}, formatted(value, digits)), range);
       if (index > 0) {
         const difference = value - base[0];
-        const apart = low > base[2] || high < base[1];
+        const apart = known && base[1] !== null && (low > base[2] || high < base[1]);
         const sign = Number(difference.toFixed(digits)) > 0 ? "+" : "";
         const kind = apart ? "diff apart" : "diff";
         cell.append(make("span", { class: kind }, `Δ ${sign}${formatted(difference, digits)}`));
