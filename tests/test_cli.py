@@ -535,7 +535,10 @@ class TestEvaluate:
     ) -> None:
         good("evaluate", "constant", "Plane1", *QUICK, "--out", "ev")
         names = sorted(path.name for path in (tmp_path / "ev").iterdir())
-        assert names == ["decay_curve.png", "evaluation.json", "similarity_map.png"]
+        assert names == [
+            "decay_curve.pdf", "decay_curve.png", "evaluation.json", "similarity_map.pdf",
+            "similarity_map.png",
+        ]  # fmt: skip
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"
         assert "--force" in refused("evaluate", "random", "Plane1", *QUICK, "--out", "ev")
         assert EvaluationReport.read(tmp_path / "ev/evaluation.json").policy == "constant"

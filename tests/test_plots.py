@@ -13,6 +13,9 @@ from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
 pytest.importorskip("matplotlib")
 
 from sme_registry import plots
+from sme_registry.plots.style import COLOURS, FORMATS, MARKERS
+from sme_registry.statistics import smoothed
+from tests.geometry import assert_readable
 
 PLANE = SMESpec(state_dim=2, action_dim=2)
 PROTOCOL = {"states_per_region": 100, "epsilons": [0.5, 1.0]}
@@ -31,28 +34,28 @@ def report():
 EPISODES = [{"step": 100 * (i + 1), "regret": 1.0 - i / 50} for i in range(50)]
 
 
-@pytest.mark.parametrize("ending", plots.FORMATS)
+@pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("kind", ["decay_curve", "similarity_map", "training_curve"])
 def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind):
     path = tmp_path / "new" / f"figure.{ending}"
-    written = {
+    figure = {
         "decay_curve": lambda: plots.decay_curve(report, path),
         "similarity_map": lambda: plots.similarity_map(half, PLANE, path, resolution=20),
         "training_curve": lambda: plots.training_curve(EPISODES, path),
     }[kind]()
-    assert written == path
+    assert figure.axes
     assert path.read_bytes().startswith(SIGNATURES[ending])
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_56_lines_differ_in_colour_or_marker_and_ten_in_marker():
-    colours, markers = plots.COLOURS, plots.MARKERS
+    colours, markers = COLOURS, MARKERS
     looks = {(colours[i % len(colours)], markers[i % len(markers)]) for i in range(56)}
     assert len(looks) == 56
     assert len(set(markers)) == len(markers) >= 10
 
 
-@pytest.mark.parametrize("ending", plots.FORMATS)
+@pytest.mark.parametrize("ending", FORMATS)
 def test_the_same_figure_is_the_same_file(tmp_path, report, ending):
     first, second = tmp_path / f"1.{ending}", tmp_path / f"2.{ending}"
     plots.decay_curve(report, first)
@@ -106,7 +109,7 @@ def test_figures_name_their_task(tmp_path, report, figures):
     plots.decay_curve(report, tmp_path / "decay.png")
     plots.similarity_map(half, "Plane1", tmp_path / "map.png", resolution=4)
     assert figures[0].get_suptitle() == f"SME/{report.spec.content_name}"
-    assert "half on SME/Plane1-v1, L = 1" in figures[1].axes[0].get_title()
+    assert "half on SME/Plane1-v1, L = 1" in figures[1].get_suptitle()
     other = evaluate(half, PLANE.derive(seed=1), PROTOCOL)
     plots.decay_curve([report, other], tmp_path / "two.png")
     assert figures[2].get_suptitle() == ""
@@ -231,15 +234,37 @@ def test_training_curve_reads_a_csv_and_ignores_an_incomplete_row(tmp_path, figu
     assert np.array_equal(cloud, expected)
 
 
-def test_training_curve_is_the_running_median(tmp_path, figures):
+def test_training_curve_is_the_median_of_the_last_episodes(figures):
     rng = np.random.default_rng(0)
     rows = [{"step": i, "regret": r} for i, r in enumerate(rng.random(30), start=1)]
-    plots.training_curve(rows, tmp_path / "figure.png", window=5)
+    axes = plots.training_curve(rows, window=5).axes[0]
     regret = np.array([row["regret"] for row in rows])
-    line = figures[0].axes[0].lines[0]
-    medians = [np.median(regret[max(0, i - 2) : i + 3]) for i in range(30)]
-    assert np.array_equal(line.get_ydata(), medians)
-    assert np.array_equal(line.get_xdata(), np.arange(1, 31))
+    line = axes.lines[0]
+    assert np.array_equal(line.get_ydata(), [np.median(regret[i - 5 : i]) for i in range(5, 31)])
+    assert np.array_equal(line.get_xdata(), np.arange(5, 31))
+    assert not figures  # nothing was written
+
+
+def test_the_episodes_of_parallel_lanes_give_one_increasing_line():
+    rng = np.random.default_rng(0)
+    lengths = rng.integers(20, 100, size=(8, 30))
+    step = 8 * np.cumsum(lengths, axis=1).ravel()  # lane after lane, so out of order
+    regret = rng.random(step.size)
+    x, y, window = smoothed(step, regret)
+    assert window == 24
+    assert np.all(np.diff(x) > 0)
+    order = np.argsort(step, kind="stable")
+    for at, median in zip(x[::7], y[::7], strict=True):
+        ended = regret[order][: np.sum(step <= at)]
+        assert median == np.median(ended[-window:])
+    axes = plots.training_curve({"step": step, "regret": regret}).axes[0]
+    assert np.all(np.diff(axes.lines[0].get_xdata()) > 0)
+
+
+def test_the_window_holds_all_episodes_that_end_at_one_step():
+    step = np.repeat([100, 200, 300], 64)
+    x, _, window = smoothed(step, np.arange(192.0))
+    assert (window, x.tolist()) == (64, [100, 200, 300])
 
 
 @pytest.mark.parametrize(
@@ -258,3 +283,164 @@ def test_training_curve_rejects_invalid_logs(tmp_path, content, message):
         path.write_text(content)
     with pytest.raises(OptionError, match=message):
         plots.training_curve(path, tmp_path / "figure.png")
+
+
+def test_learning_curve_is_the_median_and_the_quartiles_over_runs():
+    step = np.arange(1, 101)
+    runs = {"A": [{"step": step, "regret": np.full(100, level)} for level in (0.1, 0.2, 0.6)]}
+    axes = plots.learning_curve({**runs, "B": [{"step": step, "regret": step / 100}]}).axes[0]
+    lines = {line.get_label(): line for line in axes.lines}
+    assert list(lines) == ["A (n = 3)", "B", "optimal"]
+    assert set(lines["A (n = 3)"].get_ydata()) == {0.2}
+    (band,) = axes.collections  # none of a single run
+    assert np.allclose(
+        sorted(set(band.get_paths()[0].vertices[:, 1].round(6))), [0.15, 0.4], atol=1e-6
+    )
+
+
+def test_learning_curve_of_a_table_is_that_of_its_runs():
+    pandas = pytest.importorskip("pandas")
+    rng = np.random.default_rng(0)
+    runs = {m: [{"step": np.arange(40), "regret": rng.random(40)} for _ in "ab"] for m in "XY"}
+    table = pandas.concat(
+        pandas.DataFrame(run).assign(method=method, seed=seed)
+        for method, each in runs.items()
+        for seed, run in enumerate(each)
+    )
+    one, other = (plots.learning_curve(x, window=4).axes[0].lines for x in (runs, table))
+    for left, right in zip(one, other, strict=True):
+        assert left.get_label() == right.get_label()
+        assert np.array_equal(left.get_data(), right.get_data())
+
+
+def test_learning_curve_reads_the_folders_of_runs(tmp_path):
+    (tmp_path / "episodes.csv").write_text("step,regret\n10,0.5\n20,0.25\n")
+    line = plots.learning_curve({"TD3": [tmp_path, tmp_path / "episodes.csv"]}).axes[0].lines[0]
+    assert (line.get_ydata()[0], line.get_ydata()[-1]) == (0.5, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ({}, "one or more runs"),
+        ({"A": []}, "one or more runs"),
+        ({"regret": [1.0]}, "columns step and regret"),
+        ({"regret": [1.0, 2.0], "step": [1]}, "columns step and regret of equal length"),
+        ({"A": [EPISODES[:5], EPISODES[40:]]}, "share no steps"),
+    ],
+)
+def test_learning_curve_rejects_invalid_runs(runs, message):
+    with pytest.raises(OptionError, match=message):
+        plots.learning_curve(runs)
+
+
+def test_decay_curve_of_methods_is_the_iqm_over_their_runs(report):
+    other = evaluate(lambda o: np.full((len(o), 2), 0.4), PLANE.derive(seed=1), PROTOCOL)
+    axes = plots.decay_curve({"A": [report, other], "B": [report]}, measures=["similarity"]).axes[0]
+    runs = np.array([[region.similarity for region in each.regions] for each in (report, other)])
+    lines = {line.get_label(): np.array(line.get_ydata()) for line in axes.lines}
+    assert np.allclose(lines["A (n = 2)"], runs.mean(axis=0))
+    assert np.array_equal(lines["B"], runs[0])
+    assert len(axes.collections) == 1
+    linear = [each.references["linear_least_squares"] for each in (report, other)]
+    assert np.allclose(
+        lines["linear (LSQ)"], np.mean([[r.similarity for r in one] for one in linear], axis=0)
+    )
+
+
+def test_decay_curve_of_methods_rejects_runs_of_different_protocols(report):
+    other = evaluate(half, PLANE, {"states_per_region": 100, "epsilons": [0.3]})
+    with pytest.raises(OptionError, match="different regions"):
+        plots.decay_curve({"A": [report, other]})
+
+
+def test_references_that_coincide_are_one_line_with_both_names():
+    report = evaluate(half, PLANE, {"states_per_region": 40_000, "epsilons": [0.5]})
+    for axes in plots.decay_curve(report).axes:
+        drawn = {line.get_label(): line for line in axes.lines if line.get_visible()}
+        assert "best constant = constant ½" in drawn
+        assert not {"best constant", "constant ½"} & set(drawn)
+    apart = report.model_copy(update={"references": dict(report.references)})
+    worse = [
+        region.model_copy(update={"similarity": region.similarity - 0.1})
+        for region in report.references["best_constant"]
+    ]
+    apart.references["best_constant"] = tuple(worse)
+    labels = {line.get_label() for line in plots.decay_curve(apart).axes[0].lines}
+    assert {"best constant", "constant ½"} <= labels
+
+
+def test_figures_are_drawn_in_the_callers_axes_and_leave_their_legend_to_the_caller(report):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    panels = figure.subplots(2, 2)
+    assert plots.decay_curve(report, ax=panels[0]) is figure
+    assert plots.training_curve(EPISODES, ax=panels[1, 0]) is figure
+    assert plots.learning_curve({"A": [EPISODES]}, ax=panels[1, 1]) is figure
+    assert all(axes.lines and axes.get_legend() is None for axes in panels.flat)
+    assert not figure.legends
+    with pytest.raises(OptionError, match="ax: 1 axes for 2 panels"):
+        plots.decay_curve(report, ax=panels[0, 0])
+
+
+def test_save_figure_writes_every_format_beside_the_others_without_type_3_fonts(tmp_path, report):
+    written = plots.save_figure(plots.decay_curve(report), tmp_path / "a.b", FORMATS)
+    assert [path.name for path in written] == ["a.b.png", "a.b.pdf", "a.b.svg"]
+    pdf = written[1].read_bytes()
+    assert b"/Type3" not in pdf
+    assert b"TrueType" in pdf or b"CIDFontType2" in pdf
+    with pytest.raises(OptionError, match="must end in"):
+        plots.save_figure(plots.decay_curve(report), tmp_path / "c", ["jpg"])
+
+
+LONG = [f"a method with a long name and settings (learning_rate = 0.000{i})" for i in range(1, 9)]
+
+
+def test_eight_methods_with_long_names_leave_every_figure_readable(report):
+    named = [report.model_copy(update={"policy": name}) for name in LONG]
+    tasks = [evaluate(half, PLANE.derive(seed=i), PROTOCOL, name=LONG[i]) for i in range(2)]
+    runs = {name: [EPISODES, EPISODES] for name in LONG}
+    for figure in (
+        plots.decay_curve(named),
+        plots.decay_curve({name: [report, report] for name in LONG[:7]}),
+        plots.decay_curve(named, measures=["similarity"]),
+        plots.decay_curve(tasks),
+        plots.learning_curve(runs, title=LONG[0]),
+        plots.training_curve(EPISODES, title=LONG[0]),
+        plots.similarity_map(half, PLANE, resolution=4, name=LONG[0][:30]),
+    ):
+        assert_readable(figure)
+
+
+def test_panels_keep_their_height_however_long_the_legend_is(report):
+    heights = []
+    for count in (1, 8):
+        figure = plots.learning_curve({name: [EPISODES] for name in LONG[:count]})
+        figure.canvas.draw()
+        heights.append(figure.axes[0].bbox.height)
+    assert heights[1] == pytest.approx(heights[0], rel=0.1)
+
+
+def test_an_unreadable_figure_is_noticed():
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.add_subplot().plot([0, 1], [0, 1], label="covering")
+    figure.axes[0].legend()
+    with pytest.raises(AssertionError, match="covers a panel"):
+        assert_readable(figure)
+
+
+def test_colours_of_a_map_cover_its_similarities_and_the_scale_says_so():
+    from sme_registry.plots.maps import colour_scale
+
+    assert colour_scale([0.713, np.nan, 0.76]) == pytest.approx((0.70, 0.80))
+    assert colour_scale([0.9, 0.95]) == pytest.approx((0.9, 0.95))
+    assert colour_scale([1.0, 1.0]) == pytest.approx((0.95, 1.0))
+    figure = plots.similarity_map(half, PLANE, resolution=16)
+    image = figure.axes[0].images[0]
+    low, high = image.get_clim()
+    assert low <= image.get_array().min() < low + 0.05
+    assert high - 0.05 < image.get_array().max() <= high
+    assert f"colours from {low:.2f} to {high:.2f}" in figure.axes[1].get_ylabel()

@@ -155,7 +155,8 @@ def _write(result: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
         from sme_registry.diagnosis.figures import draw
 
         figures = draw(result, folder, subject.log)
-    page = write_atomically(folder / _PAGE, markdown(result, [path.name for path in figures]))
+    shown = [path.name for path in figures if path.suffix == ".png"]
+    page = write_atomically(folder / _PAGE, markdown(result, shown))
     # Last, so that the other files exist once it does.
     data = write_atomically(folder / _JSON, to_json(result.to_dict()))
     return [*figures, page, data]

@@ -94,14 +94,6 @@ def evaluate(
 def _figures(report: Any, policy: Any, target: Path) -> list[Path]:
     if not can_draw():
         return []
-    from sme_registry import plots
+    from sme_registry.plots.files import write_evaluation
 
-    figures = [plots.decay_curve(report, target.with_name("decay_curve.png"))]
-    if report.spec.state_dim == 2 and report.spec.team is None:
-        path, action_range = target.with_name("similarity_map.png"), report.action_range
-        figures.append(
-            plots.similarity_map(
-                policy, report.spec, path, action_range=action_range, name=report.policy
-            )
-        )
-    return figures
+    return write_evaluation(report, target.parent, policy)

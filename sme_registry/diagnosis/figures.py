@@ -11,18 +11,22 @@ import numpy as np
 
 from sme_registry.diagnosis.document import POLICY, Diagnosis, Measurements
 from sme_registry.diagnosis.render import title
-from sme_registry.diagnosis.rollouts import running_median
 from sme_registry.diagnosis.subject import Log
 from sme_registry.evaluation.report import LABELS
-from sme_registry.io import write_atomically
-from sme_registry.plots import (
+from sme_registry.plots.curves import draw_training
+from sme_registry.plots.style import (
     COLOURS,
     GREY,
-    MARKERS,
-    REFERENCE_DASHES,
-    draw_training,
-    drawing,
-    literal,
+    WRITTEN,
+    draw_reference,
+    entitle,
+    legend_above,
+    legend_below,
+    look,
+    merge_coincident,
+    new_figure,
+    save_figure,
+    styled,
 )
 
 if TYPE_CHECKING:
@@ -35,7 +39,7 @@ _MAX_CHANNELS = 32
 
 
 def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Path, ...]:
-    """Write the figures into a folder; the one of the training only where there is a log.
+    """Write the figures into a folder, as PNG and PDF; the training's only where there is a log.
 
     Raises:
       MissingDependencyError: Matplotlib is not installed.
@@ -51,30 +55,29 @@ def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Pa
         figures["training"] = partial(_training, log=log)
     written = []
     for name, fill in figures.items():
-        with drawing((8.2, 3.4), ("png",)) as (figure, files):
-            figure.suptitle(literal(title(diagnosis)), fontsize=10)
+        with styled():
+            figure = new_figure((8.2, 4.0))
+            entitle(figure, title(diagnosis))
             fill(figure, diagnosis.measurements)
-        written.append(write_atomically(folder / f"{name}.png", files["png"]))
+        written += save_figure(figure, folder / name, WRITTEN)
     return tuple(written)
 
 
 def _line(axes: Axes, x: Any, y: Any, index: int, label: str) -> None:
-    axes.plot(
-        x, y, color=COLOURS[index], marker=MARKERS[index], markersize=4.5, linewidth=2, label=label
-    )
+    axes.plot(x, y, **look(index), markersize=4.5, linewidth=2, label=label)
 
 
 def _reference(axes: Axes, value: float, name: str) -> None:
-    axes.axhline(
-        value, color=GREY, linewidth=1.1, linestyle=REFERENCE_DASHES[name], label=LABELS[name]
-    )
+    draw_reference(axes, name, None, value, LABELS[name])
 
 
-def _legend(axes: Axes, *, from_zero: bool = True, **options: Any) -> None:
-    """A legend in free space above what is drawn."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(min(0.0, low) if from_zero else low, high * 1.45)
-    axes.legend(loc="upper left", fontsize=8, **options)
+def _legends(*panels: Axes, ncols: int = 1) -> None:
+    """A legend above each panel, after its limits."""
+    for axes in panels:
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(0.0, low), high)
+        merge_coincident([axes])
+        legend_above(axes, ncols=ncols)
 
 
 def _channels(figure: Figure, measured: Measurements) -> None:
@@ -101,7 +104,7 @@ def _channels(figure: Figure, measured: Measurements) -> None:
     for axes in (left, right):
         axes.set_xlabel("action channel" + (f" (the first {_MAX_CHANNELS})" if cut else ""))
         axes.set_xticks(x[:: max(1, len(x) // 8)])
-        _legend(axes, from_zero=False)
+    _legends(left, right)
 
 
 def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
@@ -118,9 +121,9 @@ def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
         _line(middle, 1 + np.arange(len(part.mae)), part.mae, index, names[index])
     left.set_xticks(range(len(names)), short_names)
     left.set_ylim(0.0, max(0.12, left.get_ylim()[1]))
-    left.axhline(threshold, color=GREY, linewidth=1.1)
+    left.axhline(threshold, color=GREY, linewidth=1.1, label=f"stands out above {threshold:.0%}")
     left.set_ylabel("share of the error's\nvariance explained")
-    left.set_xlabel("line: threshold")
+    left.set_xlabel("quantity that explains it")
     _reference(middle, measured.uniform[_LINEAR].mae, _LINEAR)
     middle.set_xticks(1 + np.arange(len(centre.mae)))
     middle.set_xlabel("fifth of the states, by quantity")
@@ -131,15 +134,11 @@ def _states(figure: Figure, measured: Measurements, threshold: float) -> None:
         if name == POLICY:
             _line(right, levels, values, 0, "this policy")
         else:
-            dash = REFERENCE_DASHES[name]
-            right.plot(
-                levels, values, color=GREY, linewidth=1.1, linestyle=dash, label=LABELS[name]
-            )
+            draw_reference(right, name, levels, values, LABELS[name])
     right.set_xticks(levels, ["WD", *(f"{level:g}" for level in levels[1:])])
     right.set_xlabel("expansion level ε of the shell")
     right.set_ylabel("normalised regret")
-    for axes in (middle, right):
-        _legend(axes)
+    _legends(left, middle, right)
 
 
 def _time(figure: Figure, measured: Measurements) -> None:
@@ -158,9 +157,8 @@ def _time(figure: Figure, measured: Measurements) -> None:
     _line(right, time.inputs, time.action_change, 1, "change of a")
     _reference(right, measured.uniform[_LINEAR].normalised_regret, _LINEAR)
     right.set_xlabel("input t/T, in fixed states")
-    right.set_ylabel("normalised regret; mean |change of a|")
-    for axes in (left, right):
-        _legend(axes, ncols=2, columnspacing=1.2, handlelength=1.8)
+    right.set_ylabel("normalised regret;\nmean |change of a|")
+    _legends(left, right)
 
 
 def _squared_error(figure: Figure, measured: Measurements) -> None:
@@ -193,20 +191,18 @@ def _squared_error(figure: Figure, measured: Measurements) -> None:
             start += share
     right.set_yticks((0, 1), ("this policy", "random\nactions"))
     right.set_xlim(0.0, 1.0)
-    right.set_ylim(2.4, -0.6)
+    right.set_ylim(1.6, -0.6)
     right.set_xlabel("share of steps")
-    right.legend(loc="lower center", ncols=3, fontsize=7, columnspacing=1.0, handlelength=1.4)
+    legend_above(right, ncols=3, columnspacing=1.0, handlelength=1.4)
     for axes in (left, right):
         axes.grid(visible=False, axis="y")
 
 
 def _training(figure: Figure, measured: Measurements, log: Log) -> None:
-    axes = draw_training(figure, log.step, log.regret, f"one of the {log.source}")
+    axes = figure.add_subplot()
+    draw_training(axes, log.step, log.regret, each=log.source.removesuffix("s"))
     training, episodes = measured.training, measured.on_policy
     assert training is not None  # there is a log
-    steps, median = running_median(log, training.window)
-    label = f"median of {training.window}"
-    axes.plot(steps, median, color=COLOURS[0], linewidth=2.2, label=label)
     for name in _REFERENCES[:3]:
         _reference(axes, episodes.scores[name].regret, name)
     regret = episodes.scores[POLICY].regret
@@ -219,4 +215,5 @@ def _training(figure: Figure, measured: Measurements, log: Log) -> None:
             xytext=(-4 if late else 4, 0), textcoords="offset points", fontsize=8,
             ha="right" if late else "left",
         )  # fmt: skip
-    figure.legend(loc="outside right center")
+    merge_coincident([axes])
+    legend_below(figure, axes.get_legend_handles_labels()[0])

@@ -6,7 +6,7 @@ exact mean r̃ of the data set. The final policy is evaluated in and out of dist
 The folder of an offline training:
     offline.json      the record, with all evaluations
     policy.npz        the policy, for `OfflinePolicy.load` and `sme evaluate`
-    evaluation.json   its final evaluation; decay_curve.png if matplotlib is installed
+    evaluation.json   its final evaluation; decay_curve.png, .pdf if matplotlib is installed
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import (
     claim_folder,
     integer_in,
+    is_installed,
     require_packages,
     to_json,
     versions,
@@ -33,14 +34,15 @@ from sme_registry.io import (
 from sme_registry.offline.hyperparameters import ALGORITHMS, resolve_hyperparameters
 from sme_registry.offline.record import Evaluation, OfflineRecord
 from sme_registry.offline.source import data_source
+from sme_registry.plots import files as plot_files
 from sme_registry.spec import ProtocolLike, SpecLike
 from sme_registry.training import known_algorithm
 from sme_registry.training.record import PACKAGES
-from sme_registry.training.run import DECAY_CURVE, EVALUATION, write_evaluation
+from sme_registry.training.run import EVALUATION
 
 RECORD = "offline.json"
 POLICY = "policy.npz"
-_FILES = (RECORD, POLICY, EVALUATION, DECAY_CURVE)
+_FILES = (RECORD, POLICY, EVALUATION, *plot_files.FILES)
 _ABOUT = ("algorithm", "seed", "steps", "dataset_digest", "spec_digest")  # in the policy's file
 
 EPISODES = 10  # METHOD, section 4
@@ -168,7 +170,9 @@ def train_offline(
     if target is not None:
         (target / RECORD).unlink(missing_ok=True)
         policy.save(target / POLICY)
-        write_evaluation(report, target)
+        report.write(target / EVALUATION)
+        if is_installed("matplotlib"):
+            plot_files.write_evaluation(report, target)
         # Last, so that a folder with a record is complete.
         write_atomically(target / RECORD, to_json(record.to_dict()))
     return OfflineResult(policy, record, report, target)

@@ -7,7 +7,7 @@ The folder of a run, which `resume` continues after an interruption:
     model.zip         the trained model
     model/            instead: one model for each agent of a team, `<agent>.zip`
     evaluation.json   its evaluation
-    *.png             figures, if matplotlib is installed
+    *.png, *.pdf      figures, if matplotlib is installed
     tensorboard/      if TensorBoard is installed
 """
 
@@ -25,6 +25,7 @@ from rich.console import Console
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.io import choice, claim_folder, integer_in, is_installed
+from sme_registry.plots import files as plot_files
 from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.progress import Progress
@@ -44,13 +45,10 @@ from sme_registry.training.hyperparameters import for_lanes, nested_hyperparamet
 from sme_registry.training.record import MODEL, MODELS, RECORD, TENSORBOARD, RunRecord, versions_for
 
 EVALUATION = "evaluation.json"
-DECAY_CURVE = "decay_curve.png"
-TRAINING_CURVE = "training_curve.png"
-SIMILARITY_MAP = "similarity_map.png"
 REPORT = "report.md"  # written by `sme demo`
 _FILES = (
     RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, EVALUATION,
-    TRAINING_CURVE, DECAY_CURVE, SIMILARITY_MAP, REPORT, TENSORBOARD,
+    *plot_files.FILES, REPORT, TENSORBOARD,
 )  # fmt: skip
 
 MAX_STEPS = 10**10
@@ -276,25 +274,11 @@ def _evaluate(
             name=f"{'independent ' * record.independent}{short_name(record.algorithm)}",
             progress=lambda done, total: bar.update(done),
         )
-    figures = write_evaluation(report, folder)
+    report.write(folder / EVALUATION)
+    figures: list[Path] = []
     if is_installed("matplotlib"):
-        from sme_registry import plots
-
-        log = folder / episode_files.FILE
         if record.episodes:
             title = f"{report.policy} on {report.title}"
-            figures.insert(0, plots.training_curve(log, folder / TRAINING_CURVE, title=title))
-        if report.spec.state_dim == 2 and report.spec.team is None:
-            path = folder / SIMILARITY_MAP
-            figures.append(plots.similarity_map(model, report.spec, path, name=report.policy))
+            figures += plot_files.write_training(folder / episode_files.FILE, folder, title)
+        figures += plot_files.write_evaluation(report, folder, model)
     return report, tuple(figures)
-
-
-def write_evaluation(report: EvaluationReport, folder: Path) -> list[Path]:
-    """Write a report, and its decay curve if matplotlib is installed; returns the figures."""
-    report.write(folder / EVALUATION)
-    if not is_installed("matplotlib"):
-        return []
-    from sme_registry import plots
-
-    return [plots.decay_curve(report, folder / DECAY_CURVE)]

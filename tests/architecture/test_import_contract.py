@@ -51,7 +51,7 @@ def test_the_import_contract_holds() -> None:
         ("compiled/engine.py", "import numba"),
         ("envs/single.py", "import pygame"),
         ("evaluation/references.py", "def _late():\n    import torch"),
-        ("plots.py", "import stable_baselines3"),
+        ("plots/style.py", "import stable_baselines3"),
         ("evaluation/policies/policy.py", "def _late():\n    import onnxruntime"),
         ("evaluation/evaluate.py", "def _late():\n    import pandas"),
         ("studies/engine/runner.py", "import pandas"),

@@ -95,7 +95,9 @@ def test_a_team_is_evaluated_by_the_policy_its_agents_share(team_run: TrainingRe
     assert list(report.agents) == ["agent_0", "agent_1"]
     again = evaluate(team_run.model_path, TEAM, PROTOCOL, name="PPO")
     assert (again.regions, again.agents) == (report.regions, report.agents)
-    assert {path.name for path in team_run.figures} == {"training_curve.png", "decay_curve.png"}
+    assert {path.name for path in team_run.figures} == {
+        "training_curve.png", "training_curve.pdf", "decay_curve.png", "decay_curve.pdf",
+    }  # fmt: skip
 
 
 def test_training_lowers_the_regret_of_each_agent(tmp_path: Path) -> None:

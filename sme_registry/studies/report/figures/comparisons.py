@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from sme_registry.evaluation.report import NOT_COMPARABLE
-from sme_registry.plots import GREY, drawing, literal
+from sme_registry.plots.style import GREY, drawing, legend_below, literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
@@ -24,6 +24,8 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
         place = class_places(analysis, set(rows.class_name))
         height = 1.15 + (0.07 * len(looks) + 0.09) * max(5.0, max(place.values()) + 1)
         with panels.panel_grid(len(metrics), formats, (0.0, height)) as grid:
+            if name == "regret":  # WD and OOD, of one unit and size
+                grid.panels[1].sharex(grid.panels[0])
             for axes, metric in zip(grid.panels, metrics, strict=True):
                 selected = rows[rows.metric == metric.key]
                 at, enough = selected.class_name.map(place), selected.enough_pairs
@@ -54,7 +56,7 @@ def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pict
     place = _places(rows.group)
     looks = panels.looks(analysis)
     height = 1.1 + (0.09 * len(looks) + 0.1) * max(2, len(place))
-    with panels.panel_grid(2, formats, (0.0, height)) as grid:
+    with panels.panel_grid(2, formats, (0.0, height), share_x=True) as grid:
         for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
             selected = rows[rows.metric == metric]
             at, enough = selected.group.map(place), selected.fewest_runs >= ENOUGH_RUNS
@@ -115,7 +117,7 @@ def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture:
         axes.axhline(0.0, color=GREY, linewidth=1.0)
         axes.set_xlabel("similarity r̃ within distribution")
         axes.set_ylabel(f"points of r̃ lost in the shell up to ε = {outside.epsilon_high.max():g}")
-        figure.legend(loc="outside right center")
+        legend_below(figure, axes.get_legend_handles_labels()[0])
     dims = sorted(set(inside.state_dim))
     caption = (
         "One mark a run: its similarity in the unit cube, and the hundredths of r̃ that it loses in "

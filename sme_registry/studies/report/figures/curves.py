@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.evaluation.report import NOT_COMPARABLE
-from sme_registry.plots import GREY, literal, shades
+from sme_registry.plots.style import GREY, literal, shades
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import SEVERAL, Group, axis_values, setting_label
 from sme_registry.studies.report.figures import panels

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from sme_registry.plots import literal
+from sme_registry.plots.style import literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
@@ -30,7 +30,7 @@ def draw_differences(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pic
     if ALL in set(rows.class_name):
         place[ALL] = max(place.values()) + 1.4
     height = 1.3 + (0.07 * len(looks) + 0.12) * max(4.0, max(place.values()) + 1)
-    with panels.panel_grid(len(_DRAWN), formats, (0.0, height)) as grid:
+    with panels.panel_grid(len(_DRAWN), formats, (0.0, height), share_x=True) as grid:
         for axes, metric in zip(grid.panels, _DRAWN, strict=True):
             selected = rows[rows.metric == metric.key]
             at, enough = selected.class_name.map(place), selected.enough_pairs

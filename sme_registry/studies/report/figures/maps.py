@@ -12,7 +12,14 @@ import pandas as pd
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
 from sme_registry.evaluation.report import NOT_COMPARABLE
-from sme_registry.plots import draw_similarity, drawing, literal, similarity_on_grid
+from sme_registry.plots.maps import (
+    colour_scale,
+    draw_similarity,
+    scale_text,
+    scale_ticks,
+    similarity_on_grid,
+)
+from sme_registry.plots.style import drawing, literal
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
 from sme_registry.studies.report.tables import by_place
@@ -28,17 +35,20 @@ def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture:
     regions = list(dict.fromkeys(rows.region))
     classes = [name for name in analysis.classes if name in set(rows.class_name)]
     heights = 0.75, 0.62 + 0.2 * len(classes)
+    scale = colour_scale(rows.similarity)
     with panel_grid(len(analysis.algorithms), formats, heights) as grid:
         for axes, name in zip(grid.panels, analysis.algorithms, strict=True):
             selected = rows[rows.algorithm == name]
             values = selected.pivot(index="class_name", columns="region", values="similarity")
-            image = _heat_map(axes, values.reindex(index=classes, columns=regions).to_numpy())
+            values = values.reindex(index=classes, columns=regions)
+            image = _heat_map(axes, values.to_numpy(), scale)
             axes.set_title(literal(name))
             axes.set_xticks(range(len(regions)), [region.replace("OOD ", "") for region in regions])
             axes.set_yticks(range(len(classes)), classes, fontsize=8)
         bar = grid.figure.colorbar(
             image, ax=grid.panels, location="bottom", shrink=0.5, aspect=40, pad=0.02,
-            label="similarity r̃ (IQM over runs) in WD and in the shells OOD 1, 2, …", extend="min",
+            label="similarity r̃ (IQM over runs) in WD and in the shells OOD 1, 2, …; "
+            + scale_text(scale), ticks=scale_ticks(scale),
         )  # fmt: skip
         bar.outline.set_visible(False)
     return Picture(
@@ -51,16 +61,17 @@ def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture:
     )
 
 
-def _heat_map(axes: Any, values: Any) -> Any:
+def _heat_map(axes: Any, values: Any, scale: tuple[float, float]) -> Any:
     """`[class, region]` similarities as an image with their numbers."""
-    image = axes.imshow(values, vmin=0.4, vmax=1.0, cmap="viridis", aspect="auto")
+    image = axes.imshow(values, vmin=scale[0], vmax=scale[1], cmap="viridis", aspect="auto")
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
+    digits = 2 if scale[1] - scale[0] > 0.11 else 3
     for (y, x), value in np.ndenumerate(values):
         known = not np.isnan(value)
         dark = known and np.dot(image.to_rgba(value)[:3], _LUMINANCE) < 0.5
-        text = f"{value:.2f}"[1 - (value >= 0.995) :] if known else "–"
+        text = f"{value:.{digits}f}".removeprefix("0") if known else "–"
         colour = "white" if dark else "black"
         axes.text(x, y, text, ha="center", va="center", fontsize=7.5, color=colour)
     return image
@@ -82,6 +93,7 @@ def draw_maps(
         )
     classes = list(dict.fromkeys(class_name for class_name, _ in maps))
     names = list(dict.fromkeys(algorithm for _, algorithm in maps))
+    scale = colour_scale([grid for grid, _ in maps.values()])
     size = (min(WIDTH, 1.4 + 2.0 * len(classes)), 0.5 + 1.95 * len(names))
     with drawing(size, formats) as (figure, files):
         panels = figure.subplots(len(names), len(classes), squeeze=False, sharex=True, sharey=True)
@@ -97,12 +109,15 @@ def draw_maps(
                 axes.set_axis_off()
                 continue
             similarity, inside = maps[classes[x], names[y]]
-            image = draw_similarity(axes, similarity, _EPSILON)
+            image = draw_similarity(axes, similarity, _EPSILON, scale)
             axes.text(
                 0.03, 0.03, f"WD {inside:.2f}", transform=axes.transAxes, fontsize=7.5, bbox=_BOX,
                 color="black",
             )  # fmt: skip
-        bar = figure.colorbar(image, ax=panels, label="similarity r̃", shrink=0.8)
+        bar = figure.colorbar(
+            image, ax=panels, label=f"similarity r̃; {scale_text(scale)}", shrink=0.8,
+            ticks=scale_ticks(scale),
+        )  # fmt: skip
         bar.outline.set_visible(False)
     return Picture(
         "maps",

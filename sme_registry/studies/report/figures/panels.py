@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sme_registry.plots import COLOURS, GREY, MARKERS, REFERENCE_DASHES, drawing, literal
+from sme_registry.plots.style import (
+    COLOURS,
+    GREY,
+    MARKERS,
+    REFERENCE_DASHES,
+    drawing,
+    legend_below,
+    literal,
+)
 from sme_registry.studies.report.analysis import Analysis
 
 if TYPE_CHECKING:
@@ -212,4 +220,4 @@ def legend(figure: Figure, looks: Mapping[str, Look], across: int = 6) -> None:
         )[0]
         for name, look in looks.items()
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(across, len(handles)))
+    legend_below(figure, handles, across)

@@ -1,0 +1,194 @@
+"""`decay_curve`: similarity and normalised regret over the regions, of one or more policies."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport
+from sme_registry.evaluation.report import LABELS
+from sme_registry.plots.style import (
+    COLOURS,
+    GREY,
+    canvas,
+    draw_reference,
+    entitle,
+    figure_of,
+    literal,
+    look,
+)
+from sme_registry.spec import catalogue
+from sme_registry.statistics import iqm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Measure = Literal["similarity", "normalised_regret"]
+Reports = EvaluationReport | Sequence[EvaluationReport] | Mapping[str, Sequence[EvaluationReport]]
+
+_MEASURES = {
+    "similarity": "similarity r̃  (1 = optimal)",
+    "normalised_regret": "normalised regret  (1 = constant ½)",
+}
+
+
+class _Method(NamedTuple):
+    """One line: a report, or the reports of a method's runs."""
+
+    label: str
+    reports: list[EvaluationReport]
+
+
+def decay_curve(
+    reports: Reports,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    measures: Sequence[Measure] = ("similarity", "normalised_regret"),
+    references: bool = True,
+    title: str | None = None,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> Figure:
+    """Draw reports over the expansion level ε: one panel per measure, one line per method.
+
+    Args:
+      reports: one or more reports, each a line named by its policy; or a mapping from a method's
+        name to the reports of its runs (seeds or instances), each a line of their IQM, with their
+        quartiles as a band. A single report of a team also has a thinner line for each agent.
+      path: a file to write, .png, .pdf or .svg; None writes none.
+      measures: "similarity", "normalised_regret", or both.
+      references: whether to draw the reference policies as thin lines. In a mapping they are means
+        over its tasks; otherwise they are drawn once per task: in grey, or with several tasks in
+        the colour of the first report on each task.
+      title: above a new figure; None takes the task's name if there is only one task.
+      ax: the axes to draw in, one for each measure, without title and legend; None for a new
+        figure.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError: no report, different regions, an unknown measure or suffix, another number of
+        axes than of measures, or the file cannot be written.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    methods = _methods(reports)
+    everything = [report for method in methods for report in method.reports]
+    if not measures or any(measure not in _MEASURES for measure in measures):
+        raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(_MEASURES)}.")
+    size = (4.4 * len(measures) + 0.6, 3.9)
+    with canvas(ax, size, path, len(measures)) as panels:
+        for axes, measure in zip(panels, measures, strict=True):
+            for index, method in enumerate(methods):
+                _draw_method(axes, method, measure, look(index))
+            if len(everything) == 1:
+                _draw_agents(axes, everything[0], measure)
+            if references:
+                _draw_references(axes, methods, measure, averaged=isinstance(reports, Mapping))
+            _label_axes(axes, everything, measure)
+        tasks = catalogue.titles(report.spec.named(report.task) for report in everything)
+        if title is None and len(tasks) == 1:
+            (title,) = tasks.values()
+        if ax is None and title:
+            entitle(figure_of(panels[0]), title)
+    return figure_of(panels[0])
+
+
+def _methods(reports: Reports) -> list[_Method]:
+    """The lines to draw; those of equal labels on different tasks are told apart by their task."""
+    if isinstance(reports, EvaluationReport):
+        reports = [reports]
+    if isinstance(reports, Mapping):
+        methods = [_Method(name, list(runs)) for name, runs in reports.items()]
+        for method in methods:
+            if len({_levels(report) for report in method.reports}) > 1:
+                raise OptionError(
+                    f"reports[{method.label!r}]: have different regions. Evaluate all runs of a "
+                    "method with one protocol."
+                )
+    else:
+        specs = {r.spec_digest: r.spec.named(r.task) for r in reports}
+        tasks = catalogue.titles(specs.values())
+        methods = [
+            _Method(r.policy if len(tasks) == 1 else f"{r.policy}, {tasks[r.spec_digest]}", [r])
+            for r in reports
+        ]
+    if not methods or not all(method.reports for method in methods):
+        raise OptionError("reports: must be one or more evaluation reports. Give one.")
+    return methods
+
+
+def _levels(report: EvaluationReport) -> tuple[float, ...]:
+    return tuple(region.epsilon_high for region in report.regions)
+
+
+def _values(regions: Any, measure: str) -> list[float]:
+    return [getattr(region, measure) for region in regions]
+
+
+def _draw_method(axes: Axes, method: _Method, measure: str, style: Mapping[str, Any]) -> None:
+    x = _levels(method.reports[0])
+    runs = np.array([_values(report.regions, measure) for report in method.reports])
+    label = literal(method.label)
+    if len(runs) > 1:
+        low, high = np.quantile(runs, [0.25, 0.75], axis=0)
+        axes.fill_between(x, low, high, color=style["color"], alpha=0.16, linewidth=0)
+        label += f" (n = {len(runs)})"
+    axes.plot(x, iqm(runs), **style, markersize=4.5, linewidth=2, label=label)
+
+
+def _draw_agents(axes: Axes, report: EvaluationReport, measure: str) -> None:
+    """A thinner line for each agent of a team; one colour for all if they are too many."""
+    several = len(report.agents) >= len(COLOURS)
+    for index, (name, agent) in enumerate(report.agents.items()):
+        style: Any = {"markersize": 3.5, "linewidth": 1.2, "alpha": 0.8, "zorder": 1.8}
+        if several:
+            each = f"each of {len(report.agents)} agents"
+            style |= {"color": COLOURS[5], "label": "" if index else each}
+        else:
+            style |= {**look(index + 1), "label": literal(name)}
+        axes.plot(_levels(report), _values(agent.regions, measure), **style)
+
+
+def _draw_references(
+    axes: Axes, methods: Sequence[_Method], measure: str, *, averaged: bool
+) -> None:
+    """The references of each task, or their means over all tasks, with one entry in the legend."""
+    tasks: dict[str, tuple[int, EvaluationReport]] = {}
+    for index, method in enumerate(methods):
+        for report in method.reports:
+            tasks.setdefault(report.spec_digest, (index, report))
+    first = methods[0].reports[0]
+    alike = [report for _, report in tasks.values() if _levels(report) == _levels(first)]
+    if averaged:
+        for name in first.references:
+            values = [_values(report.references[name], measure) for report in alike]
+            mean = np.mean(values, axis=0)
+            draw_reference(axes, name, _levels(first), mean, LABELS.get(name, name))
+        return
+    for index, report in tasks.values():
+        colour = GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)]
+        for name, regions in report.references.items():
+            label = LABELS.get(name, name) if report is first else "_another task"
+            values = _values(regions, measure)
+            draw_reference(axes, name, _levels(report), values, label, colour)
+
+
+def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -> None:
+    levels = sorted({level for report in reports for level in _levels(report)})
+    dims = sorted({report.spec.state_dim for report in reports})
+    warning = (
+        "different S: these levels are not comparable"
+        if len(dims) > 1
+        else f"S = {dims[0]}; not comparable with another S"
+    )
+    axes.set_xlabel(f"outer expansion level ε of the region\n{warning}")
+    axes.set_ylabel(_MEASURES[measure])
+    if len(levels) <= 12:
+        axes.set_xticks(levels, [f"{level:g}" if level > 0 else "WD" for level in levels])
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.5) if measure == "similarity" else 0.0 - 0.03 * high, high)

@@ -1,0 +1,307 @@
+"""What all figures share: style, colours, legends below the panels, and files.
+
+The colours are those of Okabe and Ito, which colour-blind readers can distinguish. Lines also
+differ in dash and marker, and maps in lightness, so that they remain legible in grey. Figures are
+made without pyplot: nothing global changes, and no display is needed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.io import require_packages, write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
+    from matplotlib.lines import Line2D
+
+# Metadata without a date, by format, so that equal figures are equal files.
+_UNDATED: dict[str, Any] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+FORMATS = tuple(_UNDATED)
+WRITTEN = ("png", "pdf")  # what commands write
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MARKERS = "osD^vPX<>*"  # ten, with seven colours: the first 70 pairs all differ
+GREY = "#707070"
+REFERENCE_DASHES: dict[str, Any] = {
+    "optimal": "-",
+    "linear_least_squares": (0, (6, 2)),
+    "best_constant": (0, (3, 1, 1, 1)),
+    "constant_half": (0, (4, 4)),
+    "uniform_random": (0, (1, 2)),
+}
+_DPI = 160
+_LABEL_WIDTH = 60  # letters in a line of a legend
+_REFERENCE = "reference "  # begins the gid of the line of a reference policy
+_STYLE: Any = {
+    "figure.constrained_layout.use": True,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,  # TrueType: journals refuse Type 3
+    "ps.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sme-registry",
+}
+
+
+@contextlib.contextmanager
+def styled() -> Iterator[None]:
+    """Matplotlib's settings for figures of this package, during the block.
+
+    Raises:
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    require_packages("figures", {"matplotlib": "Matplotlib"}, "plot")
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def new_figure(size: tuple[float, float]) -> Figure:
+    """An empty figure of this width and height in inches, in the style of the `styled` block."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+@contextlib.contextmanager
+def drawing(
+    size: tuple[float, float], formats: Iterable[str]
+) -> Iterator[tuple[Figure, dict[str, bytes]]]:
+    """A figure in the style of this package, and its files.
+
+    Args:
+      size: width and height in inches.
+      formats: of `FORMATS`.
+
+    Yields:
+      The figure to draw in, and a dict that holds the bytes of each format after the block.
+
+    Raises:
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    files: dict[str, bytes] = {}
+    with styled():
+        figure = new_figure(size)
+        yield figure, files
+        files |= _encoded(figure, formats)
+
+
+def save_figure(
+    figure: Figure, path: str | os.PathLike[str], formats: Sequence[str] | None = None
+) -> list[Path]:
+    """Write a figure, each file completely or not at all; equal figures give equal files.
+
+    Fonts are embedded in PDF as TrueType, and SVG keeps its text.
+
+    Args:
+      figure: the figure.
+      path: the file to write. Its folder is created, and an existing file is replaced.
+      formats: of "png", "pdf" and "svg", each written next to the others with its own ending; None
+        takes the ending of `path`.
+
+    Returns:
+      The paths written.
+
+    Raises:
+      OptionError: an unknown format, or a file cannot be written.
+    """
+    path = Path(path)
+    if formats is None:
+        formats = [checked_format(path)]
+        targets = [path]
+    else:
+        targets = [path.with_name(f"{path.name}.{ending}") for ending in formats]
+        for target in targets:
+            checked_format(target)
+    with styled():
+        files = _encoded(figure, formats)
+    return [write_atomically(t, files[e]) for t, e in zip(targets, formats, strict=True)]
+
+
+def checked_format(path: str | os.PathLike[str]) -> str:
+    """The format of a figure's path; raises OptionError unless it is one of `FORMATS`."""
+    ending = Path(path).suffix.removeprefix(".").lower()
+    if ending not in FORMATS:
+        raise OptionError(f"{path}: must end in {', '.join('.' + known for known in FORMATS)}.")
+    return ending
+
+
+@contextlib.contextmanager
+def canvas(
+    ax: Axes | Sequence[Axes] | None,
+    size: tuple[float, float],
+    path: str | os.PathLike[str] | None,
+    panels: int = 1,
+) -> Iterator[list[Axes]]:
+    """The panels that a public function draws in: the caller's, or those of a new figure.
+
+    After the block a new figure has a legend of all labelled lines below its panels; the caller's
+    axes have none. The figure is written if there is a path.
+
+    Raises:
+      OptionError: an unknown suffix, another number of axes, or the file cannot be written.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    if path is not None:
+        checked_format(path)
+    with styled():
+        if ax is None:
+            axes = list(new_figure(size).subplots(1, panels, squeeze=False)[0])
+        else:
+            axes = list(np.ravel(np.array(ax, dtype=object)))
+        if len(axes) != panels:
+            raise OptionError(f"ax: {len(axes)} axes for {panels} panels. Give as many as panels.")
+        yield axes
+        merge_coincident(axes)
+        if ax is None:
+            legend_below(figure_of(axes[0]), axes[0].get_legend_handles_labels()[0])
+    if path is not None:
+        save_figure(figure_of(axes[0]), path)
+
+
+def figure_of(axes: Axes) -> Figure:
+    """The figure that axes are in."""
+    figure: Any = axes.get_figure(root=True)
+    return figure
+
+
+def entitle(figure: Figure, title: str) -> None:
+    """A title above all panels, wrapped to the width of the figure."""
+    letters = int(12 * figure.get_figwidth())
+    lines = [textwrap.fill(line, letters) for line in title.splitlines()]
+    figure.suptitle(literal("\n".join(lines)), fontsize=10)
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist], most_across: int = 6) -> Legend | None:
+    """A legend below all panels, which covers none: as many columns as fit, and a taller figure.
+
+    Args:
+      figure: with constrained layout. It grows by all rows of the legend but the first.
+      handles: labelled artists.
+      most_across: the most columns.
+
+    Returns:
+      The legend; None without handles.
+    """
+    if not handles:
+        return None
+    labels = [textwrap.fill(str(each.get_label()), _LABEL_WIDTH) for each in handles]
+    for across in range(min(most_across, len(handles)), 0, -1):
+        legend = figure.legend(
+            handles, labels, loc="outside lower center", ncols=across, columnspacing=1.4
+        )
+        box = legend.get_window_extent()
+        if box.width <= figure.bbox.width or across == 1:
+            break
+        legend.remove()
+    row = legend.get_texts()[0].get_fontsize() * 1.9 / 72.0
+    height = max(0.0, box.height / figure.dpi - row)
+    figure.set_figheight(figure.get_figheight() + height)
+    return legend
+
+
+def legend_above(axes: Axes, **options: Any) -> None:
+    """A legend above a panel, which covers no data."""
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8, borderaxespad=0.2, **options
+    )
+
+
+def draw_reference(axes: Axes, name: str, x: Any, y: Any, label: str, colour: Any = GREY) -> None:
+    """The line of a reference policy: over x, or across the panel if x is None.
+
+    `merge_coincident` may later combine it with the line of another one.
+    """
+    style: Any = {
+        "color": colour, "linewidth": 1.1, "linestyle": REFERENCE_DASHES.get(name, "-"),
+        "zorder": 1.5, "label": label, "gid": f"{_REFERENCE}{colour}",
+    }  # fmt: skip
+    axes.axhline(y, **style) if x is None else axes.plot(x, y, **style)
+
+
+def merge_coincident(panels: Sequence[Axes]) -> None:
+    """Draw reference policies that coincide, in every panel, as one line with both names.
+
+    Lines coincide if they differ by less than a point of print. Call it when limits are final.
+    """
+    by_panel = [
+        [line for line in axes.lines if str(line.get_gid() or "").startswith(_REFERENCE)]
+        for axes in panels
+    ]
+    groups: list[list[int]] = []
+    for index in range(min(map(len, by_panel), default=0)):
+        for group in groups:
+            if all(_coincide(lines[group[0]], lines[index]) for lines in by_panel):
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    for lines in by_panel:
+        for first, *others in groups:
+            labels = [str(lines[i].get_label()) for i in (first, *others)]
+            named = [label for label in labels if not label.startswith("_")]
+            lines[first].set_label(" = ".join(named) if named else labels[0])
+            for other in others:
+                lines[other].set_visible(False)
+                lines[other].set_label("_hidden")
+
+
+def _coincide(one: Line2D, other: Line2D) -> bool:
+    if one.get_gid() != other.get_gid():  # another task
+        return False
+    ends = [np.asarray(line.get_ydata(), dtype=float) for line in (one, other)]
+    if ends[0].shape != ends[1].shape:
+        return False
+    figure: Any = one.get_figure(root=True)
+    transform = one.axes.transData if one.axes is not None else one.get_transform()
+    heights = [transform.transform(np.column_stack([np.zeros_like(y), y]))[:, 1] for y in ends]
+    return bool(np.abs(heights[0] - heights[1]).max() * 72.0 / figure.dpi < 1.0)
+
+
+def shades(count: int) -> list[tuple[float, ...]]:
+    """Colours for ordered values, from dark to light, all legible on white."""
+    from matplotlib import colormaps
+
+    return [tuple(colour) for colour in colormaps["viridis"](np.linspace(0.0, 0.85, count))]
+
+
+def look(index: int) -> Mapping[str, Any]:
+    """The colour and marker of the line of this number, as arguments of `plot`."""
+    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
+
+
+def literal(text: str) -> str:
+    """Text that Matplotlib prints as it is, not as a formula."""
+    return text.replace("$", r"\$")
+
+
+def _encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
+    files = {}
+    for ending in formats:
+        content = io.BytesIO()
+        figure.savefig(content, format=ending, dpi=_DPI, metadata=_UNDATED[ending])
+        files[ending] = content.getvalue()
+    return files
