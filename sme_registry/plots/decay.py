@@ -166,8 +166,8 @@ def _draw_references(
     alike = [report for _, report in tasks.values() if _levels(report) == _levels(first)]
     if averaged:
         for name in first.references:
-            values = [_values(report.references[name], measure) for report in alike]
-            mean = np.mean(values, axis=0)
+            runs = [_values(report.references[name], measure) for report in alike]
+            mean = np.mean(runs, axis=0)
             draw_reference(axes, name, _levels(first), mean, LABELS.get(name, name))
         return
     for index, report in tasks.values():

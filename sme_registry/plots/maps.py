@@ -105,7 +105,7 @@ def colour_scale(similarity: npt.ArrayLike) -> tuple[float, float]:
 def scale_ticks(scale: tuple[float, float]) -> Array:
     """The numbers at a scale: every 0.05, or every 0.1 of a long one."""
     steps = round((scale[1] - scale[0]) / _STEP)
-    return scale[0] + _STEP * np.arange(0, steps + 1, 1 if steps <= 8 else 2)
+    return np.arange(0, steps + 1, 1 if steps <= 8 else 2, dtype=np.float64) * _STEP + scale[0]
 
 
 def scale_text(scale: tuple[float, float]) -> str:

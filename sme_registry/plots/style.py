@@ -183,8 +183,8 @@ def canvas(
 
 
 def figure_of(axes: Axes) -> Figure:
-    """The figure that axes are in."""
-    figure: Any = axes.get_figure(root=True)
+    """The figure that axes are in, also where they are in a part of it."""
+    figure: Figure = axes.figure.figure  # `get_figure(root=True)` is of Matplotlib 3.10
     return figure
 
 
@@ -217,7 +217,7 @@ def legend_below(figure: Figure, handles: Sequence[Artist], most_across: int = 6
         if box.width <= figure.bbox.width or across == 1:
             break
         legend.remove()
-    row = legend.get_texts()[0].get_fontsize() * 1.9 / 72.0
+    row = legend.prop.get_size_in_points() * 1.9 / 72.0
     height = max(0.0, box.height / figure.dpi - row)
     figure.set_figheight(figure.get_figheight() + height)
     return legend
@@ -275,10 +275,10 @@ def _coincide(one: Line2D, other: Line2D) -> bool:
     ends = [np.asarray(line.get_ydata(), dtype=float) for line in (one, other)]
     if ends[0].shape != ends[1].shape:
         return False
-    figure: Any = one.get_figure(root=True)
-    transform = one.axes.transData if one.axes is not None else one.get_transform()
-    heights = [transform.transform(np.column_stack([np.zeros_like(y), y]))[:, 1] for y in ends]
-    return bool(np.abs(heights[0] - heights[1]).max() * 72.0 / figure.dpi < 1.0)
+    axes: Any = one.axes
+    points = [axes.transData.transform(np.column_stack([np.zeros_like(y), y])) for y in ends]
+    apart = np.abs(points[0] - points[1])[:, 1].max()
+    return bool(apart * 72.0 / figure_of(axes).dpi < 1.0)
 
 
 def shades(count: int) -> list[tuple[float, ...]]:
