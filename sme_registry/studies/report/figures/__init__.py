@@ -34,7 +34,7 @@ def draw_figures(
 
     Args:
       analysis: the tables, of at least one run.
-      formats: of `plots.FORMATS`.
+      formats: of `plots.style.FORMATS`.
       models: paths of kept models by the digests of their cells. They are loaded.
 
     Returns:
