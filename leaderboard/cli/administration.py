@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, Json, NewBoardFolder, SuiteName, find_suite
+from leaderboard.cli.options import (
+    BoardFolder,
+    Json,
+    NewBoardFolder,
+    SuiteName,
+    complete_protocol,
+    find_suite,
+)
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json
 
@@ -22,7 +29,8 @@ def init(
         str | None,
         typer.Option(
             help="A protocol's name (see `sme list`) or file; default paper-v1, for practice "
-            "quick-v1."
+            "quick-v1.",
+            autocompletion=complete_protocol,
         ),
     ] = None,
     title: Annotated[

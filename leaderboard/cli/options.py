@@ -11,7 +11,7 @@ import typer
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder
 from sme_registry.errors import OptionError
-from sme_registry.spec import SuiteFile, catalogue
+from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
 _HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
 
@@ -113,16 +113,26 @@ BoardOrUrl = Annotated[
     ),
 ]
 BundleFolder = Annotated[Path, typer.Argument(metavar="BUNDLE", help="The submission's folder.")]
+
 SuiteName = Annotated[
     str,
-    typer.Option(help="A suite's name (see `sme list`) or file, or the board that has it."),
+    typer.Option(
+        help="A suite's name (see `sme list`) or file, or the board that has it.",
+        autocompletion=catalogue.completion(SuiteFile),
+    ),
 ]
+complete_protocol = catalogue.completion(ProtocolFile)
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 KEY_VARIABLE = "SME_LEADERBOARD_KEY"
 DEFAULT_KEY = Path(typer.get_app_dir("sme-leaderboard")) / "ed25519.key"
 KeyFile = Annotated[
     Path,
-    typer.Option("--key", envvar=KEY_VARIABLE, help="Your signing key, as `keygen` creates it."),
+    typer.Option(
+        "--key",
+        envvar=KEY_VARIABLE,
+        help="Your signing key, as `keygen` creates it.",
+        show_default="sme-leaderboard/ed25519.key in your settings folder",
+    ),
 ]
 
 

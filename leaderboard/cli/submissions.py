@@ -18,6 +18,7 @@ from leaderboard.cli.options import (
     SuiteName,
     board_document,
     board_or_url,
+    complete_protocol,
     find_suite,
     is_url,
 )
@@ -204,7 +205,10 @@ def check(
     ] = None,
     protocol: Annotated[
         str | None,
-        typer.Option(help="Without BOARD: a protocol's name (see `sme list`) or file."),
+        typer.Option(
+            help="Without BOARD: a protocol's name (see `sme list`) or file.",
+            autocompletion=complete_protocol,
+        ),
     ] = None,
     json: Json = False,
 ) -> None:

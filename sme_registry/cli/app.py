@@ -23,9 +23,17 @@ app = application(
     "sme",
     """Synthetic Monitoring Environments: control tasks whose optimal policy is known exactly.
 
-    To start:  **sme list**  ·  **sme show Default**  ·  **sme demo**
+    To start:
 
-    Your own task:  **sme new mine.json --complexity 10 --seed 3**
+      sme list
+
+      sme show Default
+
+      sme demo
+
+    Your own task:
+
+      sme new mine.json --complexity 10 --seed 3
     """,
 )
 app.command("list")(list_)

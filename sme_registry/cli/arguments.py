@@ -21,7 +21,12 @@ from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.resolve import is_path, refuse_bare_spec, resolve
 
 TaskName = Annotated[
-    str, typer.Argument(metavar="TASK", help="The task: a name, a path or a digest.")
+    str,
+    typer.Argument(
+        metavar="TASK",
+        help="The task: a name, a path or a digest.",
+        autocompletion=catalogue.completion(EnvFile),
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print plain JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing output.")]
@@ -30,7 +35,11 @@ SpecChanges = Annotated[
     typer.Option("--set", metavar="FIELD=VALUE", help="Change a field of the task. Repeatable."),
 ]
 Protocol = Annotated[
-    str, typer.Option(help="Evaluation protocol: a name from `sme list`, or a path.")
+    str,
+    typer.Option(
+        help="Evaluation protocol: a name from `sme list`, or a path.",
+        autocompletion=catalogue.completion(ProtocolFile),
+    ),
 ]
 DatasetsFolder = Annotated[
     Path | None,

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.errors import UnknownNameError
-from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile
+from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
 from sme_registry.terminal import Table, err, out, print_json
 
 if TYPE_CHECKING:
@@ -25,7 +25,12 @@ _MARKS = {
 
 def certify(
     tasks: Annotated[
-        list[str], typer.Argument(metavar="NAME|PATH...", help="Tasks or suites to check.")
+        list[str],
+        typer.Argument(
+            metavar="NAME|PATH...",
+            help="Tasks or suites to check.",
+            autocompletion=catalogue.completion(EnvFile, SuiteFile),
+        ),
     ],
     seed: Annotated[int, typer.Option(help="Seed of the states and actions used.")] = 0,
     json: Json = False,

@@ -33,7 +33,6 @@ _DEFAULT = "MINARI_DATASETS_PATH, or ~/.minari/datasets"
 
 app = typer.Typer(
     no_args_is_help=True,
-    rich_markup_mode="markdown",
     help="""Data sets for offline RL, of a chosen quality, with the exact regret of every step.
 
     Examples:

@@ -14,6 +14,7 @@ from sme_registry.cli.arguments import ActionRange, Force, Json, Out, SpecChange
 from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing, to_json, write_atomically
+from sme_registry.spec import EnvFile, catalogue
 from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
@@ -31,7 +32,13 @@ def diagnose(
         ),
     ],
     task: Annotated[
-        str | None, typer.Option("--task", "-t", help="RUN is a policy, for this task.")
+        str | None,
+        typer.Option(
+            "--task",
+            "-t",
+            help="RUN is a policy, for this task.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
     ] = None,
     cell: Annotated[
         str | None, typer.Option(help="RUN is a study's folder; the start of a cell's key.")

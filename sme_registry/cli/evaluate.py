@@ -24,11 +24,16 @@ from sme_registry.io import refuse_existing
 from sme_registry.terminal import Progress, err, out, print_json
 
 
+def _complete_policy(incomplete: str) -> list[str]:
+    return [name for name in POLICIES if name.startswith(incomplete)]
+
+
 def evaluate(
     policy: Annotated[
         str,
         typer.Argument(
             metavar="POLICY",
+            autocompletion=_complete_policy,
             help=f"A .zip, .onnx or .npz file, module:function, or {', '.join(POLICIES)}.",
         ),
     ],

@@ -17,7 +17,7 @@ from sme_registry.cli.arguments import Force, json_or_text
 from sme_registry.cli.files import check_document_path
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in, read_json
-from sme_registry.spec import SMESpec
+from sme_registry.spec import EnvFile, SMESpec, catalogue
 from sme_registry.terminal import err, out
 
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
@@ -85,7 +85,7 @@ def new(
         typer.Option(
             metavar="JSON|FILE",
             help='Agents of a team, as a .json file or as JSON: \'{"agents": [{"action_dim": 2, '
-            '"observes": \\[0, 1]}, {"action_dim": 2}]}\'.',
+            '"observes": [0, 1]}, {"action_dim": 2}]}\'.',
         ),
     ] = None,
     agents: Annotated[
@@ -102,7 +102,13 @@ def new(
         ),
     ] = None,
     base: Annotated[
-        str | None, typer.Option("--from", metavar="NAME|PATH", help="The task to start from.")
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="NAME|PATH",
+            help="The task to start from.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
     description: Annotated[str, typer.Option(help="One or two sentences.")] = "",

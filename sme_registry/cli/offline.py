@@ -12,7 +12,7 @@ from sme_registry.cli.arguments import DatasetsFolder, Force, Json, Out, changes
 from sme_registry.cli.files import print_training
 from sme_registry.terminal import Progress, Table, err
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.callback()

@@ -17,7 +17,15 @@ from sme_registry.cli.arguments import Protocol, find_file, json_or_text
 from sme_registry.cli.study_plan import scaled_plan
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import integer_in, parse_json
-from sme_registry.spec import SMESpec, StudyFile, StudyPlan, SuiteClass, SuiteFile, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    SMESpec,
+    StudyFile,
+    StudyPlan,
+    SuiteClass,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.spec.sweep import sweep
 
 
@@ -25,10 +33,20 @@ from sme_registry.spec.sweep import sweep
 class ClassOptions:
     """Options of a command that describe classes of tasks, each with its help."""
 
-    suite: Annotated[str | None, typer.Option(help="A suite of classes: name or path.")] = None
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="A suite of classes: name or path.", autocompletion=catalogue.completion(SuiteFile)
+        ),
+    ] = None
     task: Annotated[
         list[str] | None,
-        typer.Option("--task", "-t", help="A task as a class of its own. Repeatable."),
+        typer.Option(
+            "--task",
+            "-t",
+            help="A task as a class of its own. Repeatable.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
     ] = None
     sweep: Annotated[
         list[str] | None,

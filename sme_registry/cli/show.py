@@ -11,7 +11,7 @@ import typer
 from pydantic import BaseModel
 from rich.markup import escape
 
-from sme_registry.cli.arguments import Json, find_any
+from sme_registry.cli.arguments import KINDS, Json, find_any
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError
 from sme_registry.spec import (
@@ -49,7 +49,12 @@ _SHORT = len("sha256:") + 12  # characters of a digest that name a task
 
 def show(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME|PATH|DIGEST", help="What to show.")
+        str | None,
+        typer.Argument(
+            metavar="NAME|PATH|DIGEST",
+            help="What to show.",
+            autocompletion=catalogue.completion(*KINDS.values()),
+        ),
     ] = None,
     json: Json = False,
     json_schema: Annotated[

@@ -14,7 +14,7 @@ from sme_registry.cli import study_compare, study_new, study_plan, study_sweep
 from sme_registry.cli.arguments import Json, Out, find_file
 from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
 from sme_registry.errors import OptionError
-from sme_registry.spec import StudyFile
+from sme_registry.spec import StudyFile, catalogue
 from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ ExecutorName = enum.StrEnum("ExecutorName", ["processes", "in-process", "ray"])
 
 app = typer.Typer(
     no_args_is_help=True,
-    rich_markup_mode="markdown",
     help="""Studies: algorithms × classes of tasks × seeds, resumable, on a laptop or a cluster.
 
     Examples:
@@ -52,7 +51,12 @@ app.command("compare")(study_compare.compare)
 @app.command("run")
 def run(
     plan: Annotated[
-        str, typer.Argument(metavar="PLAN", help="A name from `sme study plan`, or a path.")
+        str,
+        typer.Argument(
+            metavar="PLAN",
+            help="A name from `sme study plan`, or a path.",
+            autocompletion=catalogue.completion(StudyFile),
+        ),
     ],
     folder: Annotated[
         Path, typer.Option("--folder", "-f", help="The study's folder; created if necessary.")

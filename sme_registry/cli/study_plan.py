@@ -42,7 +42,11 @@ Jobs = Annotated[
 def plan(
     plan: Annotated[
         str | None,
-        typer.Argument(metavar="PLAN", help="A name or a path; without it, list the catalogue."),
+        typer.Argument(
+            metavar="PLAN",
+            help="A name or a path; without it, list the catalogue.",
+            autocompletion=catalogue.completion(StudyFile),
+        ),
     ] = None,
     folder: Annotated[
         Path | None,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -52,6 +52,18 @@ def names(kind: type[Envelope]) -> list[str]:
 @functools.cache
 def _read(kind: type[_E], path: Path) -> _E:
     return kind.read(path)
+
+
+def completion(*kinds: type[Envelope]) -> Callable[[str], list[str]]:
+    """What completes a name of these kinds in a shell: ids after `SME/`, else short names."""
+
+    def complete(incomplete: str) -> list[str]:
+        known = [_VERSION.sub("", name) for kind in kinds for name in names(kind)]
+        if incomplete.startswith(f"{NAMESPACE}/") and EnvFile in kinds:
+            known = [f"{NAMESPACE}/{name}" for name in names(EnvFile)]
+        return [name for name in dict.fromkeys(known) if name.startswith(incomplete)]
+
+    return complete
 
 
 def entries(kind: type[_E]) -> list[_E]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import os
+import re
 import sys
 from importlib import metadata
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 from typer.core import TyperGroup
 
 from sme_registry.errors import SMEError
@@ -27,6 +30,10 @@ class CommandGroup(TyperGroup):
 
     exit_codes: tuple[tuple[type[SMEError], int], ...] = ()
     extra: str = ""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        _show_literally(self)
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run the command line, and exit with its exit code."""
@@ -72,6 +79,24 @@ class CommandGroup(TyperGroup):
             raise typer.Exit(130) from None
 
 
+def _show_literally(command: Any) -> None:
+    """Make the help of a command and of all in it show as it is written, in paragraphs.
+
+    Markdown would remove asterisks, backticks and angle brackets, and Rich's markup brackets.
+    """
+    for each in (command, *command.params):
+        if getattr(each, "help", None):
+            each.help = escape(_in_paragraphs(inspect.cleandoc(each.help)))
+    for child in getattr(command, "commands", {}).values():
+        _show_literally(child)
+
+
+def _in_paragraphs(text: str) -> str:
+    """Text with one line per paragraph; indented ones, the examples, follow without empty lines."""
+    paragraphs = [re.sub(r"\n\s*", " ", part) for part in re.split(r"\n\s*\n", text)]
+    return re.sub(r"(?m)^( .*)\n\n(?= )", r"\1\n", "\n\n".join(paragraphs))
+
+
 def _show_version(context: typer.Context, wanted: bool) -> None:
     if wanted:
         typer.echo(f"{context.info_name} {metadata.version('sme-registry')}")
@@ -87,9 +112,8 @@ def application(
         help=description,
         cls=commands,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
-        rich_markup_mode="markdown",
+        rich_markup_mode="rich",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
 

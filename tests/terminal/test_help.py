@@ -1,0 +1,88 @@
+"""Help texts show what their source says, and the shell completes names."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer
+from rich.text import Text
+from typer.testing import CliRunner
+
+from leaderboard.cli import app as leaderboard
+from sme_registry.cli import app as sme
+
+APPS = {"sme": sme, "sme-leaderboard": leaderboard}
+
+
+def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield path, command
+    for name, child in getattr(command, "commands", {}).items():
+        yield from commands(child, (*path, name))
+
+
+COMMANDS = [
+    pytest.param(program, path, command, id=" ".join((program, *path)))
+    for program, app in APPS.items()
+    for path, command in commands(typer.main.get_command(app))
+]
+
+
+def words(text: str) -> str:
+    return f" {' '.join(re.sub('[│╭╮╰╯─]', ' ', text).split())} "
+
+
+@pytest.mark.parametrize("width", [80, 200])
+@pytest.mark.parametrize(("program", "path", "command"), COMMANDS)
+def test_help_shows_its_source_unchanged(
+    program: str, path: tuple[str, ...], command: Any, width: int
+) -> None:
+    settings = {"COLUMNS": str(width)}
+    result = CliRunner().invoke(APPS[program], [*path, "--help"], env=settings)
+    shown = words(result.stdout)
+    source = inspect.getdoc(command.callback) if path and not hasattr(command, "commands") else None
+    for paragraph in (source or Text.from_markup(command.help).plain).split("\n\n"):
+        assert words(paragraph) in shown
+    for parameter in command.params:
+        text = Text.from_markup(getattr(parameter, "help", None) or "").plain
+        for word in text.split():
+            assert f" {word} " in shown or (len(word) > 24 and word in shown.replace(" ", ""))
+
+
+def test_examples_are_lines_without_empty_ones_between() -> None:
+    lines = CliRunner().invoke(sme, ["list", "--help"], env={"COLUMNS": "80"}).stdout.splitlines()
+    start = lines.index(next(line for line in lines if line.strip() == "Examples:"))
+    examples = [line.strip() for line in lines[start + 1 : start + 5]]
+    assert [text.partition(" ")[0] for text in examples] == ["", "sme", "sme", "sme"]
+
+
+def test_a_suggestion_ends_with_one_mark() -> None:
+    message = CliRunner().invoke(sme, ["shwo"]).stderr
+    assert "Did you mean 'show'? See `sme --help`." in message
+
+
+@pytest.mark.parametrize(
+    ("program", "line", "expected"),
+    [
+        ("sme", "sme st", {"study"}),
+        ("sme", "sme train Defau", {"Default"}),
+        ("sme", "sme train SME/Defau", {"SME/Default-v1"}),
+        ("sme", "sme show smo", {"smoke"}),
+        ("sme", "sme study run smo", {"smoke"}),
+        ("sme", "sme evaluate linear Default --protocol qu", {"quick"}),
+        ("sme", "sme evaluate opt", {"optimal"}),
+        ("sme-leaderboard", "sme-leaderboard init board --suite co", {"core"}),
+        ("sme-leaderboard", "sme-leaderboard new b --suite smo", {"smoke"}),
+    ],
+)
+def test_the_shell_completes_names(program: str, line: str, expected: set[str]) -> None:
+    settings = {
+        f"_{program.replace('-', '_').upper()}_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+    }
+    result = CliRunner().invoke(APPS[program], [], env=settings)
+    assert set(result.stdout.split()) == expected
