@@ -23,6 +23,9 @@ def catalogue() -> str:
         "",
         "## Environments",
         "",
+        "Each id of a single agent (agents = 1) also exists with `Symmetric` before the version,",
+        "such as `SME/DefaultSymmetric-v1`: the same task, with actions in [−1, 1], not [0, 1].",
+        "",
         f"| Id | {' | '.join(_SYMBOLS)} | agents | digest | |",
         "|---" * (len(_SYMBOLS) + 4) + "|",
     ]

@@ -26,13 +26,18 @@ _ENTRY_POINTS: dict[str, Any] = {
 
 
 def _register(env_id: str, spec: dict[str, Any] | str, team: bool) -> None:
-    """Register an id with Gymnasium or, for a team, with PettingZoo."""
+    """Register an id with PettingZoo for a team; else with Gymnasium, and its symmetric id."""
+    from sme_registry.spec.catalogue import symmetric_name
+
     kwargs = {"spec": spec}
     if team:
         pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
         pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
     else:
         gymnasium.register(env_id, **_ENTRY_POINTS, kwargs=kwargs)
+        if "/sha256-" not in env_id:
+            symmetric = {**kwargs, "action_range": "symmetric"}
+            gymnasium.register(symmetric_name(env_id), **_ENTRY_POINTS, kwargs=symmetric)
 
 
 def _is_registered(env_id: str) -> bool:
@@ -41,6 +46,9 @@ def _is_registered(env_id: str) -> bool:
 
 def register_catalogue() -> None:
     """Register every file of `specs/envs` by its name and by its content, without validation.
+
+    The name of a single agent's task is registered once more with actions in [−1, 1]:
+    `SME/DefaultSymmetric-v1`.
 
     Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
     """
@@ -61,14 +69,15 @@ def register(spec: SMESpec, name: str) -> str:
       name: letters, digits, '_' and '-', as in `MyTask` or `MyTask-v1`.
 
     Returns:
-      The id, such as `SME/MyTask-v1`.
+      The id, such as `SME/MyTask-v1`. A single agent's task can also be made by
+      `SME/MyTaskSymmetric-v1`, with actions in [−1, 1].
 
     Raises:
-      OptionError: the name has invalid characters.
+      OptionError: the name has invalid characters, or ends with "Symmetric".
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
     """
     from sme_registry.spec import as_spec
-    from sme_registry.spec.catalogue import NAMESPACE
+    from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC
     from sme_registry.spec.resolve import registered, resolve
     from sme_registry.task.streams import DYNAMICS_VERSION
 
@@ -78,6 +87,11 @@ def register(spec: SMESpec, name: str) -> str:
         raise OptionError(
             f"name={name!r}: must be 1 to 64 letters, digits, '_' and '-', with the version "
             f"-v{DYNAMICS_VERSION} or none."
+        )
+    if short.endswith(SYMMETRIC):
+        raise OptionError(
+            f"name={name!r}: must not end with {SYMMETRIC!r}, the ending of ids with actions in "
+            f"[−1, 1]. Remove it: the id with that ending is registered as well."
         )
     env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
     if _is_registered(env_id):
@@ -220,7 +234,8 @@ def make_vec(
 def registered_or_new(spec_or_id: SpecLike) -> EnvSpec:
     """The `EnvSpec` of an id as it is registered, which keeps the id's name; else `env_spec`."""
     if isinstance(spec_or_id, str):
-        for env_id in (spec_or_id, f"SME/{spec_or_id}", f"SME/{spec_or_id}-v1", f"{spec_or_id}-v1"):
+        name = spec_or_id.removeprefix("sme_registry:")
+        for env_id in (name, f"SME/{name}", f"SME/{name}-v1", f"{name}-v1"):
             if env_id in gymnasium.registry and env_id.startswith("SME/"):
                 return gymnasium.registry[env_id]
     return env_spec(spec_or_id)

@@ -89,7 +89,7 @@ def _env_table(files: list[EnvFile]) -> Table:
         {"id": "name", **dict.fromkeys(numbers, "number"), "tags": "text"},
         rows,
         caption="n agents · S state channels, A action channels · L layers of π* · k reward "
-        "interval · T horizon",
+        "interval · T horizon · actions are in [0, 1]; in [−1, 1] by SME/DefaultSymmetric-v1, …",
     )
 
 

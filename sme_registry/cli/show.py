@@ -139,8 +139,11 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
     """What follows from a spec without drawing its task."""
     from sme_registry.task.memory import parameter_bytes
 
+    env_id = _env_id(spec)
+    symmetric = spec.team is None and "/sha256-" not in env_id
     facts: dict[str, Any] = {
-        "id": _env_id(spec),
+        "id": env_id,
+        **({"symmetric_id": catalogue.symmetric_name(env_id)} if symmetric else {}),
         **_spaces(spec),
         "parameters": parameter_bytes(spec) // 8,
         "parameter_memory_bytes": parameter_bytes(spec),

@@ -141,7 +141,7 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
     fields = SMESpec.model_fields.keys()
     registered = gymnasium.registry.get(env_spec.id)
     task = env_spec.kwargs.get("spec")
-    is_named = registered is None or registered.kwargs.get("spec") == task
+    is_named = registered is None or registered.kwargs.items() <= env_spec.kwargs.items()
     named = is_named and not fields & env_spec.kwargs.keys()
 
     plain = copy.deepcopy(env_spec)

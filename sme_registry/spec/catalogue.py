@@ -17,6 +17,8 @@ from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, StudyFil
 from sme_registry.spec.sme_spec import SMESpec
 
 NAMESPACE = "SME"
+SYMMETRIC = "Symmetric"
+"""Ends the name in an id of the same task with actions in [−1, 1]: `SME/DefaultSymmetric-v1`."""
 
 _E = TypeVar("_E", bound=Envelope)
 _FOLDERS: dict[type[Envelope], str] = {
@@ -130,6 +132,11 @@ def titles(specs: Iterable[SMESpec]) -> dict[str, str]:
         digest: text if shared.count(text) == 1 else f"{text} ({tasks[digest].content_name})"
         for digest, text in plain.items()
     }
+
+
+def symmetric_name(versioned_name: str) -> str:
+    """`Default-v1` → `DefaultSymmetric-v1`."""
+    return _VERSION.sub(lambda version: SYMMETRIC + version[0], versioned_name)
 
 
 def released() -> Iterator[tuple[str, str, bool]]:

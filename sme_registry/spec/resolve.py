@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,24 @@ def resolve(task: SpecLike) -> ResolvedSpec:
             return ResolvedSpec(registered[env_id])
     if short.startswith(("sha256:", "sha256-")):
         return _by_content(short)
+    refuse_symmetric_name(short)
     registered_names = [env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered]
     return _of_file(catalogue.find(EnvFile, short, registered_names))
+
+
+def refuse_symmetric_name(name: str) -> None:
+    """Raise UnknownNameError on the name of a symmetric id, such as `DefaultSymmetric`.
+
+    It presents the task of another name; a policy for one is not read as a policy for the other.
+    """
+    short = re.sub(r"-v\d+$", "", name)
+    if short.endswith(catalogue.SYMMETRIC):
+        task = short.removesuffix(catalogue.SYMMETRIC)
+        resolve(task)  # raises where this is unknown, too
+        raise UnknownNameError(
+            f"{name!r}: stands for environments of the task {task!r} with actions in [−1, 1], not "
+            f"for a task. Use {task!r}, and action_range='symmetric' where actions are meant."
+        )
 
 
 def _of_file(file: EnvFile) -> ResolvedSpec:

@@ -24,6 +24,7 @@ from sme_registry.errors import (
     UnknownNameError,
     WrapperError,
 )
+from sme_registry.spec import EnvFile, catalogue
 from sme_registry.testing.comparing import expect_same
 from sme_registry.testing.episodes import mixed_actions
 
@@ -228,6 +229,68 @@ def test_an_unknown_keyword_is_a_type_error_in_pythons_words(make: Any) -> None:
 def test_an_unknown_name_says_what_is_near() -> None:
     with pytest.raises(UnknownNameError, match="Complexity10"):
         sme_registry.make("Complexty10")
+
+
+def test_each_single_agent_name_has_an_id_with_symmetric_actions() -> None:
+    names = [path.stem for path in catalogue.paths(EnvFile)]
+    assert not [name for name in names if catalogue.SYMMETRIC in name]
+    singles = [name for name in names if f"SME/{name}" in gymnasium.registry]
+    assert len(singles) >= 30
+    for name in singles:
+        plain, symmetric = (
+            gymnasium.spec(f"SME/{each}") for each in (name, catalogue.symmetric_name(name))
+        )
+        assert symmetric.kwargs == {**plain.kwargs, "action_range": "symmetric"}
+    ours = [env_id for env_id in gymnasium.registry if env_id.startswith("SME/")]
+    assert sum(env_id.endswith("Symmetric-v1") for env_id in ours) >= len(singles)
+    assert not [env_id for env_id in ours if env_id.startswith("SME/Team") or "Duo" in env_id]
+
+
+def test_a_symmetric_id_is_the_same_task_with_other_actions() -> None:
+    default = sme_registry.load("Default")
+    for env in (
+        gymnasium.make("SME/DefaultSymmetric-v1"),
+        gymnasium.make_vec("SME/DefaultSymmetric-v1"),
+        sme_registry.make("DefaultSymmetric"),
+        sme_registry.make("sme_registry:SME/DefaultSymmetric-v1"),
+        sme_registry.make_vec("DefaultSymmetric"),
+    ):
+        unwrapped: Any = env.unwrapped
+        assert unwrapped.sme_spec == default
+        assert env.action_space.low.min() == -1.0
+        assert env.spec.id == "SME/DefaultSymmetric-v1"
+    # Other actions, or another task, do not keep the name.
+    for changed in ({"action_range": "unit"}, {"k": 3}):
+        env = gymnasium.make("SME/DefaultSymmetric-v1", **changed)
+        unwrapped = env.unwrapped
+        assert env.spec.id == f"SME/{unwrapped.sme_spec.content_name}-v1"
+        again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+        assert again.action_space == env.action_space
+
+
+def test_a_symmetric_id_works_by_its_module_in_a_fresh_process() -> None:
+    low = fresh_python(
+        "import gymnasium\n"
+        "env = gymnasium.make('sme_registry:SME/DefaultSymmetric-v1')\n"
+        "print(env.action_space.low[0], end='')"
+    )
+    assert low == "-1.0"
+
+
+def test_a_symmetric_name_is_not_that_of_a_task() -> None:
+    with pytest.raises(UnknownNameError, match=r"Use 'Default', and action_range='symmetric'"):
+        sme_registry.load("SME/DefaultSymmetric-v1")
+    with pytest.raises(UnknownNameError, match="Did you mean 'Default-v1'"):
+        sme_registry.load("DefalutSymmetric")
+    with pytest.raises(OptionError, match="must not end with 'Symmetric'"):
+        sme_registry.register(SMESpec(k=7), "MineSymmetric")
+
+
+def test_a_registered_task_has_a_symmetric_id_too() -> None:
+    sme_registry.register(SMESpec(k=7, seed=123), "Seven")
+    env = gymnasium.make("SME/SevenSymmetric-v1")
+    assert env.unwrapped.sme_spec == SMESpec(k=7, seed=123)
+    assert env.action_space.low[0] == -1.0
 
 
 def test_an_env_spec_with_overrides_goes_by_the_derived_content() -> None:

@@ -154,7 +154,7 @@ def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
     env = sme_registry.make_parallel(file.versioned_name)
     assert env.sme_spec == spec
     _, infos = env.reset(seed=1)
-    assert infos == {name: {} for name in task.names}
+    assert tuple(infos) == task.names
     s = env.state()
     a = task.optimal_action(s)
     actions = {name: a[own] for name, own in zip(task.names, task.owned, strict=True)}
