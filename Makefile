@@ -12,15 +12,19 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo serve test check bench docs clean
+.PHONY: help install demo demo-full serve test check bench docs clean
 
 help:            ## show this list
-	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
 install: $(INSTALLED)  ## create the virtual environment with all dependencies
 
-demo: $(INSTALLED)     ## train an agent on SME/Default-v1, evaluate it, submit it to a local leaderboard
+demo: $(INSTALLED)     ## in a minute: train an agent on SME/Default-v1, evaluate it, submit it to a local leaderboard
 	$(VENV)/bin/sme demo
+	$(VENV)/bin/sme-leaderboard demo
+
+demo-full: $(INSTALLED)  ## the same in a few minutes, with TD3's default hyperparameters
+	$(VENV)/bin/sme demo --full
 	$(VENV)/bin/sme-leaderboard demo
 
 serve: $(INSTALLED)    ## serve a leaderboard on this machine: pages and submission API

@@ -700,7 +700,7 @@ class TestTrain:
 class TestDemo:
     def test_it_leaves_figures_and_a_report_that_links_them(self, tmp_path: Path) -> None:
         pytest.importorskip("stable_baselines3")
-        result = good("demo", "--quick", "--steps", "200", "--out", "demo")
+        result = good("demo", "--steps", "200", "--out", "demo")
         names = {path.name for path in (tmp_path / "demo").iterdir()}
         assert names >= {"report.md", "training_curve.png", "decay_curve.png", "model.zip"}
         text = (tmp_path / "demo/report.md").read_text()
@@ -709,7 +709,10 @@ class TestDemo:
         assert load("Default").digest in text
         assert "demo/report.md" in result.stdout
         assert "Mean regret during training" in result.stdout
-        again = sme("demo", "--quick", "--out", "demo")
+        run = json.loads((tmp_path / "demo/run.json").read_text())
+        assert "net_arch" in text
+        assert run["hyperparameters"]["policy_kwargs"] == {"net_arch": [64, 64]}
+        again = sme("demo", "--out", "demo")
         assert again.exit_code == 2
         assert "demo: contains a finished run" in again.stderr
 

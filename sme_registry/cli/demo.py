@@ -19,36 +19,45 @@ if TYPE_CHECKING:
 
 TASK = "Default-v1"
 FOLDER = Path("runs/demo")
-_STEPS, _QUICK_STEPS = 15_000, 2_000
 _STAGES = 10
+# Networks of 64² units and batches of 128 learn this task in a third of the time of TD3's defaults.
+_STEPS, _SETTINGS = 6_000, {"batch_size": 128, "policy_kwargs": {"net_arch": [64, 64]}}
+_FULL_STEPS = 15_000
 
 
 def demo(
     out_folder: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = FOLDER,
     steps: Annotated[
-        int | None, typer.Option("--steps", "-n", help=f"Training steps; default {_STEPS:,}.")
+        int | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            help=f"Training steps; default {_STEPS:,}, with --full {_FULL_STEPS:,}.",
+        ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help=f"Take a minute: {_QUICK_STEPS:,} steps, few states.")
+    full: Annotated[
+        bool, typer.Option("--full", help="TD3's default hyperparameters and a longer training.")
     ] = False,
     force: Force = False,
 ) -> None:
     """Train TD3 on SME/Default-v1, show its regret falling, evaluate it in and out of distribution.
 
-    Takes a few minutes on two cores. Writes figures and report.md, and lists them.
+    Takes less than a minute on one core, with networks of two layers of 64 units. --full takes a
+    few minutes. Writes figures and report.md, and lists them.
 
     Examples:
 
       sme demo
 
-      sme demo --quick --out demo
+      sme demo --full --out runs/full
     """
     from sme_registry import training
     from sme_registry.cli.train import how_to_continue
     from sme_registry.training.run import REPORT
 
     if steps is None:
-        steps = _QUICK_STEPS if quick else _STEPS
+        steps = _FULL_STEPS if full else _STEPS
+    settings = {} if full else _SETTINGS
     err().print(
         f"Training TD3 on SME/{TASK} for {steps:,} steps. The optimal action of every state is "
         "known, so the regret below is exact."
@@ -58,7 +67,7 @@ def demo(
             TASK,
             steps=steps,
             folder=out_folder,
-            protocol="quick-v1" if quick else "paper-v1",
+            hyperparameters=settings,
             console=err(),
             force=force or out_folder == FOLDER,
         )
