@@ -72,6 +72,8 @@ def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run: TrainingR
         model = PPO.load(path, device="cpu")
         shapes.append((model.observation_space.shape, model.action_space.shape))
         assert model.num_timesteps == 128
+        (log,) = (team_run.folder / "tensorboard" / path.stem).iterdir()
+        assert b"rollout/regret" in log.read_bytes()
     assert shapes == [((4,), (1,)), ((5,), (2,))]
     assert team_run.record.hyperparameters == SETTINGS
 

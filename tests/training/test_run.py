@@ -40,6 +40,13 @@ def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
     assert "similarity_map.png" in names
 
 
+def test_tensorboard_has_the_mean_regret_of_the_episodes(run: TrainingResult) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(run.folder / "tensorboard")).Reload()
+    (first, *_) = events.Scalars("rollout/regret")  # SB3 writes after every fourth episode
+    assert first.value == pytest.approx(np.mean([e.regret for e in run.episodes[:4]]), abs=1e-6)
+
+
 def test_the_record_describes_the_run(run: TrainingResult) -> None:
     record = RunRecord.read(run.folder)
     assert record == run.record
