@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from sme_registry import teams as teams
     from sme_registry import testing as testing
     from sme_registry import training as training
+    from sme_registry import wrappers as wrappers
     from sme_registry.evaluation import EvaluationReport, evaluate
     from sme_registry.export import export_onnx
     from sme_registry.spec import EvaluationProtocol, SMESpec
@@ -95,6 +96,7 @@ _SUBMODULES = (
     "teams",
     "testing",
     "training",
+    "wrappers",
 )
 
 

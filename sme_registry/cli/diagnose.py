@@ -58,6 +58,10 @@ def diagnose(
             help="Fit a network of the same layers to the optimal actions; takes under a minute.",
         ),
     ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option(help="With --task, the episodes.csv of the policy's training."),
+    ] = None,
     out_folder: Out = None,
     action_range: ActionRange = None,
     set_: SpecChanges = None,
@@ -85,6 +89,8 @@ def diagnose(
 
       sme diagnose mypolicy:act --task Complexity10
 
+      sme diagnose actor.onnx --task Default --log runs/mine/episodes.csv
+
       sme diagnose runs/smoke --cell 3f2a91c4
     """
     from sme_registry import diagnosis
@@ -96,7 +102,9 @@ def diagnose(
         raise OptionError("--set: changes the task of a policy. Add --task.")
     if action_range and task is None:
         raise OptionError("--action-range: applies to a policy with --task; a run records its own.")
-    subject = _subject(run, task, cell, set_, action_range)
+    if log is not None and task is None:
+        raise OptionError("--log: is the log of a policy with --task; a run has its own.")
+    subject = _subject(run, task, cell, set_, action_range, log)
     other = None
     if against is not None:
         other = _other_cell(run, task, cell, against) or _subject(
@@ -121,7 +129,12 @@ def diagnose(
 
 
 def _subject(
-    run: str, task: str | None, cell: str | None, set_: list[str] | None, action_range: str | None
+    run: str,
+    task: str | None,
+    cell: str | None,
+    set_: list[str] | None,
+    action_range: str | None,
+    log: Path | None = None,
 ) -> Subject:
     """The run, cell or policy that the arguments name."""
     from sme_registry import diagnosis
@@ -131,7 +144,7 @@ def _subject(
     if task is not None:
         spec = load(task).derive(**changes(set_))
         name = run if os.sep not in run else None
-        return diagnosis.load_policy(run, spec, action_range=action_range, name=name)
+        return diagnosis.load_policy(run, spec, action_range=action_range, name=name, log=log)
     if cell is not None:
         return diagnosis.load_cell(run, cell)
     if not Path(run).is_dir() and (Path(run).is_file() or ":" in run or os.sep not in run):

@@ -59,11 +59,19 @@ class Subject:
 
 
 def load_policy(
-    policy: Any, spec: SMESpec, *, action_range: str | None = None, name: str | None = None
+    policy: Any,
+    spec: SMESpec,
+    *,
+    action_range: str | None = None,
+    name: str | None = None,
+    log: str | Path | None = None,
 ) -> Subject:
     """A policy in any form that `evaluate` accepts, and its task.
 
+    `log` is the episodes.csv of its training, as `sme train` and `wrappers.RecordRegret` write it.
+
     Raises:
+      OptionError: the log has other columns, or cannot be read.
       SpecError: the task is for a team.
       PolicyError, OptionError, MissingDependencyError: see `as_policy`.
     """
@@ -71,7 +79,9 @@ def load_policy(
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         policy, name = load_sb3(policy), name or Path(policy).stem
     act = numpy_policy(policy, spec, action_range=action_range)
-    return Subject(name or act.name, spec, act, {}, explore=networks.exploration(policy, act))
+    episodes = None if log is None else _log_of(episode_files.read_episodes(Path(log)))
+    explore = networks.exploration(policy, act)
+    return Subject(name or act.name, spec, act, {}, episodes, explore)
 
 
 def load_run(folder: str | Path) -> Subject:
@@ -200,7 +210,10 @@ def _example_key(study: Path) -> str:
 
 
 def _episode_log(path: Path) -> Log | None:
-    rows = episode_files.read_episodes(path) if path.exists() else []
+    return _log_of(episode_files.read_episodes(path)) if path.exists() else None
+
+
+def _log_of(rows: list[episode_files.Episode]) -> Log | None:
     if not rows:
         return None
     step, regret, ended = np.array([(e.step, e.regret, e.terminated) for e in rows], float).T

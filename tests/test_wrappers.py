@@ -1,0 +1,157 @@
+"""Recorded regret is that of `info`, in every kind of loop, and the file is that of `sme train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
+
+import sme_registry
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError
+from sme_registry.training import read_episodes
+from sme_registry.wrappers import RecordRegret, RecordVectorRegret
+
+# Some episodes end by D, others at the horizon.
+SPEC = SMESpec(state_dim=3, action_dim=1, D=0.1, r_min=0.1, horizon=3)
+STEPS = 60
+
+
+def actions(lanes: int = 1) -> Any:
+    return np.random.default_rng(4).random((STEPS, lanes, 1), dtype=np.float32)
+
+
+def by_hand(env: Any, taken: Any) -> list[tuple[float, ...]]:
+    """Return, length, mean regret, mean similarity and end of each episode."""
+    env.reset(seed=0)
+    episodes: list[tuple[float, ...]] = []
+    rows: list[tuple[float, ...]] = []
+    for action in taken:
+        _, reward, terminated, truncated, info = env.step(action)
+        rows.append((reward, info["regret"], info["similarity"]))
+        if terminated or truncated:
+            rewards, regrets, similarities = np.array(rows, float).T
+            episodes.append(
+                (rewards.sum(), len(rows), regrets.mean(), similarities.mean(), terminated)
+            )
+            rows = []
+            env.reset()
+    return episodes
+
+
+def as_rows(env: Any) -> list[tuple[float, ...]]:
+    return [
+        (each.episode_return, each.length, each.regret, each.similarity, each.terminated)
+        for each in env.episodes
+    ]
+
+
+def test_each_episode_has_its_mean_regret(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "episodes.csv"
+    env = RecordRegret(sme_registry.make(SPEC), path)
+    assert np.isnan(env.online_regret)
+    env.reset(seed=0)
+    infos, regrets = [], []
+    for action in actions()[:, 0]:
+        _, _, terminated, truncated, info = env.step(action)
+        regrets.append(info["regret"])
+        assert ("episode" in info) == (terminated or truncated)
+        if terminated or truncated:
+            infos.append(info["episode"])
+            env.reset()
+    env.close()
+    expected = by_hand(sme_registry.make(SPEC), actions()[:, 0])
+    assert {episode[-1] for episode in expected} == {True, False}
+    np.testing.assert_allclose(as_rows(env), expected, atol=1e-12)
+    assert [info["regret"] for info in infos] == [episode.regret for episode in env.episodes]
+    assert env.online_regret == pytest.approx(np.mean(regrets))
+    last = env.episodes[-1].step
+    assert infos[-1]["online_regret"] == pytest.approx(np.mean(regrets[:last]))
+    read = read_episodes(path)
+    assert [each.step for each in read] == [each.step for each in env.episodes]
+    assert [each.regret for each in read] == pytest.approx([each.regret for each in env.episodes])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize("kind", ["native", "sync"])
+def test_a_vector_records_the_same_episodes_in_every_mode(kind: str, mode: str) -> None:
+    lanes, mode_ = 3, AutoresetMode(mode)
+    taken = actions(lanes)
+    if kind == "native":
+        envs: Any = sme_registry.make_vec(SPEC, lanes, autoreset_mode=mode)
+    else:
+        makers = [lambda: sme_registry.make(SPEC)] * lanes
+        envs = SyncVectorEnv(makers, autoreset_mode=mode_)
+    recorded = RecordVectorRegret(envs)
+    recorded.reset(seed=0)
+    ended = np.zeros(lanes, bool)
+    used: list[list[Any]] = [[] for _ in range(lanes)]
+    in_infos = 0
+    for action in taken:
+        if mode_ is AutoresetMode.DISABLED and ended.any():
+            recorded.reset(options={"reset_mask": ended})
+            ended = np.zeros(lanes, bool)
+        for lane in range(lanes):
+            if not (mode_ is AutoresetMode.NEXT_STEP and ended[lane]):
+                used[lane].append(action[lane])
+        _, _, terminated, truncated, info = recorded.step(action)
+        ended = terminated | truncated
+        if ended.any():
+            np.testing.assert_array_equal(info["_episode"], ended)
+            assert (info["episode"]["regret"][ended] > 0).all()
+            assert (info["episode"]["l"][~ended] == 0).all()
+        in_infos += int(ended.sum())
+    expected = []
+    for lane in range(lanes):
+        env = sme_registry.make(SPEC)
+        seeded = _Seeded(env, lane)
+        expected += by_hand(seeded, used[lane])
+    assert in_infos == len(recorded.episodes) == len(expected)
+    np.testing.assert_allclose(sorted(as_rows(recorded)), sorted(expected), atol=1e-9)
+
+
+class _Seeded(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def __init__(self, env: Any, seed: int) -> None:
+        super().__init__(env)
+        self._seed = seed
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.env.reset(seed=None if seed is None else self._seed)
+
+
+def test_it_stands_beside_gymnasiums_statistics() -> None:
+    env = RecordRegret(RecordEpisodeStatistics(sme_registry.make(SPEC)))
+    env.reset(seed=0)
+    info: dict[str, Any] = {}
+    while "episode" not in info:
+        info = env.step(np.ones(1, np.float32))[-1]
+    assert {"r", "l", "t", "regret", "similarity", "online_regret"} == set(info["episode"])
+    envs = RecordVectorRegret(RecordVectorStatistics(sme_registry.make_vec(SPEC, 2)))
+    envs.reset(seed=0)
+    info = {}
+    while "episode" not in info:
+        info = envs.step(np.ones((2, 1), np.float32))[-1]
+    assert {"r", "regret"} <= set(info["episode"])
+
+
+def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.csv"
+    path.write_text("mine")
+    with pytest.raises(OptionError, match=r"already exists.*force=True"):
+        RecordRegret(sme_registry.make(SPEC), path)
+    assert path.read_text() == "mine"
+    RecordRegret(sme_registry.make(SPEC), path, force=True).close()
+    assert path.read_text().startswith("episode,step,")
+
+
+def test_another_environment_is_refused_at_its_first_step() -> None:
+    env = RecordRegret(gymnasium.make("Pendulum-v1"))
+    env.reset(seed=0)
+    with pytest.raises(OptionError, match="info has no 'regret'"):
+        env.step(np.zeros(1, np.float32))
