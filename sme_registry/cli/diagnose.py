@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,9 @@ from sme_registry.spec import EnvFile, catalogue
 from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
-    from sme_registry.diagnosis import Diagnosis, Subject
+    from rich.console import RenderableType
+
+    from sme_registry.diagnosis import Diagnosis, Subject, TeamDiagnosis, TeamSubject
 
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 
@@ -79,6 +82,8 @@ def diagnose(
     separate causes; --against or --probe-capacity then often help. With --out, it also writes
     diagnosis.json, diagnosis.md and figures.
 
+    Of a team, it shows who is to blame for the team's regret, and where each agent's own error is.
+
     Loading a model's .zip can run code: use only files whose author you trust.
 
     Examples:
@@ -92,9 +97,10 @@ def diagnose(
       sme diagnose actor.onnx --task Default --log runs/mine/episodes.csv
 
       sme diagnose runs/smoke --cell 3f2a91c4
+
+      sme diagnose runs/Team4-PPO-seed0 --out runs/Team4-PPO-seed0/diagnosis
     """
     from sme_registry import diagnosis
-    from sme_registry.diagnosis.render import terminal
 
     if out_folder is not None:
         refuse_existing(out_folder / _JSON, force=force)
@@ -122,10 +128,20 @@ def diagnose(
     if json:
         print_json(result.to_dict())
     else:
-        for part in terminal(result):
+        for part in _terminal(result):
             out().print(part)
     if out_folder is not None:
         print_written(_write(result, subject, out_folder))
+
+
+def _terminal(result: Diagnosis | TeamDiagnosis) -> Iterator[RenderableType]:
+    from sme_registry.diagnosis import TeamDiagnosis, render, team_render
+
+    return (
+        team_render.terminal(result)
+        if isinstance(result, TeamDiagnosis)
+        else render.terminal(result)
+    )
 
 
 def _subject(
@@ -135,7 +151,7 @@ def _subject(
     set_: list[str] | None,
     action_range: str | None,
     log: Path | None = None,
-) -> Subject:
+) -> Subject | TeamSubject:
     """The run, cell or policy that the arguments name."""
     from sme_registry import diagnosis
 
@@ -167,16 +183,33 @@ def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> S
     return None if cell is None else diagnosis.load_cell(run, against)
 
 
-def _write(result: Diagnosis, subject: Subject, folder: Path) -> list[Path]:
-    from sme_registry.diagnosis.render import markdown
+def _write(
+    result: Diagnosis | TeamDiagnosis, subject: Subject | TeamSubject, folder: Path
+) -> list[Path]:
+    from sme_registry.diagnosis import TeamDiagnosis, render, team_render
 
-    figures: tuple[Path, ...] = ()
-    if can_draw():
-        from sme_registry.diagnosis.figures import draw
-
-        figures = draw(result, folder, subject.log)
-    shown = [path.name for path in figures if path.suffix == ".png"]
-    page = write_atomically(folder / _PAGE, markdown(result, shown))
+    figures = _figures(result, subject, folder) if can_draw() else ()
+    names = [path.name for path in figures if path.suffix == ".png"]
+    if isinstance(result, TeamDiagnosis):
+        text = team_render.markdown(result, names)
+    else:
+        text = render.markdown(result, names)
+    page = write_atomically(folder / _PAGE, text)
     # Last, so that the other files exist once it does.
     data = write_atomically(folder / _JSON, to_json(result.to_dict()))
     return [*figures, page, data]
+
+
+def _figures(
+    result: Diagnosis | TeamDiagnosis, subject: Subject | TeamSubject, folder: Path
+) -> tuple[Path, ...]:
+    from sme_registry.diagnosis import TeamDiagnosis, TeamSubject
+
+    if isinstance(result, TeamDiagnosis) or isinstance(subject, TeamSubject):
+        from sme_registry.diagnosis.team_figures import draw_team
+
+        assert isinstance(result, TeamDiagnosis)  # of a team's subject
+        return draw_team(result, folder)
+    from sme_registry.diagnosis.figures import draw
+
+    return draw(result, folder, subject.log)

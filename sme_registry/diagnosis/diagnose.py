@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import overload
 
 from sme_registry.diagnosis import measure, networks, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
 from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
 from sme_registry.diagnosis.questions import THRESHOLDS
-from sme_registry.diagnosis.subject import Subject
+from sme_registry.diagnosis.subject import Subject, TeamSubject
+from sme_registry.diagnosis.team import diagnose_team
+from sme_registry.diagnosis.team_document import TeamDiagnosis
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import Perceptron
 from sme_registry.io import integer_in, versions
-from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import materialize
 
 __all__ = ["EPISODES", "STATES", "diagnose"]
@@ -19,30 +22,60 @@ __all__ = ["EPISODES", "STATES", "diagnose"]
 STATES, EPISODES = 8192, 64
 
 
+@overload
 def diagnose(
     subject: Subject,
     *,
-    against: Subject | None = None,
+    against: Subject | TeamSubject | None = None,
     probe_capacity: bool = False,
     states: int = STATES,
     episodes: int = EPISODES,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> Diagnosis:
+) -> Diagnosis: ...
+
+
+@overload
+def diagnose(
+    subject: TeamSubject,
+    *,
+    against: Subject | TeamSubject | None = None,
+    probe_capacity: bool = False,
+    states: int = STATES,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> TeamDiagnosis: ...
+
+
+def diagnose(
+    subject: Subject | TeamSubject,
+    *,
+    against: Subject | TeamSubject | None = None,
+    probe_capacity: bool = False,
+    states: int = STATES,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis | TeamDiagnosis:
     """Measure a policy and the references, and answer every question about its regret.
+
+    Of a team, it measures every agent over its own action channels, and answers who is to blame
+    for the team's regret.
 
     Args:
       subject: from `load_run`, `load_cell` or `load_policy`.
-      against: another run, e.g. with a single axis changed. It is measured in the same way.
+      against: another run of a single agent, e.g. with a single axis changed. It is measured in
+        the same way.
       probe_capacity: fit a network of the same layers to a*; tens of seconds. Ignored if the
-        policy's network is unknown.
+        policy's network is unknown. Single agents only.
       states: uniform states, in [64, 1,000,000]; fewer are used if a state is large.
       episodes: in [8, 10,000]; fewer are used if a state is large.
       seed: of everything random here, at least 0.
       progress: called with a description of each step.
 
     Raises:
-      OptionError: an argument is out of range.
+      OptionError: an argument is out of range, or needs a single agent.
       PolicyError: the policy's actions are invalid.
       MissingDependencyError: the probe needs PyTorch, which is not installed.
       ResourceLimitError: the task does not fit in memory.
@@ -51,6 +84,13 @@ def diagnose(
     episodes = integer_in("episodes", episodes, 8, 10_000)
     seed = integer_in("seed", seed, 0, 2**53 - 1)
     report = progress or (lambda description: None)
+    if isinstance(subject, TeamSubject) or isinstance(against, TeamSubject):
+        if isinstance(subject, Subject) or against is not None or probe_capacity:
+            raise OptionError(
+                "against, probe_capacity: compare runs and fit networks of single agents only. "
+                "Leave them out for a team."
+            )
+        return diagnose_team(subject, states, episodes, seed, report)
     measurements = _measurements(subject, states, episodes, seed, report)
     if probe_capacity:
         probe = _probe(subject, seed, report)
@@ -79,18 +119,12 @@ def _measurements(
     subject: Subject, states: int, episodes: int, seed: int, report: Callable[[str], None]
 ) -> Measurements:
     task, policy = materialize(subject.spec), subject.policy
-    report(f"{subject.name}: uniform states")
     references = measure.fit_references(task, states, seed)
-    protocol = EvaluationProtocol(states_per_region=measure.affordable(task, states), seed=seed)
-    sample = measure.sample(policy, task, references, protocol, 0)
-    uniform = measure.scores(task, sample)
-    time_dependence, time_variance = measure.time_dependence(policy, task, sample)
-    squared_error = measure.squared_error(policy, task, sample, time_variance)
-    response = measure.response(policy, task, sample, seed)
-    report(f"{subject.name}: shells")
-    shells = measure.shells(policy, task, references, seed, uniform)
+    report(f"{subject.name}: uniform states and shells")
+    fields, sample = measure.fixed_states(policy, task, references, states, seed)
     report(f"{subject.name}: episodes")
-    on_policy = rollouts.on_policy(policy, task, references, episodes, seed)
+    (runs,) = rollouts.episodes_of(policy.start(), task, references, episodes, seed)
+    on_policy = rollouts.on_policy(task, runs)
     training = exploration_sd = None
     if subject.log is not None:
         constant = min(on_policy.scores[name].regret for name in rollouts.CONSTANTS)
@@ -98,16 +132,7 @@ def _measurements(
     if subject.explore is not None:
         exploration_sd = networks.exploration_sd(subject.explore, sample.observation, seed)
     return Measurements(
-        uniform=uniform,
-        channels=measure.channels(task, sample),
-        partitions=measure.partitions(task, sample),
-        shells=shells,
-        squared_error=squared_error,
-        response=response,
-        time_dependence=time_dependence,
-        on_policy=on_policy,
-        training=training,
-        exploration_sd=exploration_sd,
+        **fields, on_policy=on_policy, training=training, exploration_sd=exploration_sd
     )
 
 

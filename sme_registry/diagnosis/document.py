@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 Answer = Literal["yes", "no", "cannot tell"]
-Kind = Literal["where", "why"]
+Kind = Literal["who", "where", "why"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
@@ -148,7 +148,7 @@ class OnPolicy(StrictModel):
     mae: TupleOf[Real]
     alive: TupleOf[Real]  # the share of those
     mean_length: Real  # of an episode, in steps
-    termination_rate: Real  # share of episodes that D terminated
+    termination_rate: Real  # share of episodes that D terminated, in a team because of this agent
     signal: RewardSignal  # in the states that the policy visits
     random_signal: RewardSignal  # under uniform random actions, as an untrained agent sees it
     credit: Real | None
@@ -213,7 +213,7 @@ class Verdict(StrictModel):
     """The answer to one question, as data; `render.sentence` puts it in words."""
 
     question: str  # such as "sparsity"
-    kind: Kind  # "where" the error is, or "why" it is there
+    kind: Kind  # "where" the error is, "why" it is there, or "who" in a team makes it
     answer: Answer  # "cannot tell" if the evidence does not separate the causes
     reason: str  # the rule's branch that decided; see `verdicts.QUESTIONS`
     evidence: dict[str, JsonValue]  # the numbers that the branch compared or reports

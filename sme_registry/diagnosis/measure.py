@@ -6,7 +6,7 @@ stream of one seed, so the same policy gets the same measurements.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,7 @@ __all__ = [
     "channels",
     "clipped_actions",
     "fit_references",
+    "fixed_states",
     "partitions",
     "response",
     "sample",
@@ -82,7 +83,8 @@ def fit_references(task: Task, states: int, seed: int) -> references.References:
     """Fit the references on uniform states that no measurement uses."""
     count = min(4 * affordable(task, states), references.fit_states(task.spec))
     s = streams.uniform(seed, "diagnosis/fit", count * task.spec.state_dim).reshape(count, -1)
-    return references.fit(s, engine(task).optimal_action(s))
+    agents = zip(task.observed, task.owned, strict=True)
+    return references.fit(s, engine(task).optimal_action(s), agents)
 
 
 def sample(
@@ -99,6 +101,26 @@ def sample(
     random = streams.uniform(protocol.seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
     return Sample(observation, s, clipped_actions(policy, observation), optimal, actions)
+
+
+def fixed_states(
+    policy: Policy, task: Task, fitted: references.References, states: int, seed: int
+) -> tuple[dict[str, Any], Sample]:
+    """The fields of `Measurements` that need no episodes, and the uniform states."""
+    protocol = EvaluationProtocol(states_per_region=affordable(task, states), seed=seed)
+    uniform = sample(policy, task, fitted, protocol, 0)
+    uniform_scores = scores(task, uniform)
+    dependence, time_variance = time_dependence(policy, task, uniform)
+    fields = {
+        "uniform": uniform_scores,
+        "squared_error": squared_error(policy, task, uniform, time_variance),
+        "response": response(policy, task, uniform, seed),
+        "time_dependence": dependence,
+        "shells": shells(policy, task, fitted, seed, uniform_scores),
+        "channels": channels(task, uniform),
+        "partitions": partitions(task, uniform),
+    }
+    return fields, uniform
 
 
 def scores(task: Task, states: Sample) -> dict[str, Score]:

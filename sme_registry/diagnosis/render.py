@@ -8,19 +8,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sme_registry.diagnosis.document import POLICY, Diagnosis, Verdict
+from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.diagnosis.verdicts import COMPARISON_REASONS
 from sme_registry.evaluation.report import LABELS
 from sme_registry.spec import catalogue
-from sme_registry.terminal.templates import environment
+from sme_registry.terminal.templates import environment as sentence_environment
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from rich.console import RenderableType
 
-__all__ = ["headline", "label", "markdown", "sentence", "terminal", "title"]
+__all__ = [
+    "COLOURS",
+    "headline",
+    "label",
+    "markdown",
+    "sentence",
+    "templates",
+    "terminal",
+    "title",
+    "words",
+]
 
 _HEADINGS = {"where": "Where the error is", "why": "Why"}
-_COLOURS = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
+COLOURS = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
 
 
 def label(question: str) -> str:
@@ -29,15 +40,16 @@ def label(question: str) -> str:
 
 
 @cache
-def _templates() -> Environment:
-    templates = environment(Path(__file__).parent / "templates", autoescape=False)
-    templates.filters["label"] = label
-    return templates
+def templates() -> Environment:
+    """The templates of diagnoses."""
+    environment = sentence_environment(Path(__file__).parent / "templates", autoescape=False)
+    environment.filters["label"] = label
+    return environment
 
 
-def _words(macro: str, *arguments: Any) -> str:
-    """A macro of sentences.jinja, on one line."""
-    macros: Any = _templates().get_template("sentences.jinja").module
+def words(macro: str, *arguments: Any, template: str = "sentences.jinja") -> str:
+    """A macro of a template, on one line."""
+    macros: Any = templates().get_template(template).module
     return " ".join(getattr(macros, macro)(*arguments).split())
 
 
@@ -45,15 +57,15 @@ def sentence(verdict: Verdict) -> str:
     """The verdict's reason, with its evidence and thresholds, in a few sentences."""
     macro = "compared" if verdict.reason in COMPARISON_REASONS else verdict.question
     macro = "solved" if verdict.reason == "solved" else macro
-    return _words(macro, verdict.reason, verdict.evidence, verdict.thresholds)
+    return words(macro, verdict.reason, verdict.evidence, verdict.thresholds)
 
 
 def headline(diagnosis: Diagnosis) -> str:
     """How good the policy is, where its error stands out, and which causes are established."""
-    return _words("headline", diagnosis)
+    return words("headline", diagnosis)
 
 
-def title(diagnosis: Diagnosis) -> str:
+def title(diagnosis: Diagnosis | TeamDiagnosis) -> str:
     """The run or policy, and its task."""
     spec = diagnosis.spec
     task = catalogue.title(spec.named(diagnosis.task))
@@ -79,11 +91,11 @@ def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
         table.add_column(no_wrap=True, min_width=11)
         table.add_column(overflow="fold")
         for question, answer, text in rows:
-            table.add_row(question, f"[{_COLOURS[answer]}]{answer}[/]", escape(text))
+            table.add_row(question, f"[{COLOURS[answer]}]{answer}[/]", escape(text))
         yield table
     if diagnosis.comparison is not None:
         yield ""
-        heading = escape(_words("comparison", diagnosis.comparison))
+        heading = escape(words("comparison", diagnosis.comparison))
         numbers = ("this run", "other run", "difference")
         differences = Table(heading, {"": "text", **dict.fromkeys(numbers, "number")})
         for row in diagnosis.comparison.differences:
@@ -96,7 +108,7 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
     """The diagnosis as a page that shows figures of the same folder."""
     comparison = diagnosis.comparison
     return (
-        _templates()
+        templates()
         .get_template("diagnosis.md.jinja")
         .render(
             diagnosis=diagnosis,
@@ -104,7 +116,7 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
             title=title(diagnosis),
             headline=headline(diagnosis),
             verdicts=_rows(diagnosis),
-            comparison_title=comparison and _words("comparison", comparison),
+            comparison_title=comparison and words("comparison", comparison),
             policies={POLICY: "**this policy**", **LABELS},
             figures=figures,
         )

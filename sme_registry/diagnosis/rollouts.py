@@ -18,12 +18,19 @@ from sme_registry.diagnosis.measure import MAX_NUMBERS
 from sme_registry.diagnosis.subject import Log
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Mask, Observation
-from sme_registry.evaluation import Policy, references
+from sme_registry.evaluation import references
 from sme_registry.statistics import smoothed
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
 
-__all__ = ["CONSTANTS", "Trajectories", "on_policy", "rollout", "training"]
+__all__ = [
+    "CONSTANTS",
+    "Trajectories",
+    "episodes_of",
+    "on_policy",
+    "rollout",
+    "training",
+]
 
 CONSTANTS = ("best_constant", "constant_half")
 _TIME_BINS, _COVERAGE_BINS = 10, 20
@@ -32,16 +39,21 @@ _TINY = 1e-12
 
 
 class Trajectories(NamedTuple):
-    """Episodes side by side, up to the end of the longest."""
+    """Episodes side by side, up to the end of the longest, as one agent experiences them.
+
+    In a team that shares a reward, an agent's step reward here is that of its own similarity, and
+    its payout is the team's.
+    """
 
     s: Array  # `[T, n, S]` states
+    a: Array  # `[T, n, A]` actions of all agents
     mae: Array  # `[T, n]` mean |a − a*| over channels
     constant_mae: Array  # `[T, n]` the same of the constant ½
     reward: Array  # `[T, n]` step reward r
     payout: Array  # `[T, n]` payout R
     alive: Mask  # `[T, n]` whether the episode was still running
     payout_due: Mask  # `[T, n]` whether a payout was due after the step
-    terminated: Mask  # `[n]` whether D terminated the episode
+    terminated: Mask  # `[n]` whether D terminated the episode because of this agent
 
     def mean(self, values: Array | Mask) -> float:
         """Over all steps of all episodes."""
@@ -58,38 +70,70 @@ class Trajectories(NamedTuple):
         )
 
 
-def rollout(act: Callable[[Observation], Array], task: Task, initial_states: Array) -> Trajectories:
-    """Whole episodes of a policy in the unit range, from initial states `[n, S]`."""
-    n = len(initial_states)
+def rollout(
+    act: Callable[[Observation], Array], task: Task, initial_states: Array
+) -> tuple[Trajectories, ...]:
+    """Whole episodes of a policy in the unit range, from initial states `[n, S]`, by agent.
+
+    `act` maps joint observations `[n, S + 1 + m]` of m agents (one where there is no team) to the
+    actions `[n, A]` of all.
+    """
+    n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
     observation = batch.observe()
     batch.begin(np.arange(n), observation, initial_states)
-    alive, terminated = np.ones(n, bool), np.zeros(n, bool)
+    alive, terminated = np.ones(n, bool), np.zeros((agents, n), bool)
     rows: list[tuple[npt.NDArray[Any], ...]] = []
     while alive.any():
         s, a = batch.state, np.clip(act(observation.copy()), 0.0, 1.0)
         step = batch.advance(np.ascontiguousarray(a, np.float64))
         due = ((len(rows) + 1) % task.spec.k == 0) | step.truncated
-        mae, constant_mae = (np.abs(x - step.optimal).mean(axis=1) for x in (a, 0.5))
-        reward, payout = step.values[STEP_REWARD, 0].copy(), step.values[REWARD, 0].copy()
-        rows.append((s, mae, constant_mae, reward, payout, alive.copy(), due))
-        terminated |= alive & step.terminated
+        mae, constant_mae = (_mae(task, x - step.optimal) for x in (a, 0.5))
+        received, payout = step.values[STEP_REWARD].copy(), step.values[REWARD].copy()
+        reward = task.reward_of(1.0 - mae) if task.pays_the_team else received
+        rows.append((s, a, mae, constant_mae, reward, payout, alive.copy(), due))
+        terminated |= alive & step.terminated & (received < task.spec.D)
         alive &= ~(step.terminated | step.truncated)
         observation = step.observation
-    s, mae, constant_mae, reward, payout, running, due = map(np.array, zip(*rows, strict=True))
-    return Trajectories(s, mae, constant_mae, reward, payout, running, due, terminated)
+    s, a, mae, constant_mae, reward, payout, running, due = map(np.array, zip(*rows, strict=True))
+    return tuple(
+        Trajectories(
+            s, a, mae[:, i], constant_mae[:, i], reward[:, i], payout[:, i], running, due, ended
+        )
+        for i, ended in enumerate(terminated)
+    )
 
 
-def on_policy(
-    policy: Policy, task: Task, fitted: references.References, episodes: int, seed: int
-) -> OnPolicy:
-    """Whole episodes of the policy and of references, from the same initial states."""
+def _mae(task: Task, difference: Array) -> Array:
+    """`[m, n]` mean |a − a*| over each agent's channels, of differences `[n, A]`."""
+    distance = np.abs(difference)
+    return np.stack([distance[:, owned].mean(axis=1) for owned in task.owned])
+
+
+def episodes_of(
+    act: Callable[[Observation], Array],
+    task: Task,
+    fitted: references.References,
+    episodes: int,
+    seed: int,
+) -> tuple[dict[str, Trajectories], ...]:
+    """Whole episodes of the policy and of references, from the same initial states.
+
+    Returns:
+      For each agent, its trajectories under the policy and under each reference.
+    """
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
     starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
-    runs = {POLICY: rollout(policy.start(), task, starts)}
-    for name, act in _reference_actions(task, fitted, n, seed).items():
-        runs[name] = rollout(act, task, starts)
+    runs = {POLICY: rollout(act, task, starts)}
+    for name, reference in _reference_actions(task, fitted, n, seed).items():
+        runs[name] = rollout(reference, task, starts)
+    return tuple(dict(zip(runs, each, strict=True)) for each in zip(*runs.values(), strict=True))
+
+
+def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
+    """A summary of one agent's episodes, from `episodes_of`."""
+    S, n = task.spec.state_dim, len(runs[POLICY].terminated)
     run, random = runs[POLICY], runs["uniform_random"]
     edges = np.linspace(0, len(run.s), min(_TIME_BINS, len(run.s)) + 1).round().astype(int)
     bins = [slice(low, high) for low, high in itertools.pairwise(edges.tolist())]
@@ -115,7 +159,7 @@ def on_policy(
 def _reference_actions(
     task: Task, fitted: references.References, n: int, seed: int
 ) -> dict[str, Callable[[Observation], Array]]:
-    """The references as functions of observations `[n, S + 2]`."""
+    """The references as functions of joint observations `[n, S + 1 + m]`."""
     S, A = task.spec.state_dim, task.spec.action_dim
     bits = streams.bit_generator(seed, "diagnosis/random_action")
     return {

@@ -17,7 +17,7 @@ from pydantic import JsonValue
 from sme_registry.diagnosis import networks
 from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
-from sme_registry.evaluation import Policy, load_sb3
+from sme_registry.evaluation import Policy, TeamPolicy, as_policy, load_sb3
 from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import Cell
@@ -27,7 +27,7 @@ from sme_registry.training import episodes as episode_files
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import MODEL
 
-__all__ = ["Log", "Subject", "load_cell", "load_policy", "load_run"]
+__all__ = ["Log", "Subject", "TeamSubject", "load_cell", "load_policy", "load_run"]
 
 _MIN_DIGITS = 6
 
@@ -58,6 +58,17 @@ class Subject:
     checkpoint_step: int | None = None  # of an unfinished run, the steps at its checkpoint
 
 
+@dataclass(frozen=True, eq=False)
+class TeamSubject:
+    """The policies of a team's agents; the fields of `Subject`."""
+
+    name: str
+    spec: SMESpec  # of a team
+    policy: TeamPolicy
+    plan: dict[str, JsonValue]
+    checkpoint_step: int | None = None
+
+
 def load_policy(
     policy: Any,
     spec: SMESpec,
@@ -65,17 +76,20 @@ def load_policy(
     action_range: str | None = None,
     name: str | None = None,
     log: str | Path | None = None,
-) -> Subject:
+) -> Subject | TeamSubject:
     """A policy in any form that `evaluate` accepts, and its task.
 
     `log` is the episodes.csv of its training, as `sme train` and `wrappers.RecordRegret` write it.
 
     Raises:
       OptionError: the log has other columns, or cannot be read.
-      SpecError: the task is for a team.
       PolicyError, OptionError, MissingDependencyError: see `as_policy`.
     """
-    _require_single_agent(spec)
+    if spec.team is not None:
+        if log is not None:
+            raise OptionError("log: of a team is not used. Leave it out.")
+        team = _team_policy(policy, spec, action_range)
+        return TeamSubject(name or team.name, spec, team, {})
     if isinstance(policy, str | Path) and str(policy).endswith(".zip"):
         policy, name = load_sb3(policy), name or Path(policy).stem
     act = numpy_policy(policy, spec, action_range=action_range)
@@ -84,12 +98,12 @@ def load_policy(
     return Subject(name or act.name, spec, act, {}, episodes, explore)
 
 
-def load_run(folder: str | Path) -> Subject:
+def load_run(folder: str | Path) -> Subject | TeamSubject:
     """A run of `sme train`, finished or not.
 
     Raises:
       OptionError: the folder holds no run, or the run has neither a model nor a checkpoint yet.
-      MalformedDocumentError, SpecError: run.json is damaged, or the task is for a team.
+      MalformedDocumentError, SpecError: run.json is damaged.
       PolicyError, MissingDependencyError: its model cannot be loaded.
     """
     folder = Path(folder)
@@ -101,7 +115,6 @@ def load_run(folder: str | Path) -> Subject:
         if (folder / "cells").is_dir():
             advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
         raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
-    _require_single_agent(record.spec)
     path, checkpoint_step = folder / MODEL, None
     if not path.exists():
         path, checkpoint_step = folder / checkpoint.FILE, record.steps_done
@@ -110,18 +123,28 @@ def load_run(folder: str | Path) -> Subject:
             f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Wait for its "
             "first checkpoint, or continue it with `sme train … --resume`."
         )
-    model = load_sb3(path)
-    policy = numpy_policy(model, record.spec, action_range=record.action_range)
+    model, spec, name = load_sb3(path), record.spec.named(record.task), folder.name or str(folder)
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
+    plan = {field: getattr(record, field) for field in fields}
+    if spec.team is not None:
+        team = _team_policy(model, spec, record.action_range)
+        return TeamSubject(name, spec, team, plan, checkpoint_step)
+    policy = numpy_policy(model, record.spec, action_range=record.action_range)
     return Subject(
-        folder.name or str(folder),
-        record.spec.named(record.task),
+        name,
+        spec,
         policy,
-        {field: getattr(record, field) for field in fields},
+        plan,
         _episode_log(folder / episode_files.FILE),
         networks.exploration(model, policy),
         checkpoint_step,
     )
+
+
+def _team_policy(policy: Any, spec: SMESpec, action_range: str | None) -> TeamPolicy:
+    team = as_policy(policy, spec, action_range=action_range)
+    assert isinstance(team, TeamPolicy)  # of a team's spec
+    return team
 
 
 def load_cell(study: str | Path, key: str) -> Subject:
@@ -194,14 +217,6 @@ def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
             "the study in a new folder, with --keep-models."
         )
     return load_sb3(path)
-
-
-def _require_single_agent(spec: SMESpec) -> None:
-    if spec.team is not None:
-        raise SpecError(
-            f"team: diagnosis supports one agent, and this task has {len(spec.team.agents)}. Use "
-            "`sme evaluate`, which reports each agent of a team."
-        )
 
 
 def _example_key(study: Path) -> str:

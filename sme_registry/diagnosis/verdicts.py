@@ -6,6 +6,8 @@ field decided by the difference in normalised regret.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sme_registry.diagnosis.document import Answer, Comparison, Level, Measurements, Verdict
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
 from sme_registry.diagnosis.questions import Case, Outcome, Question
@@ -29,11 +31,14 @@ SOLVED: dict[str, Answer] = {"solved": "no"}
 
 
 def judge(
-    measurements: Measurements, spec: SMESpec, comparison: Comparison | None = None
+    measurements: Measurements,
+    spec: SMESpec,
+    comparison: Comparison | None = None,
+    questions: Iterable[str] = tuple(QUESTIONS),
 ) -> tuple[Verdict, ...]:
-    """Answer every question; a comparison in a single field decides the question of that field."""
+    """Answer questions; a comparison in a single field decides the question of that field."""
     case = Case(measurements, spec, comparison)
-    return tuple(_verdict(case, name, question) for name, question in QUESTIONS.items())
+    return tuple(_verdict(case, name, QUESTIONS[name]) for name in questions)
 
 
 def level(measurements: Measurements) -> Level:

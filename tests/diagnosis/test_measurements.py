@@ -76,7 +76,7 @@ def test_rewards_of_an_episode_that_D_terminated_before_a_payout_have_no_credit(
     payout_due = np.array([[0, 0], [0, 1], [0, 0], [0, 1]], bool)
     zeros = np.zeros((4, 2))
     trajectories = rollouts.Trajectories(
-        np.zeros((4, 2, 1)), zeros, zeros, reward, payout, alive, payout_due,
+        np.zeros((4, 2, 1)), np.zeros((4, 2, 1)), zeros, zeros, reward, payout, alive, payout_due,
         np.array([True, False]),
     )  # fmt: skip
     by_hand = np.corrcoef([0.2, 0.9, 0.4, 0.6], [1.1, 1.1, 1.0, 1.0])[0, 1] ** 2

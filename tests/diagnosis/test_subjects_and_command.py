@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sme_registry import SMESpec
 from sme_registry.cli import app
 from sme_registry.diagnosis import (
     Diagnosis,
     diagnose,
     load_cell,
-    load_policy,
     load_run,
     render,
 )
@@ -27,16 +25,12 @@ from sme_registry.errors import (
     DigestMismatchError,
     OptionError,
     PolicyError,
-    SpecError,
     UnknownNameError,
 )
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
 
 
 def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
-    team = SMESpec(team={"agents": [{"action_dim": 2}, {"action_dim": 2}], "reward": "team"})
-    with pytest.raises(SpecError, match="one agent"):
-        load_policy(shrunk, team)
     with pytest.raises(OptionError, match="no such folder"):
         load_run(tmp_path / "absent")
     with pytest.raises(OptionError, match=r"run\.json"):

@@ -1,0 +1,65 @@
+"""`TeamDiagnosis`: who is to blame for a team's regret, and where each agent's own regret is.
+
+In the states s of uniform samples or of the team's own episodes, with joint actions a:
+
+    regret share of agent i        regret · d_i / Σ_j d_j,  d_i = ‖a_i − a*_i‖₁; they add up to it
+    difference reward of agent i   the team's gain in step reward if agent i alone acted optimally
+
+The team's regret is that of the mean similarity over all action channels, in either reward mode.
+"""
+
+from __future__ import annotations
+
+from pydantic import JsonValue
+
+from sme_registry.diagnosis.document import Level, Measurements, Score, Verdict
+from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
+
+__all__ = ["AgentDiagnosis", "Credit", "TeamDiagnosis"]
+
+
+class Credit(StrictModel):
+    """An agent's part in the team's regret; means over states."""
+
+    regret_share: Real  # in units of regret: over the agents, they add up to the team's regret
+    difference_reward: Real  # in [0, 1]; these do not add up, because the step reward is clipped
+
+
+class AgentDiagnosis(StrictModel):
+    """One agent of a team, measured over its own action channels."""
+
+    name: str
+    state_channels: TupleOf[Integer]  # that it observes, from 1
+    action_channels: TupleOf[Integer]  # that it owns, from 1
+    level: Level
+    uniform: Credit  # in uniform states
+    visited: Credit  # in the states that the team visits
+    verdicts: TupleOf[Verdict]  # on its own policy
+    measurements: Measurements
+
+
+class TeamDiagnosis(StrictModel):
+    """The diagnosis of a team's policies."""
+
+    schema_version: SchemaVersion = 1
+    name: str  # of the run or policy
+    spec: SMESpec
+    spec_digest: Digest
+    task: str = ""  # its name
+    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
+    checkpoint_step: Integer | None = None  # of an unfinished run, the steps at its checkpoint
+    uniform: Score  # of the team, in uniform states
+    visited: Score  # of the team, in the states of its own episodes
+    verdicts: TupleOf[Verdict]  # on the team: who
+    agents: TupleOf[AgentDiagnosis]  # in the order of the channels that they own
+    left_out: TupleOf[str]  # questions of a single agent's diagnosis without an answer for a team
+    thresholds: dict[str, Real]  # all that verdicts use
+    versions: dict[str, str]
+
+    def verdict(self, question: str) -> Verdict:
+        """The verdict on a question about the team, such as "blame"."""
+        return next(verdict for verdict in self.verdicts if verdict.question == question)
+
+    def agent(self, name: str) -> AgentDiagnosis:
+        """One agent, by its name."""
+        return next(agent for agent in self.agents if agent.name == name)

@@ -1,0 +1,126 @@
+"""A team's diagnosis in words, for the terminal and as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from sme_registry.diagnosis.document import POLICY, Verdict
+from sme_registry.diagnosis.render import COLOURS, label, sentence, templates, title, words
+from sme_registry.diagnosis.team_document import AgentDiagnosis, TeamDiagnosis
+from sme_registry.terminal import fixed
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+__all__ = ["headline", "markdown", "team_sentence", "terminal"]
+
+_SENTENCES = "team_sentences.jinja"
+_COLUMNS = (
+    "agent",
+    "share of regret",
+    "of channels",
+    "N, uniform",
+    "N, own episodes",
+    "N, linear",
+    "gain if optimal",
+)
+_Rows = list[tuple[str, str, str]]
+
+
+def headline(diagnosis: TeamDiagnosis) -> str:
+    """How good the team is, and who is to blame."""
+    return words("headline", diagnosis, template=_SENTENCES)
+
+
+def team_sentence(verdict: Verdict) -> str:
+    """The reason of a verdict on the team, with its evidence and thresholds."""
+    reason, evidence, thresholds = verdict.reason, verdict.evidence, verdict.thresholds
+    return words(verdict.question, reason, evidence, thresholds, template=_SENTENCES)
+
+
+def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
+    """What `sme diagnose` prints of a team, part by part."""
+    from rich.markup import escape
+
+    from sme_registry.terminal import table
+
+    yield f"[bold]{escape(title(diagnosis))}[/]"
+    yield escape(headline(diagnosis))
+    yield table(
+        "",
+        {name: "number" if index else "name" for index, name in enumerate(_COLUMNS)},
+        [[escape(cell) for cell in row] for row in _numbers(diagnosis)],
+        caption="N: normalised regret over the agent's channels · gain if optimal: of the team's "
+        "step reward, if this agent alone acted optimally",
+    )
+    yield from _answers("Who is to blame", _team_rows(diagnosis))
+    for agent in diagnosis.agents:
+        rows = [row for row in _agent_rows(agent) if row[1] == "yes"]
+        yield from _answers(f"Where the error of {agent.name} is", rows)
+    yield escape(words("left_out", diagnosis.left_out, template=_SENTENCES))
+
+
+def _answers(heading: str, rows: _Rows) -> Iterator[RenderableType]:
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not rows:
+        return
+    answers = Table(title=heading, title_justify="left", show_header=False, box=None)
+    answers.add_column(style="cyan", no_wrap=True, min_width=19)
+    answers.add_column(no_wrap=True, min_width=4)
+    answers.add_column(overflow="fold")
+    for question, answer, text in rows:
+        answers.add_row(question, f"[{COLOURS[answer]}]{answer}[/]", escape(text))
+    yield answers
+
+
+def markdown(diagnosis: TeamDiagnosis, figures: Sequence[str] = ()) -> str:
+    """The diagnosis as a page that shows figures of the same folder."""
+    return (
+        templates()
+        .get_template("team.md.jinja")
+        .render(
+            diagnosis=diagnosis,
+            title=title(diagnosis),
+            headline=headline(diagnosis),
+            columns=_COLUMNS,
+            rows=_numbers(diagnosis),
+            verdicts=_team_rows(diagnosis),
+            agents={agent.name: _agent_rows(agent) for agent in diagnosis.agents},
+            left_out=words("left_out", diagnosis.left_out, template=_SENTENCES),
+            figures=figures,
+        )
+    )
+
+
+def _numbers(diagnosis: TeamDiagnosis) -> list[tuple[str, ...]]:
+    """The row of each agent under `_COLUMNS`."""
+    regret = max(diagnosis.visited.regret, 1e-12)
+    rows = []
+    for agent in diagnosis.agents:
+        measured = agent.measurements
+        regrets = (
+            measured.policy.normalised_regret,
+            measured.on_policy.scores[POLICY].normalised_regret,
+            measured.uniform["linear_least_squares"].normalised_regret,
+        )
+        rows.append(
+            (
+                agent.name,
+                f"{agent.visited.regret_share / regret:.0%}",
+                f"{len(agent.action_channels) / diagnosis.spec.action_dim:.0%}",
+                *map(fixed, regrets),
+                fixed(agent.visited.difference_reward),
+            )
+        )
+    return rows
+
+
+def _team_rows(diagnosis: TeamDiagnosis) -> _Rows:
+    return [(label(v.question), v.answer, team_sentence(v)) for v in diagnosis.verdicts]
+
+
+def _agent_rows(agent: AgentDiagnosis) -> _Rows:
+    return [(label(v.question), v.answer, sentence(v)) for v in agent.verdicts]
