@@ -115,7 +115,12 @@ def load_run(folder: str | Path) -> Subject | TeamSubject:
         if (folder / "cells").is_dir():
             advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
         raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
-    path, checkpoint_step = folder / MODEL, None
+    path, checkpoint_step = folder / record.model_name, None
+    if record.independent and not path.exists():
+        raise OptionError(
+            f"run={str(folder)!r}: independent agents are diagnosed when their training has ended. "
+            "Continue it with `sme train … --resume`."
+        )
     if not path.exists():
         path, checkpoint_step = folder / checkpoint.FILE, record.steps_done
     if not path.exists():
@@ -123,12 +128,13 @@ def load_run(folder: str | Path) -> Subject | TeamSubject:
             f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Wait for its "
             "first checkpoint, or continue it with `sme train … --resume`."
         )
-    model, spec, name = load_sb3(path), record.spec.named(record.task), folder.name or str(folder)
+    spec, name = record.spec.named(record.task), folder.name or str(folder)
     fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
     plan = {field: getattr(record, field) for field in fields}
     if spec.team is not None:
-        team = _team_policy(model, spec, record.action_range)
+        team = _team_policy(str(path), spec, record.action_range)
         return TeamSubject(name, spec, team, plan, checkpoint_step)
+    model = load_sb3(path)
     policy = numpy_policy(model, record.spec, action_range=record.action_range)
     return Subject(
         name,

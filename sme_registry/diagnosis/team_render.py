@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sme_registry.diagnosis.document import POLICY, Verdict
 from sme_registry.diagnosis.render import COLOURS, label, sentence, templates, title, words
 from sme_registry.diagnosis.team_document import AgentDiagnosis, TeamDiagnosis
-from sme_registry.terminal import fixed
+from sme_registry.terminal import Table, fixed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -43,11 +43,9 @@ def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
     """What `sme diagnose` prints of a team, part by part."""
     from rich.markup import escape
 
-    from sme_registry.terminal import table
-
     yield f"[bold]{escape(title(diagnosis))}[/]"
     yield escape(headline(diagnosis))
-    yield table(
+    yield Table(
         "",
         {name: "number" if index else "name" for index, name in enumerate(_COLUMNS)},
         [[escape(cell) for cell in row] for row in _numbers(diagnosis)],
@@ -63,11 +61,11 @@ def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
 
 def _answers(heading: str, rows: _Rows) -> Iterator[RenderableType]:
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Table as RichTable
 
     if not rows:
         return
-    answers = Table(title=heading, title_justify="left", show_header=False, box=None)
+    answers = RichTable(title=heading, title_justify="left", show_header=False, box=None)
     answers.add_column(style="cyan", no_wrap=True, min_width=19)
     answers.add_column(no_wrap=True, min_width=4)
     answers.add_column(overflow="fold")

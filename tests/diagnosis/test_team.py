@@ -208,3 +208,11 @@ def test_the_command_diagnoses_a_run_of_a_team(tmp_path: Any, monkeypatch: Any) 
     assert "who_agents.png" in (tmp_path / "why/diagnosis.md").read_text()
     assert (tmp_path / "why/who_agents.png").stat().st_size > 1000
     assert load_run("run").spec.team is not None
+
+    train(
+        SPEC, algorithm="PPO", steps=64, folder="each", num_envs=1, independent=True,
+        protocol={"states_per_region": 16}, progress=False,
+    )  # fmt: skip
+    independent = diagnose(load_run("each"), states=128, episodes=8)
+    assert isinstance(independent, TeamDiagnosis)
+    assert [agent.name for agent in independent.agents] == ["scout_0", "driver_0", "driver_1"]
