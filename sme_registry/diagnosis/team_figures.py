@@ -10,8 +10,16 @@ import numpy as np
 from sme_registry.diagnosis.document import POLICY
 from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.team_document import TeamDiagnosis
-from sme_registry.io import write_atomically
-from sme_registry.plots import COLOURS, GREY, drawing, literal
+from sme_registry.plots.style import (
+    COLOURS,
+    GREY,
+    WRITTEN,
+    entitle,
+    legend_above,
+    new_figure,
+    save_figure,
+    styled,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,16 +31,17 @@ _MAX_AGENTS = 32
 
 
 def draw_team(diagnosis: TeamDiagnosis, folder: Path) -> tuple[Path, ...]:
-    """Write the figure into a folder.
+    """Write the figure into a folder, as PNG and PDF.
 
     Raises:
       MissingDependencyError: Matplotlib is not installed.
       OptionError: a file cannot be written.
     """
-    with drawing((8.2, 3.4), ("png",)) as (figure, files):
-        figure.suptitle(literal(title(diagnosis)), fontsize=10)
+    with styled():
+        figure = new_figure((8.2, 4.0))
+        entitle(figure, title(diagnosis))
         _agents(figure, diagnosis)
-    return (write_atomically(folder / "who_agents.png", files["png"]),)
+    return tuple(save_figure(figure, folder / "who_agents", WRITTEN))
 
 
 def _agents(figure: Figure, diagnosis: TeamDiagnosis) -> None:
@@ -52,8 +61,8 @@ def _agents(figure: Figure, diagnosis: TeamDiagnosis) -> None:
     right.axhline(1.0, color=GREY, linewidth=0.9)
     for axes in (left, right):
         axes.set_xticks(x, [agent.name for agent in agents], rotation=30, ha="right", fontsize=8)
-        axes.set_ylim(0.0, axes.get_ylim()[1] * 1.45)
-        axes.legend(loc="upper left", fontsize=8)
+        axes.set_ylim(0.0, max(1.05, axes.get_ylim()[1]))
+        legend_above(axes)
 
 
 def _regrets(diagnosis: TeamDiagnosis) -> dict[str, list[float]]:
