@@ -52,7 +52,7 @@ class ClassOptions:
         list[str] | None,
         typer.Option(
             metavar="FIELD=VALUE,…",
-            help="Vary a field of the --task, such as k=1,2,5 or team.reward=individual,team: a "
+            help="Vary a field of the --task, such as k=1,2,5 or D=0,0.25: a "
             "class for each value. Repeatable: each sweep is an axis of its own around the task, "
             "not a cross product.",
         ),

@@ -49,7 +49,7 @@ def test_help_shows_its_source_unchanged(
     for parameter in command.params:
         text = Text.from_markup(getattr(parameter, "help", None) or "").plain
         for word in text.split():
-            assert f" {word} " in shown or (len(word) > 24 and word in shown.replace(" ", ""))
+            assert f" {word} " in shown  # a longer word would be cut: use a shorter one
 
 
 def test_examples_are_lines_without_empty_ones_between() -> None:
