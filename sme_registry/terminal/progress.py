@@ -1,4 +1,8 @@
-"""`Progress`: how far a long job is, as bars in a terminal or as a line every few seconds."""
+"""`Progress`: how far a long job is, as bars in a terminal, elsewhere as a few lines.
+
+Lines come after 5, 10, 20, 40, … seconds, and at every further tenth of the job, at most one a
+minute: a log shows early that the job runs, and stays short however long it takes.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,8 @@ from rich.progress import Progress as Bars
 
 from sme_registry.terminal.numbers import duration
 
-SECONDS_BETWEEN_LINES = 5.0
-_SECONDS_BETWEEN_EQUAL_LINES = 60.0
+_SECONDS_TO_FIRST_LINE = 5.0
+_SECONDS_BETWEEN_TENTHS = 60.0
 _SECONDS_BETWEEN_BARS = 0.5
 _PARTS_NAMED = 3  # in a line
 
@@ -48,9 +52,10 @@ class Progress:
         self._total, self._done_before, self._done = total, done, done
         self._console = console or Console(stderr=True)
         self._seconds_left, self._enabled = seconds_left, enabled
-        self._note = self._printed = ""
+        self._note = ""
         self._parts: dict[str, float] = {}
-        self._start = self._last = self._printed_at = time.monotonic()
+        self._start = self._last = time.monotonic()
+        self._share_printed = 0.0
         self._bars: Bars | None = None
         self._tasks: dict[str, TaskID] = {}
 
@@ -132,14 +137,21 @@ class Progress:
 
     def _refresh(self) -> None:
         now = time.monotonic()
-        pause = SECONDS_BETWEEN_LINES if self._bars is None else _SECONDS_BETWEEN_BARS
-        if not self._enabled or now - self._last < pause:
+        if not self._enabled:
             return
-        self._last = now
         if self._bars is not None:
-            self._draw()
-        elif self._done < self._total:  # the last line is printed once, at the end
+            if now - self._last >= _SECONDS_BETWEEN_BARS:
+                self._last = now
+                self._draw()
+        elif self._done < self._total and self._line_is_due(now):  # the last one is at the end
+            self._last, self._share_printed = now, self._done / self._total
             self._print()
+
+    def _line_is_due(self, now: float) -> bool:
+        if now - self._start >= max(_SECONDS_TO_FIRST_LINE, 2 * (self._last - self._start)):
+            return True
+        another_tenth = self._done / self._total - self._share_printed >= 0.1
+        return another_tenth and now - self._last >= _SECONDS_BETWEEN_TENTHS
 
     def _draw(self) -> None:
         assert self._bars is not None
@@ -147,11 +159,7 @@ class Progress:
         self._bars.update(self._tasks[""], completed=done, total=self._total, text=text)
 
     def _print(self) -> None:
-        now = time.monotonic()
-        line = f"{self._title}: {' · '.join([*self._summary(), *self._running()])}"
-        if line != self._printed or now - self._printed_at >= _SECONDS_BETWEEN_EQUAL_LINES:
-            self._printed, self._printed_at = line, now
-            self.message(line)
+        self.message(f"{self._title}: {' · '.join([*self._summary(), *self._running()])}")
 
     def _summary(self) -> list[str]:
         """`4 of 10 steps`, the rate, the time left, the note."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 
 import pytest
 from rich.console import Console
@@ -42,14 +43,54 @@ def test_two_equal_bounds_are_one_duration() -> None:
     assert duration_range(60, 7500) == "1 min 0 s to 2 h 5 min"
 
 
-def test_running_parts_are_named_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sme_registry.terminal.progress.SECONDS_BETWEEN_LINES", 0.0)
+class Clock:
+    """Time as a test sets it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        monkeypatch.setattr("sme_registry.terminal.progress.time.monotonic", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+@pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24, 25), (24 * 30, 30)])
+def test_a_log_stays_short_however_long_the_job_takes(
+    clock: Clock, hours: float, most: int
+) -> None:
+    text, seconds = io.StringIO(), int(hours * 3600)
+    with Progress("training", seconds, console=Console(file=text, width=200)) as progress:
+        for second in range(0, seconds + 1, max(1, seconds // 20_000)):
+            clock.now = float(second)
+            progress.update(second)
+    lines = text.getvalue().splitlines()
+    assert 5 <= len(lines) <= most
+    done = [int(line.split()[1].replace(",", "")) for line in lines]
+    assert done[0] <= max(10, seconds // 10_000)  # the first line comes early
+    steps = [later - earlier for earlier, later in pairwise(done)]
+    assert max(steps) <= max(120, 0.11 * seconds)  # no long silence
+
+
+def test_a_job_that_stands_still_prints_ever_less(clock: Clock) -> None:
+    text = io.StringIO()
+    with Progress("study", 9, console=Console(file=text, width=200)) as progress:
+        for second in range(100_000):
+            clock.now = float(second)
+            progress.update(1)
+    assert len(text.getvalue().splitlines()) <= 15
+
+
+def test_running_parts_are_named_in_a_line(clock: Clock) -> None:
     text = io.StringIO()
     console = Console(file=text, width=200)
     with Progress("study", 9, unit="cells", console=console, seconds_left=lambda: 61.0) as progress:
         for number in range(5):
             progress.start_part(f"cell {number}")
+        clock.now = 5.0
         progress.update_part("cell 0", 0.5)
+        clock.now = 10.0
         progress.end_part("cell 4")
     assert "study: 0 of 9 cells · about 1 min 1 s left · running: cell 0 50%, cell 1 0%, " in (
         text.getvalue()

@@ -442,7 +442,7 @@ def test_a_misspelt_algorithm_is_one_error_before_anything_is_written(study: Pat
 def test_a_terminal_has_bars_and_anything_else_lines(
     study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sme_registry.terminal.progress.SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("sme_registry.terminal.Progress._line_is_due", lambda *_: True)
     _, output = quick(small_file(seeds=2), study)
     assert "study small-v1: 1 of 2 cells · about" in output
     screen = io.StringIO()
