@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -26,6 +26,7 @@ from sme_registry.spec import (
     SuiteFile,
     catalogue,
 )
+from sme_registry.spec.study import INDEPENDENT
 from sme_registry.spec.sweep import sweep
 
 
@@ -104,6 +105,14 @@ class PlanOptions(ClassOptions):
         list[str] | None,
         typer.Option(help="symmetric or unit. Repeatable: each algorithm with each range."),
     ] = None
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="ALGORITHM.NAME=VALUE",
+            help="A hyperparameter of an algorithm, such as slow.learning_rate=0.0001. Repeatable.",
+        ),
+    ] = None
     protocol: Protocol = "paper-v1"
 
     def plan(self, source: str) -> StudyPlan:
@@ -126,22 +135,25 @@ class PlanOptions(ClassOptions):
         """Each `[NAME=]USES` with each action range."""
         if not self.algorithm:
             raise OptionError("--algorithm: is required, such as --algorithm PPO.")
+        from sme_registry.training.hyperparameters import nested_hyperparameters
+
         ranges = self.action_range or ["symmetric"]
-        algorithms = []
+        uses_of: list[tuple[str, str]] = []
         for text in self.algorithm:
             name, equals, uses = text.partition("=")
-            if not equals:
-                name, uses = text.rsplit(":", 1)[-1], text
-            for action_range in ranges:
-                fields: dict[str, Any] = {
-                    "name": f"{name} ({action_range})" if len(ranges) > 1 else name,
-                    "uses": uses,
-                    "action_range": action_range,
-                }
-                if uses.startswith("reference:"):
-                    fields["steps"] = 0
-                algorithms.append(fields)
-        return algorithms
+            uses_of.append((name, uses) if equals else (_short_name(text), text))
+        settings = _hyperparameters(self.set_ or (), [name for name, _ in uses_of])
+        return [
+            {
+                "name": f"{name} ({action_range})" if len(ranges) > 1 else name,
+                "uses": uses,
+                "hyperparameters": nested_hyperparameters(settings.get(name, {})),
+                "action_range": action_range,
+                **({"steps": 0} if uses.startswith("reference:") else {}),
+            }
+            for name, uses in uses_of
+            for action_range in ranges
+        ]
 
 
 def sweep_axes(texts: typing.Iterable[str]) -> dict[str, list[Any]]:
@@ -194,6 +206,34 @@ def with_options(options: type) -> Callable[[Callable[..., None]], Callable[...,
         return with_fields
 
     return decorate
+
+
+def _short_name(uses: str) -> str:
+    """The name of an algorithm in a plan: `TQC`, `linear`, `independent PPO`."""
+    if uses.startswith(INDEPENDENT):
+        return f"independent {_short_name(uses.removeprefix(INDEPENDENT))}"
+    return uses.rsplit(":", 1)[-1]
+
+
+def _hyperparameters(
+    pairs: typing.Iterable[str], algorithms: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """The hyperparameters of each algorithm, from `ALGORITHM.NAME=VALUE`; flat, by dotted names."""
+    values: dict[str, dict[str, Any]] = {}
+    for pair in pairs:
+        path, equals, text = pair.partition("=")
+        owners = [name for name in algorithms if path.startswith(f"{name}.")]
+        if not equals or not owners:
+            raise OptionError(
+                f"--set {pair!r}: must be ALGORITHM.NAME=VALUE with an algorithm of the plan "
+                f"({', '.join(algorithms)}), such as {algorithms[0]}.learning_rate=0.001."
+            )
+        owner = max(owners, key=len)
+        name = path.removeprefix(f"{owner}.").strip()
+        if name in values.setdefault(owner, {}):
+            raise OptionError(f"--set {pair!r}: {path} is set twice. Remove one.")
+        values[owner][name] = json_or_text(text.strip())
+    return values
 
 
 def _title(spec: SMESpec) -> str:

@@ -11,7 +11,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Force, find_file
 from sme_registry.cli.files import check_document_path
 from sme_registry.cli.plan_options import PlanOptions, with_options
-from sme_registry.cli.study_plan import warn_of_unavailable
+from sme_registry.cli.study_plan import check_algorithms
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.io import read_json
 from sme_registry.spec import StudyFile
@@ -42,8 +42,8 @@ def new(
     """Write a plan: which algorithms run on which tasks, how often, and for how long.
 
     A plan is a file that a colleague can run. Reference policies learn nothing and take no steps.
-    Settings without an option, such as hyperparameters, are edited in the file. Editing changes the
-    digest, so the file is rejected until --from rewrites it.
+    Settings without an option are edited in the file. Editing changes the digest, so the file is
+    rejected until --from rewrites it.
 
     Examples:
 
@@ -54,6 +54,10 @@ def new(
       sme study new ranges.json -t Default -a PPO --action-range symmetric --action-range unit
 
       sme study new intervals.json -t Default --sweep k=1,2,5,10 -a PPO --seeds 5 -n 20000
+
+      sme study new two.json --suite smoke -a PPO -a slow=PPO --set slow.learning_rate=0.0001
+
+      sme study new teams.json --suite teams -a PPO -a independent:PPO --seeds 3 -n 20000
 
       sme study new wider.json --from edited.json
     """
@@ -70,8 +74,7 @@ def new(
         named = isinstance(data, dict) and "name" in data
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.
-    uses = (algorithm.uses for algorithm in file.plan.algorithms)
-    warn_of_unavailable(uses, MissingDependencyError)
+    check_algorithms(file.plan.algorithms, MissingDependencyError)
     file.write(path)
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")

@@ -12,7 +12,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, find_file
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError, SMEError
-from sme_registry.spec import PlannedCell, StudyFile, catalogue
+from sme_registry.spec import PlannedCell, StudyAlgorithm, StudyFile, catalogue
 from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 Steps = Annotated[
@@ -89,7 +89,8 @@ def plan(
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
-    warn_of_unavailable((cell.cell.uses for cell in planned), SMEError)
+    names = {cell.algorithm for cell in planned}
+    check_algorithms((a for a in file.plan.algorithms if a.name in names), SMEError)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
     spans = [estimator.seconds(cell) for cell in waiting]
@@ -193,16 +194,24 @@ def scaled_plan(
     return scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
 
 
-def warn_of_unavailable(uses: Iterable[str], errors: type[SMEError]) -> None:
-    """Warn about algorithms that cannot run here; errors of other types are raised."""
-    from sme_registry.studies.engine.cell import refuse_unknown_algorithm
+def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:
+    """Check a plan's algorithms; warn about those that cannot be found here by such an error.
+
+    Raises:
+      OptionError, SpecError: an algorithm has no hyperparameter of a name.
+      SMEError: it cannot be found, by an error of another type.
+    """
+    from sme_registry.studies.engine import checks
 
     messages = []
-    for name in unique(uses):
+    for algorithm in algorithms:
         try:
-            refuse_unknown_algorithm(name)
+            checks.find(algorithm.uses)
         except errors as error:
-            messages.append(str(error))
+            unchecked = " Its hyperparameters are not checked." if algorithm.hyperparameters else ""
+            messages.append(f"{error}{unchecked}")
+        else:
+            checks.check_hyperparameters(algorithm)
     for message in unique(messages):  # several algorithms may lack the same package
         err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
 

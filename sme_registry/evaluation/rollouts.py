@@ -15,7 +15,7 @@ import numpy.typing as npt
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Array, Observation
-from sme_registry.evaluation.policies import Policy
+from sme_registry.evaluation.policies import Policy, TeamPolicy
 from sme_registry.task import Task, streams
 
 LANES = 4096
@@ -32,6 +32,8 @@ class Rollouts(NamedTuple):
       regret: mean of 1 − step reward over its steps, in [0, 1].
       similarity: mean r̃ over its steps, in [0, 1].
       similarity_square: mean r̃² over its steps, in [0, 1].
+      agents_regret: `[agents, n]` the same as `regret` for each agent; the other numbers of a team
+        are means over its agents.
     """
 
     episode_return: Array
@@ -40,6 +42,7 @@ class Rollouts(NamedTuple):
     regret: Array
     similarity: Array
     similarity_square: Array
+    agents_regret: Array
 
     def per_step(self, values: Array) -> float:
         """The mean over all steps of all episodes, from the mean of each episode."""
@@ -87,7 +90,8 @@ def rollouts(
       policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, which are
         clipped to it; B is at most `LANES`. It is also called for episodes that have ended, until
         all of their batch have. The state of a recurrent `Policy` is initial at the first call.
-      task: the task, of a single agent.
+        For a team, a `TeamPolicy`.
+      task: the task.
       states: `[n, S]` in [0, 1].
       t: `[n]` steps completed before, in [0, T); None for 0, the start of an episode.
       r_cum: `[n]` accumulated reward since the last payout; None for 0.
@@ -95,36 +99,51 @@ def rollouts(
       gamma: γ of the discounted return, in [0, 1].
 
     Raises:
-      SpecError: the task is a team's.
+      SpecError: the task is a team's, and the policy is not.
       StateError: states of another shape, or outside the cube.
       ActionError: actions of another shape, or not finite.
     """
-    task = single_agent(task)
-    n = len(states)
+    if not isinstance(policy, TeamPolicy):
+        task = single_agent(task)
+    n, agents = len(states), len(task.policies)
     states = initial_states(states, (n, task.spec.state_dim))
     t = np.zeros(n, np.int64) if t is None else t
     r_cum = np.zeros(n) if r_cum is None else r_cum
-    totals = np.empty((6, n))
+    totals = np.empty((6 + agents, n))
     # Sorted by t, the episodes of a batch end at about the same time, and few lanes idle.
     order = np.argsort(t, kind="stable")
     for begin in range(0, n, LANES):
         lanes = order[begin : begin + LANES]
         batch = Batch(task, len(lanes), reuse=True)
-        batch.place(states[lanes], t[lanes], r_cum[lanes, None])
+        batch.place(states[lanes], t[lanes], np.repeat(r_cum[lanes, None], agents, axis=1))
         observation = batch.observe()
-        act = policy.start() if isinstance(policy, Policy) else policy
-        sums, running, weight = np.zeros((6, len(lanes))), np.ones(len(lanes)), 1.0
+        act = _acting(policy)
+        sums, running, weight = np.zeros((len(totals), len(lanes))), np.ones(len(lanes)), 1.0
         first = None if actions is None else actions[lanes]
         while running.any():
             a = act(observation.copy()) if first is None else first
             done = batch.advance(np.asarray(a, np.float64))
-            similarity, _, regret, reward, _ = done.values[:, 0]
-            step = (reward, weight * reward, 1.0, regret, similarity, similarity**2)
+            similarity, _, regret, reward, _ = _team_means(done.values)
+            own = done.values[2]
+            step = (reward, weight * reward, 1.0, regret, similarity, similarity**2, *own)
             for total, value in zip(sums, step, strict=True):
                 total += running * value
             weight *= gamma
             running[done.terminated | done.truncated] = 0.0
             observation, first = done.observation, None
         totals[:, lanes] = sums
-    returns, discounted, length, *means = totals
-    return Rollouts(returns, discounted, length, *(total / length for total in means))
+    returns, discounted, length = totals[:3]
+    regret, similarity, square, *of_agents = totals[3:] / length
+    return Rollouts(returns, discounted, length, regret, similarity, square, np.array(of_agents))
+
+
+def _acting(policy: Callable[[Observation], Any]) -> Callable[[Observation], Any]:
+    """A policy at the start of a batch of episodes."""
+    if isinstance(policy, TeamPolicy):
+        return policy.act_in
+    return policy.start() if isinstance(policy, Policy) else policy
+
+
+def _team_means(values: Array) -> Array:
+    """Means over agents, `[5, n, B]` to `[5, B]`; without a sum for a single agent."""
+    return values[:, 0] if values.shape[1] == 1 else np.asarray(values.mean(axis=1))

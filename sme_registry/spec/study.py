@@ -26,11 +26,22 @@ from sme_registry.spec.suite import SuiteClass
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 
-def _refuse_team(setting: Setting, field: str) -> None:
-    if setting.team is not None:
+OFFLINE = "offline:"  # the beginning of a `uses` that learns from data
+INDEPENDENT = "independent:"  # of one with a model for each agent of a team
+
+
+def _check_task(uses: str, setting: Setting, field: str) -> None:
+    """Raise ValueError, which Pydantic reports, if an algorithm cannot learn a task."""
+    if uses.startswith(OFFLINE) and setting.team is not None:
         raise ValueError(
-            f"{field}.team: must be null: a study's tasks have a single agent, and this one is "
-            f"for {len(setting.team.agents)}. Remove it, and train teams with `sme train`."
+            f"{field}={uses!r}: cannot learn a task for {len(setting.team.agents)} agents, because "
+            "data sets are collected for a single agent. Use an algorithm that learns online, such "
+            "as PPO."
+        )
+    if uses.startswith(INDEPENDENT) and setting.team is None:
+        raise ValueError(
+            f"{field}={uses!r}: needs a team, and this task has a single agent. Use "
+            f"{uses.removeprefix(INDEPENDENT)!r}."
         )
 
 
@@ -41,7 +52,8 @@ class StudyAlgorithm(StrictModel):
       name: its name in reports, unique in the plan.
       uses: an algorithm of Stable-Baselines3 ("PPO"), an installed entry point of the group
         `sme_registry.algorithms`, `module:function`, or `reference:constant`, `reference:linear`,
-        `reference:random`, `reference:optimal`, which learn nothing.
+        `reference:random`, `reference:optimal`, which learn nothing. The agents of a team share
+        one model; `independent:PPO` has one for each.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
       steps: its budget; null takes the plan's.
@@ -73,8 +85,8 @@ class Cell(Document):
     protocol: EvaluationProtocol
 
     @model_validator(mode="after")
-    def _one_agent(self) -> Self:
-        _refuse_team(self.spec, "spec")
+    def _task_suits_the_algorithm(self) -> Self:
+        _check_task(self.uses, self.spec, "uses")
         return self
 
 
@@ -115,8 +127,9 @@ class StudyPlan(Document):
     def _can_be_run(self) -> Self:
         refuse_repeated_names("classes", self.classes)
         refuse_repeated_names("algorithms", self.algorithms)
-        for i, member in enumerate(self.classes):
-            _refuse_team(member.setting, f"classes.{i}.setting")
+        for i, algorithm in enumerate(self.algorithms):
+            for member in self.classes:
+                _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
         return self
 
     @property

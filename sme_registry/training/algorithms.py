@@ -44,11 +44,14 @@ def default_algorithm(spec: SMESpec) -> str:
 
 def default_num_envs(spec: SMESpec, algorithm: Any) -> int:
     """The default number of parallel environments: 8 for a team and an on-policy class, or 1."""
+    return _TEAMS if spec.team is not None and is_on_policy(algorithm) else 1
+
+
+def is_on_policy(algorithm: Any) -> bool:
+    """Whether this is an on-policy class of Stable-Baselines3, such as PPO."""
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    is_class = isinstance(algorithm, type)
-    on_policy = is_class and issubclass(algorithm, OnPolicyAlgorithm)
-    return _TEAMS if spec.team is not None and on_policy else 1
+    return isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)
 
 
 def full_name(uses: str) -> str:

@@ -1,4 +1,4 @@
-"""`MonitoredVecEnv`: a training environment that counts its steps, their regret and their time.
+"""Training environments that count their steps, their regret and their time.
 
 Every learner steps its environment, so counting here needs no hook in the learner. `after_step` is
 called after each step, for example to evaluate the learner at fixed steps.
@@ -16,8 +16,44 @@ import numpy as np
 
 from sme_registry.envs import SMEEnv
 from sme_registry.envs.types import Observation
-from sme_registry.sb3 import LanesVecEnv
+from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv
 from sme_registry.spec import SMESpec
+
+
+class MonitoredTeamVecEnv(SMETeamVecEnv):
+    """Teams as an SB3 `VecEnv` (`SMETeamVecEnv`), with their steps counted.
+
+    Attributes:
+      steps: steps of the team taken so far, over all environments.
+      regret: sum of their regret, the mean over the team's agents.
+      agents_regret: the same of each agent, `[n]`.
+      seconds: CPU time of this thread spent in them.
+      after_step: see `MonitoredVecEnv`.
+    """
+
+    def __init__(
+        self, spec: SMESpec, num_envs: int, *, action_range: Literal["unit", "symmetric"]
+    ) -> None:
+        super().__init__(spec, num_envs, action_range=action_range)
+        self.steps, self.seconds = 0, 0.0
+        self.agents_regret = np.zeros(len(self.agents))
+        self.after_step: Callable[[int], None] = lambda steps: None
+
+    @property
+    def regret(self) -> float:
+        """Sum over steps of the mean regret over agents."""
+        return float(self.agents_regret.mean())
+
+    def step_wait(self) -> Any:
+        """One step of all teams; see `SMETeamVecEnv.step_wait`."""
+        begun = time.thread_time()
+        done = super().step_wait()
+        regrets = np.array([info["regret"] for info in done[3]])
+        self.agents_regret += regrets.reshape(self.num_teams, -1).sum(axis=0)
+        self.steps += self.num_teams
+        self.seconds += time.thread_time() - begun
+        self.after_step(self.steps)
+        return done
 
 
 class MonitoredVecEnv(LanesVecEnv):

@@ -12,14 +12,14 @@ network, and one whose actions differ on a few probes, is called directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from sme_registry.errors import PolicyError, SpecError
-from sme_registry.evaluation import Policy, as_policy
+from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.policies.perceptron import Layer, Perceptron
 from sme_registry.evaluation.policies.sb3 import torch_policy
 from sme_registry.spec import SMESpec
@@ -50,10 +50,34 @@ def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) 
     policy = as_policy(model, spec, action_range=action_range)
     if not isinstance(policy, Policy):
         raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
+    return _fast(policy, model, spec.state_dim + 2)
+
+
+def numpy_team_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> TeamPolicy:
+    """The same for a team: of one model that all agents share, or of a dict from agent to model.
+
+    Raises:
+      SpecError: the task has a single agent.
+      PolicyError, OptionError: see `as_policy`.
+    """
+    policy = as_policy(model, spec, action_range=action_range)
+    if not isinstance(policy, TeamPolicy):
+        raise SpecError("team: must not be null here. Evaluate a single agent with `evaluate`.")
+    members = []
+    for member in policy.members:
+        own = model[member.agent] if isinstance(model, Mapping) else model
+        space = getattr(own, "observation_space", None)
+        fast = member.policy if space is None else _fast(member.policy, own, space.shape[0])
+        members.append(member._replace(policy=fast))
+    return replace(policy, members=tuple(members))
+
+
+def _fast(policy: Policy, model: Any, observation_dim: int) -> Policy:
+    """A policy whose model is called as matrix products where it can be."""
     perceptron = _perceptron(torch_policy(model))
     if perceptron is None:
         return policy
-    probes = streams.uniform(0, "actor/probes", _PROBES * (spec.state_dim + 2))
+    probes = streams.uniform(0, "actor/probes", _PROBES * observation_dim)
     observations = probes.reshape(_PROBES, -1).astype(np.float32)
     expected, actions = policy.act(observations), perceptron(observations)
     # A subclass may do more than its layers say. NaN counts as a difference.

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sme_registry
-from sme_registry import SMESpec, materialize
+from sme_registry import SMESpec, make_parallel, materialize
 from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.evaluation import Perceptron, as_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
@@ -201,3 +201,31 @@ def test_a_policy_may_keep_what_it_observed() -> None:
     rollouts(remembering, materialize(PLAIN), start_states(0, 0, 2, 3))
     times = [observations[0, 3] for observations in kept]
     np.testing.assert_allclose(times, np.arange(100) / 100, atol=1e-6)
+
+
+def test_a_team_is_rolled_out_as_its_environment_steps_it() -> None:
+    spec = PLAIN.derive(
+        k=3, horizon=7, team={"agents": [{"action_dim": 1, "observes": [0]}, {"action_dim": 1}]}
+    )
+    policies = {
+        "agent_0": lambda observations: 0.5 * observations[:, :1] + 0.1 * observations[:, -1:],
+        "agent_1": lambda observations: 0.3 + 0.4 * observations[:, 1:2] * observations[:, -1:],
+    }
+    states = start_states(0, 0, 3, spec.state_dim)
+    team = as_policy(policies, spec)
+    done = rollouts(team, materialize(spec), states)
+    env = make_parallel(spec)
+    for episode, state in enumerate(states):
+        observations, _ = env.reset(options={"state": state})
+        regrets, rewards = [], []
+        while env.agents:
+            actions = {
+                name: policies[name](observation[None])[0].astype(np.float32)
+                for name, observation in observations.items()
+            }
+            observations, reward, _, _, infos = env.step(actions)
+            regrets.append([info["regret"] for info in infos.values()])
+            rewards.append(list(reward.values()))
+        assert np.allclose(done.agents_regret[:, episode], np.mean(regrets, axis=0), atol=1e-6)
+        assert done.episode_return[episode] == pytest.approx(np.sum(np.mean(rewards, axis=1)))
+        assert done.length[episode] == len(regrets)

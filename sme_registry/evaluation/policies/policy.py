@@ -9,7 +9,7 @@ is no team policy: under partial observation no agent could execute it.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -141,10 +141,24 @@ class TeamPolicy:
         Raises:
           PolicyError: an agent's policy fails or returns invalid actions; names the agent.
         """
+        return self._joint_actions([observations] * len(self.members))
+
+    def act_in(self, joint: Observation) -> Array:
+        """Joint actions `[B, A]` in episodes, where each agent has its own r_cum; see `__call__`.
+
+        Args:
+          joint: `[B, S + 1 + n]`: s, t/T, and each agent's r_cum/k.
+        """
+        shared = joint.shape[1] - len(self.members)
+        columns = [[*range(shared), shared + agent] for agent in range(len(self.members))]
+        return self._joint_actions([joint[:, own] for own in columns])
+
+    def _joint_actions(self, observations: Sequence[Observation]) -> Array:
+        """Joint actions, from the observations `[B, S + 2]` of each agent."""
         joint = []
-        for member in self.members:
+        for member, seen in zip(self.members, observations, strict=True):
             with prefixed_errors(member.agent):
-                a = member.policy(member.observe(observations))
+                a = member.policy(member.observe(seen))
             joint.append(a[:, : member.action_dim])
         return np.concatenate(joint, axis=1)
 

@@ -1,6 +1,7 @@
 """`uses` in a study: an algorithm (`training.algorithms`), or a policy that learns nothing.
 
     reference:constant, …   a reference policy
+    independent:PPO         an algorithm with one model for each agent of a team
 
 A learner gets a `VecEnv` of one environment. The cell counts its steps and evaluates the learner
 through `predict` whenever an evaluation is due, so a learner needs no callbacks.
@@ -13,6 +14,7 @@ from typing import Any
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
+from sme_registry.spec.study import INDEPENDENT
 from sme_registry.training import algorithms
 
 REFERENCE = "reference:"
@@ -21,6 +23,11 @@ REFERENCE = "reference:"
 def reference_name(uses: str) -> str | None:
     """The policy that `reference:…` names, as `named_after` reads it."""
     return named_after(REFERENCE, uses, POLICIES)
+
+
+def independent_name(uses: str) -> str | None:
+    """The algorithm of `independent:…`: each agent of a team learns with a model of its own."""
+    return uses.removeprefix(INDEPENDENT) if uses.startswith(INDEPENDENT) else None
 
 
 def named_after(prefix: str, uses: str, known: Collection[str]) -> str | None:
@@ -46,4 +53,5 @@ def find_algorithm(uses: str) -> Any:
     Raises:
       UnknownNameError, OptionError, MissingDependencyError: see `training.algorithms`.
     """
+    uses = independent_name(uses) or uses
     return algorithms.find_algorithm(uses, others=[REFERENCE + policy for policy in POLICIES])

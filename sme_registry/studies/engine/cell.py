@@ -1,34 +1,32 @@
 """`run_cell`: one run of a study, from its document to its result. It writes no files of the study.
 
-The agent learns in one environment, as its algorithm is defined; with several at once, PPO and the
-off-policy algorithms would be different algorithms. Only the evaluations run as a batch. The same
-cell gives the same result on the same machine, except for `timing`.
+A single agent learns in one environment, as its algorithm is defined (teams: `training`). Only the
+evaluations run as a batch. The same cell gives the same result on the same machine, except for
+`timing`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import Policy, evaluate
-from sme_registry.evaluation.policies import saved_sb3
+import numpy as np
+
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
+from sme_registry.studies.engine.checks import refuse_of_reference
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
+from sme_registry.studies.engine.training import training
 from sme_registry.task import materialize
-from sme_registry.training import ALGORITHMS
-from sme_registry.training.algorithms import is_sb3, one_thread, quiet, require_sb3
-from sme_registry.training.learners import new_learner
-from sme_registry.training.numpy_policy import numpy_policy
+from sme_registry.training.algorithms import one_thread, quiet
 from sme_registry.training.record import versions_for
 
 ReportSteps = Callable[[int, int], None]
@@ -75,20 +73,14 @@ def run_cell(
         else:
             policy = _train(cell, recorder, model_path)
         evaluation_start = time.thread_time()
-        report = evaluate(
-            policy.act,
-            cell.spec,
-            cell.protocol,
-            action_range=policy.action_range,
-            name=cell.uses,
-        )
+        report = evaluate(policy, cell.spec, cell.protocol, name=cell.uses)
         recorder.evaluation_seconds += time.thread_time() - evaluation_start
     return CellResult(
         key=cell.digest,
         cell=cell,
         curve=recorder.curve(),
         report=report,
-        online_regret=recorder.regret / recorder.steps if recorder.steps else None,
+        **recorder.online_regret(),
         timing=recorder.timing(time.thread_time() - start),
         versions=versions_for(cell.uses),
     )
@@ -103,7 +95,10 @@ class _Recorder:
         n = cell.evaluations
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
+        self._agents = () if cell.spec.team is None else self._task.names
         self.steps, self.regret = 0, 0.0
+        self.agents_regret = np.zeros(len(self._agents))
+        self.agents_rows: list[list[float]] = []  # the regret of each agent in an evaluation
         self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
 
     def report(self, steps: int) -> None:
@@ -116,7 +111,7 @@ class _Recorder:
         done = len(self.rows)
         return done + 1 < len(self.due) and self.due[done] <= steps
 
-    def evaluate(self, steps: int, policy: Policy) -> None:
+    def evaluate(self, steps: int, policy: Policy | TeamPolicy) -> None:
         """Run the next evaluation, after `steps` steps of training."""
         start = time.thread_time()
         cell = self._cell
@@ -133,6 +128,8 @@ class _Recorder:
                 float(done.length.mean()),
             )
         )
+        if self._agents:
+            self.agents_rows.append([done.per_step(regret) for regret in done.agents_regret])
         self.evaluation_seconds += time.thread_time() - start
 
     def curve(self) -> LearningCurve:
@@ -140,7 +137,20 @@ class _Recorder:
         if not self.rows:
             return LearningCurve()
         columns = zip(*self.rows, strict=True)
-        return LearningCurve(**dict(zip(LearningCurve.model_fields, columns, strict=True)))
+        fields: dict[str, Any] = dict(zip(LearningCurve.model_fields, columns, strict=False))
+        by_agent = zip(*self.agents_rows, strict=True)
+        fields["agents_regret"] = dict(zip(self._agents, by_agent, strict=False))
+        return LearningCurve(**fields)
+
+    def online_regret(self) -> dict[str, Any]:
+        """The online regret, and that of each agent; nothing for a policy that took no steps."""
+        if not self.steps:
+            return {}
+        means = (self.agents_regret / self.steps).tolist()
+        return {
+            "online_regret": self.regret / self.steps,
+            "agents_online_regret": dict(zip(self._agents, means, strict=True)),
+        }
 
     def timing(self, total: float) -> Timing:
         """Where the time went; `total` is the whole run's."""
@@ -154,31 +164,23 @@ class _Recorder:
         )
 
 
-def _evaluate_reference(cell: Cell, reference: str, recorder: _Recorder) -> Policy:
+def _evaluate_reference(cell: Cell, reference: str, recorder: _Recorder) -> Policy | TeamPolicy:
     """Evaluate a policy that learns nothing as often as a learner."""
-    if cell.hyperparameters:
-        raise OptionError(
-            f"hyperparameters={sorted(cell.hyperparameters)}: {cell.uses} has no hyperparameters. "
-            "Leave them out."
-        )
-    policy = numpy_policy(reference_policy(reference, cell.spec), cell.spec)
+    refuse_of_reference(cell.uses, cell.hyperparameters)
+    policy = as_policy(reference_policy(reference, cell.spec), cell.spec)
     for steps in recorder.due:
         recorder.evaluate(steps, policy)
         recorder.report(steps)
     return policy
 
 
-def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy:
+def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy | TeamPolicy:
     """Train the cell's learner, and evaluate it whenever an evaluation is due."""
-    from sme_registry.training.monitored_env import MonitoredVecEnv
-
-    env = MonitoredVecEnv(cell.spec, action_range=cell.action_range)
-    learner = new_learner(
-        cell.uses, env, seed=cell.seed, steps=cell.steps, hyperparameters=cell.hyperparameters
-    )
+    run = training(cell)
+    env = run.env
 
     def evaluate_now(steps: int) -> None:
-        recorder.evaluate(steps, numpy_policy(learner, cell.spec, action_range=cell.action_range))
+        recorder.evaluate(steps, run.policy())
 
     def after_step(steps: int) -> None:
         while recorder.is_due(steps):
@@ -189,7 +191,7 @@ def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy:
     after_step(0)
     start, evaluating = time.thread_time(), recorder.evaluation_seconds
     if cell.steps:
-        learner.learn(cell.steps)
+        run.learn()
     learning = time.thread_time() - start - (recorder.evaluation_seconds - evaluating)
     if env.steps < cell.steps:
         raise PolicyError(
@@ -197,34 +199,11 @@ def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy:
             "environment. It must take all of them, in that environment."
         )
     recorder.steps, recorder.regret = env.steps, env.regret
+    recorder.agents_regret = getattr(env, "agents_regret", recorder.agents_regret)
     recorder.environment_seconds = env.seconds
     recorder.training_seconds = learning - env.seconds
     while len(recorder.rows) < cell.evaluations:
         evaluate_now(env.steps)
-    save = getattr(learner, "save", None)
-    if model_path is not None and save is not None:
-        write_atomically(model_path, _saved(learner, save))
-    return numpy_policy(learner, cell.spec, action_range=cell.action_range)
-
-
-def _saved(learner: Any, save: Callable[[Any], Any]) -> bytes:
-    """The bytes of a learner's .zip."""
-    if is_sb3(learner):
-        return saved_sb3(learner)
-    archive = io.BytesIO()
-    save(archive)
-    return archive.getvalue()
-
-
-def refuse_unknown_algorithm(uses: str) -> None:
-    """Check that an algorithm of any kind can be found, before anything runs.
-
-    Raises:
-      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
-    """
-    if reference_name(uses) is not None or offline_name(uses) is not None:
-        return
-    if uses.casefold() in (name.casefold() for name in ALGORITHMS):
-        require_sb3()  # importing them takes seconds
-    else:
-        find_algorithm(uses)
+    if model_path is not None:
+        run.save(model_path)
+    return run.policy()

@@ -19,12 +19,12 @@ from sme_registry.datasets import DatasetRecipe
 from sme_registry.datasets.collect import collect
 from sme_registry.errors import OptionError, SpecError
 from sme_registry.offline import ALGORITHMS, train_offline
-from sme_registry.spec.study import Cell
+from sme_registry.spec.study import OFFLINE, Cell
 from sme_registry.studies.engine.algorithms import named_after
 from sme_registry.studies.engine.result import CellResult, LearningCurve, OfflineResult, Timing
 from sme_registry.task import materialize
 
-OFFLINE = "offline:"
+DATA_SETTINGS = ("nu", "transitions", "batch_size")  # hyperparameters that are not the learner's
 TRANSITIONS = 50_000
 BATCH_SIZE = 256
 

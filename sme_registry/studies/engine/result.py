@@ -10,15 +10,20 @@ STUDY/report/                 what `sme study report` writes
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel
 from sme_registry.spec.study import Cell
 
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
+
+
+def without_empty(plain: dict[str, Any], name: str) -> dict[str, Any]:
+    """Plain data without a field that is empty, as files were before the field existed."""
+    return plain if plain[name] else {key: value for key, value in plain.items() if key != name}
 
 
 class LearningCurve(StrictModel):
@@ -31,6 +36,8 @@ class LearningCurve(StrictModel):
       regret: mean of 1 − step reward over all steps of its episodes, in [0, 1].
       similarity: mean r̃ over all steps of its episodes, in [0, 1].
       length: mean length of its episodes in steps, in [1, T].
+      agents_regret: for a team, `regret` of each agent by its name; the other numbers are means
+        over its agents. A single agent's JSON omits it.
     """
 
     steps: Annotated[tuple[Integer, ...], Field(strict=False)] = ()
@@ -38,6 +45,11 @@ class LearningCurve(StrictModel):
     regret: _Numbers = ()
     similarity: _Numbers = ()
     length: _Numbers = ()
+    agents_regret: dict[str, _Numbers] = Field(default_factory=dict)
+
+    @model_serializer(mode="wrap")
+    def _omit_no_agents(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_empty(handler(self), "agents_regret")
 
 
 class Timing(StrictModel):
@@ -82,6 +94,8 @@ class CellResult(StrictModel):
       report: its evaluation in and out of distribution, with the references.
       online_regret: mean regret over all training steps, in [0, 1]; null for references and
         offline learners.
+      agents_online_regret: the same of each agent of a team, by name. A single agent's JSON omits
+        it.
       offline: similarities of an offline cell; null for all others.
       timing: CPU seconds by task.
       versions: versions of the packages that the numbers depend on.
@@ -93,9 +107,14 @@ class CellResult(StrictModel):
     curve: LearningCurve
     report: EvaluationReport
     online_regret: Real | None = None
+    agents_online_regret: dict[str, Real] = Field(default_factory=dict)
     offline: OfflineResult | None = None
     timing: Timing
     versions: dict[str, str]
+
+    @model_serializer(mode="wrap")
+    def _omit_no_agents(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_empty(handler(self), "agents_online_regret")
 
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""

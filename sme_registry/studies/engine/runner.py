@@ -17,7 +17,8 @@ from rich.console import Console
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, integer_in
 from sme_registry.spec import Cell, PlannedCell, StudyFile
-from sme_registry.studies.engine.cell import refuse_unknown_algorithm, run_cell
+from sme_registry.studies.engine import checks
+from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
 from sme_registry.studies.engine.ledger import Ledger
@@ -79,8 +80,11 @@ def run_study(
         jobs = integer_in("jobs", jobs, 1)
     planned = {cell.cell.digest: cell for cell in selected(plan_file.plan.cells, only)}
     if run is run_cell:
-        for uses in dict.fromkeys(cell.cell.uses for cell in planned.values()):
-            refuse_unknown_algorithm(uses)
+        names = {cell.algorithm for cell in planned.values()}
+        for algorithm in plan_file.plan.algorithms:
+            if algorithm.name in names:
+                checks.find(algorithm.uses)
+                checks.check_hyperparameters(algorithm)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()

@@ -42,6 +42,7 @@ class Analysis:
     learning_curves: pd.DataFrame
     regions: pd.DataFrame
     levels: pd.DataFrame
+    agents: pd.DataFrame
     contrasts: pd.DataFrame
     aggregates: pd.DataFrame
     profiles: pd.DataFrame
@@ -54,6 +55,11 @@ class Analysis:
     def base(self) -> str:
         """The name of the first class."""
         return next(iter(self.classes))
+
+    @property
+    def has_teams(self) -> bool:
+        """Whether any run is of a team."""
+        return not self.agents.empty
 
     @property
     def has_offline_runs(self) -> bool:
@@ -101,6 +107,7 @@ def analyse(
         learning_curves=tables.learning_curves(curves, runs),
         regions=tables.regions(results),
         levels=tables.levels(results, bootstrap),
+        agents=tables.agents(runs, bootstrap),
         contrasts=tables.contrasts(runs, classes, bootstrap),
         aggregates=tables.aggregates(runs, compared, names, bootstrap),
         profiles=tables.profiles(runs, compared, names, bootstrap),

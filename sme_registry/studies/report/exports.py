@@ -16,7 +16,7 @@ import pandas as pd
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.latex import latex_table
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
-from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS, Metric
+from sme_registry.studies.report.tables import AGENT_METRICS, ENOUGH_RUNS, METRICS, Metric
 from sme_registry.terminal.templates import fixed, signed
 
 CSV_TABLES = (
@@ -49,7 +49,8 @@ class TextTable:
 
 def csv_tables(analysis: Analysis) -> dict[str, str]:
     """Every frame of the study as CSV, by name; floats read back as they are."""
-    names = (*CSV_TABLES, "offline") if analysis.has_offline_runs else CSV_TABLES
+    optional = {"offline": analysis.has_offline_runs, "agents": analysis.has_teams}
+    names = [*CSV_TABLES, *(name for name, present in optional.items() if present)]
     frames = {name: getattr(analysis, name) for name in names}
     return {name: f.to_csv(index=False, lineterminator="\n") for name, f in frames.items()}
 
@@ -59,6 +60,7 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
     tables = [
         *(offline_tables(analysis) if analysis.has_offline_runs else ()),
         *(_levels(analysis, metric) for metric in METRICS),
+        *(_agents(analysis, metric) for metric in AGENT_METRICS),
         *(_differences(analysis, metric) for metric in METRICS),
         *(_contrasts(analysis, metric) for metric in METRICS),
         *(_regions(analysis, name) for name in analysis.algorithms),
@@ -109,16 +111,31 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
 def _levels(analysis: Analysis, metric: Metric) -> TextTable:
     rows = analysis.levels[analysis.levels.metric == metric.key]
 
-    def entry(row: Any) -> str:
-        count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
-        return _with_interval(row.iqm, row, metric.digits) + count
-
     return TextTable(
         f"levels-{metric.key.replace('_', '-')}",
         f"{metric.label[0].upper()}{metric.label[1:]} by class",
         "IQM over runs, with its 95 % bootstrap interval.",
-        _wide(rows, {"class_name": "class"}, "algorithm", entry, analysis.algorithms),
-    )
+        _wide(
+            rows, {"class_name": "class"}, "algorithm", lambda row: _level(row, metric),
+            analysis.algorithms,
+        ),
+    )  # fmt: skip
+
+
+def _agents(analysis: Analysis, metric: Metric) -> TextTable:
+    rows = analysis.agents[analysis.agents.metric == metric.key]
+
+    return TextTable(
+        f"agents-{metric.key.replace('_', '-')}",
+        f"{metric.label[0].upper()}{metric.label[1:]} of each agent",
+        "IQM over runs, with its 95 % bootstrap interval, over the action channels that the agent "
+        "owns.",
+        _wide(
+            rows, {"class_name": "class", "agent": "agent"}, "algorithm",
+            lambda row: _level(row, metric), analysis.algorithms,
+        ),
+        names=2,
+    )  # fmt: skip
 
 
 def _differences(analysis: Analysis, metric: Metric) -> TextTable:
@@ -243,6 +260,11 @@ def _wide(
         columns=[*index.values(), *names],
     )
     return wide.fillna(ABSENT)
+
+
+def _level(row: Any, metric: Metric) -> str:
+    count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
+    return _with_interval(row.iqm, row, metric.digits) + count
 
 
 def _change(row: Any, change: float, digits: int) -> str:

@@ -41,6 +41,13 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
     regret                       mean of 1 − step reward over their steps, in [0, 1]
     similarity                   mean r̃ over their steps, in [0, 1]
     length                       mean length of the episodes, in steps
+
+Where the plan has teams, whose other numbers are means over agents or channels, there are columns
+for each agent, NaN for tasks without it:
+
+    results: normalised_regret/<agent>                                    of the region
+             wd_regret/<agent>, ood_regret/<agent>, online_regret/<agent> of the run
+    curves:  regret/<agent>                                               of the evaluation
 """
 
 from __future__ import annotations
@@ -69,6 +76,9 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 _CURVES = _PLACE + "step:int64 episode_return regret similarity length"
+# Columns of each agent of a team, as in `wd_regret/agent_0`.
+AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
+_RUN_OF_AGENT = tuple(f"{column}/" for column in AGENT_COLUMNS[1:])
 _REFERENCES = {
     "linear_normalised_regret": "linear_least_squares",
     "best_constant_normalised_regret": "best_constant",
@@ -132,12 +142,18 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
     finished = [(cell, result) for cell, result in planned if result is not None]
     rows = [row for cell, result in finished for row in _result_rows(cell, result)]
     evaluations = [row for cell, result in finished for row in _curve_rows(cell, result)]
-    return StudyFrames(frame(rows, _PLACE + _REGION + _RUN), frame(evaluations, _CURVES))
+    agents = list(dict.fromkeys(name for _, result in finished for name in result.report.agents))
+    by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
+    regrets = " ".join(f" regret/{name}" for name in agents)
+    return StudyFrames(
+        frame(rows, _PLACE + _REGION + _RUN + by_agent), frame(evaluations, _CURVES + regrets)
+    )
 
 
 def runs(results: pd.DataFrame) -> pd.DataFrame:
     """One row per run: `results` without the columns of its regions."""
-    columns = [*RUN, *_dtypes(_RUN)]
+    by_agent = [name for name in results.columns if name.startswith(_RUN_OF_AGENT)]
+    columns = [*RUN, *_dtypes(_RUN), *by_agent]
     return results.drop_duplicates(RUN)[columns].reset_index(drop=True)
 
 
@@ -169,8 +185,13 @@ def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, An
     references = result.report.references
     for index, region in enumerate(result.report.regions):
         regrets = {c: references[name][index].normalised_regret for c, name in _REFERENCES.items()}
+        agents = {
+            f"normalised_regret/{name}": agent.regions[index].normalised_regret
+            for name, agent in result.report.agents.items()
+        }
         yield {
             **run,
+            **agents,
             **region.model_dump(exclude={"name", "channels"}),
             **regrets,
             "region": region.name,
@@ -178,11 +199,16 @@ def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, An
         }
 
 
-def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[tuple[Any, ...]]:
+def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
     curve = result.curve
-    columns = (curve.steps, curve.episode_return, curve.regret, curve.similarity, curve.length)
-    for evaluation in zip(*columns, strict=True):
-        yield (*_place(cell).values(), *evaluation)
+    columns = {
+        "step": curve.steps,
+        **{name: getattr(curve, name) for name in ("episode_return", "regret", "similarity")},
+        "length": curve.length,
+        **{f"regret/{name}": regrets for name, regrets in curve.agents_regret.items()},
+    }
+    for evaluation in zip(*columns.values(), strict=True):
+        yield _place(cell) | dict(zip(columns, evaluation, strict=True))
 
 
 def _place(cell: PlannedCell) -> dict[str, Any]:
@@ -204,6 +230,13 @@ def _run_columns(result: CellResult) -> dict[str, Any]:
         "steps_per_second": result.timing.steps_per_second,
         "key": result.key,
     }
+    for name, agent in report.agents.items():
+        wd, *shells = (region.normalised_regret for region in agent.regions)
+        columns |= {
+            f"wd_regret/{name}": wd,
+            f"ood_regret/{name}": float(np.mean(shells)) if shells else math.nan,
+            f"online_regret/{name}": result.agents_online_regret.get(name, math.nan),
+        }
     if offline is not None:
         columns |= offline.model_dump(exclude={"similarity", "similarity_sd"}) | {
             "offline_similarity": offline.similarity,

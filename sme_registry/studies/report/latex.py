@@ -99,7 +99,7 @@ def _stacked(frame: pd.DataFrame, names: int, width: float) -> tuple[list[str], 
     """The same with a heading for each row, and a line for each of its columns."""
     widest = max((text_width(text) for row in _rows(frame) for text in row[names:]), default=0.0)
     room = width - widest - _SEPARATION - _INDENT
-    blocks = []
+    blocks: list[_Block] = []
     for row in _rows(frame):
         heading = f"\\raggedright\\arraybackslash {_joined(row[:names])}"
         source = "\\addlinespace[2pt]\n" if blocks else ""

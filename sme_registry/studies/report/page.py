@@ -29,6 +29,7 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "offline": ("Learning from data", ("offline",)),
     "findings": ("Findings", ()),
     "breaks": ("What breaks it", ("contrasts", "regret", "wd-regret", "ood-regret")),
+    "agents": ("Agents of the teams", ("agents",)),
     "regions": ("Inside and outside the training cube", ("regions", "decay", "maps")),
     "algorithms": (
         "Algorithms compared",

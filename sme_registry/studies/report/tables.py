@@ -16,6 +16,7 @@ Columns of each table, those that name the row first; class_name and algorithm a
                       linear_normalised_regret
     levels            metric: runs, iqm, low, high; linear: the linear policy's median on the same
                       tasks, NaN for metrics of training
+    agents            agent, metric: runs, iqm, low, high; of each agent of a team
     contrasts         metric: axis; base, level: IQM on the first class and on this one; change,
                       low, high; pairs; enough_pairs; verdict: worse, better or open
     differences       first, second, metric: first_level, second_level: IQM over the pairs;
@@ -81,6 +82,7 @@ METRICS = (
     Metric("online_regret", "online regret", 1),
 )
 REGRET_METRICS = METRICS[:2]
+AGENT_METRICS = (*REGRET_METRICS, METRICS[4])
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,20 @@ def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
                 reference = linear[place].get(metric.key, math.nan)
                 rows.append((*place, metric.key, len(values), _iqm(values), *ends, reference))
     return frame(rows, f"{_PLACE} metric:str runs:int64 iqm low high linear")
+
+
+def agents(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The IQM of regret of each agent of a team; empty without teams."""
+    rows = []
+    for place, group in by_place(runs).items():
+        for metric in AGENT_METRICS:
+            for column in [c for c in runs.columns if c.startswith(f"{metric.key}/")]:
+                values = group[column].dropna().to_numpy()
+                if len(values):
+                    ends = bootstrap.interval(values, "agent", *reversed(place), column)
+                    agent = column.partition("/")[2]
+                    rows.append((*place, agent, metric.key, len(values), _iqm(values), *ends))
+    return frame(rows, f"{_PLACE} agent:str metric:str runs:int64 iqm low high")
 
 
 def contrasts(

@@ -225,8 +225,8 @@ def test_episodes_may_end_early() -> None:
 
 def test_what_cannot_be_run_is_refused() -> None:
     team = SPEC.derive(team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match=r"spec\.team: must be null: .* this one is for 2"):
-        Cell.from_dict({**cell().to_dict(), "spec": team.to_dict()})
+    with pytest.raises(SpecError, match="uses='offline:bc': cannot learn a task for 2 agents"):
+        Cell.from_dict({**cell("offline:bc").to_dict(), "spec": team.to_dict()})
     with pytest.raises(OptionError, match="has no hyperparameters"):
         run_cell(cell("reference:linear", hyperparameters={"degree": 2}))
     with pytest.raises(UnknownNameError, match="Did you mean 'linear'"):

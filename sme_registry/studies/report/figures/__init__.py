@@ -47,6 +47,7 @@ def draw_figures(
     pictures = [
         *comparisons.draw_contrasts(analysis, formats),
         *curves.draw_regret(analysis, formats),
+        *comparisons.draw_agents(analysis, formats),
         maps.draw_regions(analysis, formats),
         comparisons.draw_decay(analysis, formats),
         *comparisons.draw_aggregates(analysis, formats),

@@ -48,6 +48,36 @@ def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pictu
         )
 
 
+def draw_agents(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """Normalised regret of each agent of a team, WD and OOD side by side, one row an agent."""
+    if not analysis.has_teams:
+        return
+    rows = analysis.agents
+    names = rows.class_name + ", " + rows.agent
+    place: dict[str, float] = {}
+    for _, group in names.groupby(rows.class_name, sort=False):
+        begin = max(place.values(), default=-1.4) + 1.4
+        place |= {name: begin + i for i, name in enumerate(dict.fromkeys(group))}
+    looks = panels.looks(analysis)
+    height = 1.1 + (0.07 * len(looks) + 0.12) * max(4.0, max(place.values()) + 1)
+    with panels.panel_grid(2, formats, (0.0, height)) as grid:
+        for axes, (metric, heading) in zip(grid.panels, panels.HEADINGS.items(), strict=True):
+            selected = rows[rows.metric == metric]
+            at, enough = names[selected.index].map(place), selected.runs >= ENOUGH_RUNS
+            panels.marks_by_algorithm(axes, selected, "iqm", at, enough, looks)
+            axes.set_title(heading, fontsize=9)
+            axes.set_xlabel("normalised regret")
+        name_rows(grid, place)
+        panels.legend(grid.figure, looks)
+    yield Picture(
+        "agents",
+        "Normalised regret of each agent",
+        "IQM over runs with its 95 % bootstrap interval, over the action channels that the agent "
+        f"owns: 0 is the optimum, 1 the constant ½. Hollow: fewer than {ENOUGH_RUNS} runs.",
+        grid.files,
+    )
+
+
 def draw_aggregates(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
     """The IQM of 1 − normalised regret, WD and OOD side by side, one row a group of classes."""
     rows = analysis.aggregates[analysis.aggregates.statistic == "iqm"]

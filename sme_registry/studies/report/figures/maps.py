@@ -82,7 +82,8 @@ def draw_maps(
 ) -> Picture | str:
     """One map a class and algorithm whose models were kept, or the reason why there is none."""
     inside = analysis.results[analysis.results.region == "WD"]
-    plane = inside[inside.state_dim == 2]
+    single = [name for name, info in analysis.classes.items() if info.setting["team"] == "none"]
+    plane = inside[(inside.state_dim == 2) & inside.class_name.isin(single)]
     if plane.empty:
         return "No maps of the plane: no finished run has a task with two state channels."
     maps, problem = _maps(analysis, plane[plane.key.isin(models)], models)

@@ -1,0 +1,78 @@
+"""Checks of a plan's algorithms before anything runs: that they exist, and their hyperparameters.
+
+They check names, and no values. A package that is not installed here may be installed where the
+plan runs, so its algorithms cannot be checked here: `MissingDependencyError`, or `OptionError` of
+`find` for a module of someone else's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sme_registry.errors import OptionError
+from sme_registry.offline.hyperparameters import resolve_hyperparameters
+from sme_registry.spec import StudyAlgorithm
+from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
+from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
+from sme_registry.training import ALGORITHMS
+from sme_registry.training.algorithms import is_on_policy, require_sb3
+from sme_registry.training.hyperparameters import refuse_unknown
+
+__all__ = ["check_hyperparameters", "find"]
+
+
+def find(uses: str) -> None:
+    """Check that an algorithm of any kind can be found.
+
+    Raises:
+      UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
+    """
+    if reference_name(uses) is not None or offline_name(uses) is not None:
+        return
+    independent = independent_name(uses)
+    if (independent or uses).casefold() in (name.casefold() for name in ALGORITHMS):
+        require_sb3()  # importing them takes seconds
+    else:
+        find_algorithm(uses)
+    if independent is not None:
+        _check_independent(uses)
+
+
+def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
+    """Check that an algorithm of a plan has hyperparameters of these names.
+
+    Raises:
+      OptionError, SpecError: it has not; suggests a similar name.
+      UnknownNameError, MissingDependencyError: it cannot be found.
+    """
+    uses, chosen = algorithm.uses, algorithm.hyperparameters
+    if not chosen:
+        return
+    field = f"algorithm {algorithm.name!r}: hyperparameters"
+    learner = offline_name(uses)
+    if reference_name(uses) is not None:
+        refuse_of_reference(uses, chosen)
+    elif learner is not None:
+        own = {name: value for name, value in chosen.items() if name not in DATA_SETTINGS}
+        resolve_hyperparameters(learner, own)
+    else:
+        refuse_unknown(find_algorithm(uses), uses, chosen, field)
+
+
+def refuse_of_reference(uses: str, hyperparameters: Mapping[str, Any]) -> None:
+    """Raise OptionError if a reference policy is given hyperparameters."""
+    if hyperparameters:
+        raise OptionError(
+            f"hyperparameters={sorted(hyperparameters)}: {uses} has no hyperparameters. Leave them "
+            "out."
+        )
+
+
+def _check_independent(uses: str) -> None:
+    if not is_on_policy(find_algorithm(uses)):
+        raise OptionError(
+            f"uses={uses!r}: must be an on-policy algorithm, such as independent:PPO, because the "
+            "models of a team learn from the same rollouts. Use one model for all agents instead: "
+            f"{independent_name(uses)}."
+        )

@@ -1,0 +1,116 @@
+"""Cells of teams: one model for all agents, or one for each, and the regret of every agent."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import load, studies
+from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report.exports import csv_tables, text_tables
+
+pytest.importorskip("stable_baselines3")
+
+AGENTS = ["agent_0", "agent_1"]
+
+
+def plan(*uses: str) -> StudyPlan:
+    settings = {"hyperparameters": {"n_steps": 8, "batch_size": 16, "n_epochs": 1}, "steps": None}
+    setting = {name: value for name, value in load("Team2").to_dict().items() if name != "seed"}
+    return StudyPlan.from_dict(
+        {
+            "classes": [
+                {"name": "team", "setting": setting, "seeds": [1, 2]},
+                {"name": "single", "setting": {"horizon": 20}, "seeds": [1]},
+            ][: 1 if any("independent" in each for each in uses) else 2],
+            "algorithms": [
+                {"name": each.replace(":", " "), "uses": each}
+                | (settings if "PPO" in each else {"steps": 0})
+                for each in uses
+            ],
+            "seeds": 2,
+            "steps": 128,
+            "evaluations": 2,
+            "evaluation_episodes": 2,
+            "protocol": {"states_per_region": 50, "epsilons": [1.0]},
+        }
+    )
+
+
+def cell(uses: str) -> Cell:
+    return next(each.cell for each in plan(uses).cells if each.class_name == "team")
+
+
+@pytest.mark.parametrize("uses", ["PPO", "independent:PPO", "reference:linear"])
+def test_a_team_has_the_regret_of_each_agent(uses: str) -> None:
+    result = run_cell(cell(uses))
+    assert list(result.report.agents) == list(result.curve.agents_regret) == AGENTS
+    of_agents = np.array(list(result.curve.agents_regret.values()))
+    assert np.allclose(of_agents.mean(axis=0), result.curve.regret)
+    if uses == "reference:linear":
+        assert result.agents_online_regret == {}
+    else:
+        assert result.curve.steps == (64, 128)
+        online = np.mean(list(result.agents_online_regret.values()))
+        assert online == pytest.approx(result.online_regret)
+    assert CellResult.from_dict(json.loads(json.dumps(result.to_dict()))) == result
+
+
+def test_a_team_learns_the_same_again() -> None:
+    one, other = (run_cell(cell("independent:PPO")) for _ in range(2))
+    assert (one.curve, one.report) == (other.curve, other.report)
+
+
+def test_a_single_agents_result_has_no_fields_of_teams() -> None:
+    single = next(each.cell for each in plan("PPO").cells if each.class_name == "single")
+    plain = run_cell(single.model_copy(update={"uses": "reference:constant", "steps": 0,
+                                               "hyperparameters": {}})).to_dict()  # fmt: skip
+    assert "agents_regret" not in plain["curve"]
+    assert "agents_online_regret" not in plain
+    assert "agents" not in plain["report"]
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of references on a team and on a single agent."""
+    folder = tmp_path_factory.mktemp("mixed")
+    document = plan("reference:linear", "reference:constant")
+    ledger = Ledger(folder)
+    ledger.write_plan(StudyFile(name="mixed", digest=document.digest, plan=document))
+    for planned in document.cells:
+        ledger.write(run_cell(planned.cell))
+    return folder
+
+
+def test_the_frames_have_columns_of_each_agent(mixed: Path) -> None:
+    results, curves = studies.load(mixed)
+    team, single = (results[results.class_name == name] for name in ("team", "single"))
+    for name in AGENTS:
+        assert single[f"wd_regret/{name}"].isna().all()
+        wd = team[team.region == "WD"]
+        assert np.array_equal(wd[f"wd_regret/{name}"], wd[f"normalised_regret/{name}"])
+        assert curves[curves.class_name == "team"][f"regret/{name}"].between(0, 1).all()
+    assert curves[curves.class_name == "single"]["regret/agent_0"].isna().all()
+
+
+def test_the_report_has_a_table_and_a_figure_of_the_agents(mixed: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from sme_registry.studies.report.figures.comparisons import draw_agents
+
+    ledger = Ledger(mixed)
+    file = ledger.plan_file()
+    assert file is not None
+    analysis = analyse(file, ledger.results(), draws=100)
+    tables: dict[str, Any] = {table.name: table.frame for table in text_tables(analysis)}
+    assert list(tables["agents-wd-regret"].agent) == AGENTS
+    assert "agents" in csv_tables(analysis)
+    (picture,) = draw_agents(analysis, ("svg",))
+    assert b"team, agent_1" in picture.files["svg"]
