@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import runpy
+import shlex
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from sme_registry.spec import EnvFile, SMESpec, SuiteFile
 from sme_registry.spec.catalogue import names
@@ -30,6 +32,29 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
     namespace: dict[str, Any] = {"__name__": "page"}
     for block in blocks:
         exec(compile(block, page, "exec"), namespace)
+
+
+def test_the_page_on_own_agents_works_from_training_to_the_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("torch", "matplotlib", "onnx", "onnxruntime", "cryptography"):
+        pytest.importorskip(package)
+    from leaderboard.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "own_agents.md").read_text()
+    assert "STEPS = 5_000" in page
+    namespace: dict[str, Any] = {"__name__": "page"}
+    for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
+        exec(compile(block.replace("STEPS = 5_000", "STEPS = 200"), "page", "exec"), namespace)
+    commands = re.findall(r"^sme-leaderboard (.*)$", page, re.M)
+    assert len(commands) == 7
+    for command in commands:
+        arguments = shlex.split(command)
+        key = ["--key", "my.key"] if arguments[0] in ("keygen", "new", "submit") else []
+        result = CliRunner().invoke(app, [*arguments, *key])
+        assert result.exit_code == 0, result.output
+    assert "My DDPG" in result.output
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
