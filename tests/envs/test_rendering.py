@@ -219,7 +219,7 @@ def test_without_pygame_the_way_to_install_it_is_named(monkeypatch: pytest.Monke
     for name in ("pygame", "pygame.font"):
         monkeypatch.setitem(sys.modules, name, None)
     env = SMEEnv("Default", render_mode="rgb_array")
-    with pytest.raises(MissingDependencyError, match=r"sme-registry\[render\]"):
+    with pytest.raises(MissingDependencyError, match=r"\[render\]"):
         env.reset()
 
 
