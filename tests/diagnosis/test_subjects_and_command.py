@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+import sme_registry
 from sme_registry.cli import app
 from sme_registry.diagnosis import (
     Diagnosis,
@@ -27,6 +28,7 @@ from sme_registry.errors import (
     PolicyError,
     UnknownNameError,
 )
+from sme_registry.wrappers import RecordRegret
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
 
 
@@ -139,6 +141,27 @@ def test_the_command_accepts_any_policy_with_its_task(tmp_path: Path) -> None:
     assert "--task Default" in refused("diagnose", "linear")
     assert "--task" in refused("diagnose", tmp_path, "--set", "k=1")
     assert "--cell" in refused("diagnose", tmp_path, "--cell", "a", "--task", "Default")
+
+
+def test_a_policy_of_ones_own_loop_is_diagnosed_with_its_log(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.csv"
+    env = RecordRegret(sme_registry.make("Default", horizon=10), path)
+    for episode in range(4):
+        env.reset(seed=episode)
+        ended = False
+        while not ended:
+            *_, ended, _ = env.step(env.action_space.sample())
+    env.close()
+    options = ("--states", "256", "--episodes", "8", "--json")
+    result = sme("diagnose", "linear", "--task", "Default", "--log", path, *options)
+    assert result.exit_code == 0, result.output
+    training = Diagnosis.from_dict(json.loads(result.stdout)).measurements.training
+    assert training is not None
+    assert (training.rows, training.steps) == (4, 40)
+    assert training.last_regret == pytest.approx(env.episodes[-1].regret)
+    assert "--log" in refused("diagnose", tmp_path, "--log", path)
+    path.write_text("step,regret\n")
+    assert "columns must be" in refused("diagnose", "linear", "-t", "Default", "--log", path)
 
 
 def test_a_cell_of_a_study_is_found_by_the_first_digits_of_its_key(tmp_path: Path) -> None:

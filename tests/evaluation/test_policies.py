@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import zipfile
 
@@ -453,3 +454,24 @@ def test_the_command_line_evaluates_an_onnx_file(onnx, tmp_path, monkeypatch):
     done = CliRunner().invoke(app, ["evaluate", "actor.onnx", "Default", "--protocol", "quick-v1"])
     assert done.exit_code == 0, done.output
     assert "actor" in done.output
+
+
+@pytest.mark.parametrize("form", ["linear", "agent.zip", "agent.onnx", "agent.npz", "own:act"])
+def test_python_evaluates_everything_that_the_command_line_does(form, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if form == "agent.zip":
+        untrained(pytest.importorskip("stable_baselines3"), "PPO").save(form)
+    elif form == "agent.onnx":
+        network(pytest.importorskip("onnx"), tmp_path / form)
+    elif form == "agent.npz":
+        weights = np.ones((2, 5), np.float32)
+        OfflinePolicy([(weights, np.zeros(2, np.float32))]).save(form)
+    (tmp_path / "own.py").write_text("def act(observations):\n    return observations[:, :2]\n")
+    sme_registry.save(SPEC, "task.json", "Task")
+    done = CliRunner().invoke(
+        app, ["evaluate", form, "task.json", "--protocol", "quick-v1", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    by_command = json.loads(done.stdout)
+    assert evaluate(form, "task.json", "quick-v1").to_dict() == by_command
+    sys.modules.pop("own", None)
