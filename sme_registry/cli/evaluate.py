@@ -60,7 +60,8 @@ def evaluate(
     --action-range is symmetric; so does an .onnx network. A .zip of Stable-Baselines3 can run code
     when it is loaded: use only files whose author you trust.
 
-    For a team, give the one policy that all agents share. It is called for each agent with the
+    For a team, give a folder with the policy of each agent, such as agent_0.zip, from the agent's
+    own observations; or the one policy that all agents share. That one is called for each agent with the
     shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T, the
     agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that an
     agent owns. The report then includes each agent.
@@ -76,6 +77,8 @@ def evaluate(
       sme evaluate mypolicy:act Default --protocol quick-v1 --json
 
       sme evaluate runs/Team4-PPO-seed0/model.zip Team4
+
+      sme evaluate runs/Team4-independent-PPO-seed0/model Team4
     """
     from sme_registry import evaluation
 

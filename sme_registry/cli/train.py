@@ -89,11 +89,11 @@ def train(
     update once for each step (gradient_steps=-1). Setting these yourself overrides this.
 
     The agents of a team share one policy (for its observation see `sme evaluate --help`). With
-    --independent, each agent has its own, from its observations to its actions, trained with its
-    own rewards; the output folder then contains model/AGENT.zip instead of model.zip.
-    episodes.csv then has the team's mean regret, and one column per agent, such as regret/agent_0.
-    A step is one step of the whole team, so the algorithm sees as many transitions per step as
-    there are agents, and TensorBoard's axis counts those transitions.
+    --independent, each agent has a model of its own, from its observations to its actions, which
+    learns from its own rewards; the output folder then contains model/AGENT.zip instead of
+    model.zip. In both cases episodes.csv has the team's mean regret, and one column per agent, such
+    as regret/agent_0. A step is one step of the whole team, so a shared policy sees as many
+    transitions per step as there are agents, and TensorBoard's axis counts those transitions.
 
     --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
     hyperparameters and step count. The result differs from an uninterrupted run: random streams get
