@@ -61,10 +61,10 @@ def evaluate(
     when it is loaded: use only files whose author you trust.
 
     For a team, give a folder with the policy of each agent, such as agent_0.zip, from the agent's
-    own observations; or the one policy that all agents share. That one is called for each agent with the
-    shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T, the
-    agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that an
-    agent owns. The report then includes each agent.
+    own observations; or the one policy that all agents share. That one is called for each agent
+    with the shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T,
+    the agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that
+    an agent owns. The report then includes each agent.
 
     Examples:
 
