@@ -110,7 +110,7 @@ class PlanOptions(ClassOptions):
         typer.Option(
             "--set",
             metavar="ALGORITHM.NAME=VALUE",
-            help="A hyperparameter of an algorithm, such as slow.learning_rate=0.0001. Repeatable.",
+            help="A hyperparameter of an algorithm, such as slow.n_steps=64. Repeatable.",
         ),
     ] = None
     protocol: Protocol = "paper-v1"
