@@ -22,6 +22,8 @@ from sme_registry.io import require_packages
 if TYPE_CHECKING:
     import torch
 
+_OTHER_LIBRARIES = "Give networks of other libraries, and linear maps, as a `Perceptron` of arrays."
+
 
 def network(policy: Any, interface: Interface, symmetric: bool) -> Network:
     """A module or function from observations to actions in [−1, 1] if `symmetric`, else [0, 1].
@@ -131,22 +133,21 @@ def _refuse_output(policy: Any, module: Any, interface: Interface) -> None:
             raise PolicyError(
                 f"policy={policy!r:.80}: fails on a PyTorch tensor {list(rows.shape)}: "
                 f"{type(error).__name__}: {error}. It must map observations "
-                f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}]. Give "
-                "networks of other libraries, and linear maps, as a `Perceptron` of arrays."
+                f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}]. "
+                f"{_OTHER_LIBRARIES}"
             ) from error
     shape = (3, interface.action_dim)
     if isinstance(returned, torch.Tensor) and tuple(returned.shape) == shape:
         return
-    actual = (
-        f"a tensor {list(returned.shape)}"
-        if isinstance(returned, torch.Tensor)
-        else f"a {type(returned).__name__}"
-    )
+    if isinstance(returned, torch.Tensor):
+        actual = f"a tensor {list(returned.shape)}"
+    else:
+        actual = f"an object of type {type(returned).__name__}"
     raise PolicyError(
-        f"policy={policy!r:.80}: returns {actual} for 3 observations: must be one tensor "
+        f"policy={policy!r:.80}: returns {actual} for 3 observations: must be one PyTorch tensor "
         f"[3, {interface.action_dim}] of deterministic actions. Give a function that returns them "
         "alone, such as `lambda o: actor(o)[0]` for a tuple or `lambda o: actor(o).mean` for a "
-        "distribution."
+        f"distribution. {_OTHER_LIBRARIES}"
     )
 
 

@@ -109,11 +109,12 @@ def test_a_network_acts_as_before(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (Gaussian(), r"returns a Normal .*lambda o: actor\(o\)\.mean"),
-        (lambda x: (x[:, :2], x), r"returns a tuple .*lambda o: actor\(o\)\[0\]"),
-        (lambda x: x[:, 0], r"returns a tensor \[3\] .*must be one tensor \[3, 2\]"),
+        (Gaussian(), r"returns an object of type Normal .*lambda o: actor\(o\)\.mean"),
+        (lambda x: (x[:, :2], x), r"returns an object of type tuple .*lambda o: actor\(o\)\[0\]"),
+        (lambda x: x[:, 0], r"returns a tensor \[3\] .*must be one PyTorch tensor \[3, 2\]"),
         (nn.Linear(4, 2), "fails on a PyTorch tensor"),
         (lambda o: np.tanh(o @ np.ones((5, 2))), r"fails on a PyTorch tensor.*`Perceptron`"),
+        (lambda o: np.asarray(o)[:, :2], r"type ndarray .*`Perceptron` of arrays"),
         (lambda x: torch.rand_like(x[:, :2]), "differs from its own actions"),
         (lambda x: x[:, :2] * (1.0 if x.sum() > 3.0 else 0.5), "differs from its own actions"),
         (lambda x: torch.linalg.svd(x[:, :2])[0][:, :2], r"fails|cannot export|returns"),
