@@ -5,18 +5,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from pathlib import Path
 from typing import Any
 
 from leaderboard.artefact.gate import inspect
 from sme_registry import SMESpec
-from sme_registry.errors import PolicyError, SMEError
+from sme_registry.errors import PolicyError
 from sme_registry.evaluation import load_sb3
 from sme_registry.export import onnx_bytes
 from sme_registry.io import require_packages, write_atomically
-from sme_registry.training import RunRecord
 
 
 def export_sb3(
@@ -39,14 +37,13 @@ def export_sb3(
       The path written.
 
     Raises:
-      PolicyError: see `sme_registry.export_onnx`; or the model is a team's.
+      PolicyError: see `sme_registry.export_onnx`.
       Rejection: its network needs operators that no board accepts, or is too large.
       OptionError: the file cannot be written.
       MissingDependencyError: Stable-Baselines3, PyTorch, onnx or ONNX Runtime is not installed.
     """
     libraries = {"stable_baselines3": "Stable-Baselines3", "torch": "PyTorch"}
     require_packages("exporting a model", libraries, "train")
-    _refuse_team(model, spec)
     if isinstance(model, str | os.PathLike):
         model = load_sb3(model)
     if not hasattr(model, "predict"):
@@ -56,24 +53,3 @@ def export_sb3(
     data = onnx_bytes(model, spec, vec_normalize=vec_normalize)
     inspect(data, *(space.shape[0] for space in (model.observation_space, model.action_space)))
     return write_atomically(path, data)
-
-
-def _refuse_team(model: Any, spec: SMESpec | None) -> None:
-    """Raise if the spec, the model's environment or its run's record shows that it is a team's."""
-    from sme_registry.sb3 import SMETeamVecEnv
-
-    if spec is not None and spec.team is not None:
-        of_a_team = True
-    elif isinstance(model, str | os.PathLike):
-        record = None
-        with contextlib.suppress(SMEError):  # a run.json of another program
-            record = RunRecord.read(Path(model).parent)
-        of_a_team = record is not None and record.spec.team is not None
-    else:
-        env = getattr(model, "get_env", lambda: None)()
-        of_a_team = isinstance(getattr(env, "unwrapped", None), SMETeamVecEnv)
-    if of_a_team:
-        raise PolicyError(
-            "model: acts for the agents of a team, from their shared observation. Boards have "
-            "single agents only. Give a model trained on a spec without a team."
-        )

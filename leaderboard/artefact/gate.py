@@ -4,7 +4,7 @@ An allow-list; everything else is rejected with a stable code (`errors.CODES`):
 
     ModelProto → GraphProto → NodeProto → AttributeProto → TensorProto
     one domain, one opset in 13 … 23, the operators of `OPERATORS`
-    one float32 input [batch, S + 2], one float32 output [batch, A]
+    one float32 input [batch, S + 2], one float32 output [batch, A]; for teams see `widths`
     dense tensors inside the file, whose data match their dimensions
 
 Unknown fields are rejected, and so is a second value of a field that has one, because readers
@@ -26,6 +26,8 @@ from leaderboard.artefact import schema
 from leaderboard.artefact.wire import Budget, BudgetError, WireError, fields, signed, varints
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
+from sme_registry import SMESpec
+from sme_registry.evaluation import interface_of
 
 IR_VERSIONS = range(4, 14)  # before 4 every tensor had to be an input, too
 OPSETS = range(13, 24)
@@ -56,13 +58,23 @@ _STANDARD = "Export the network to standard operators only"
 _FLOAT = 1
 
 
+def widths(spec: SMESpec) -> tuple[int, int]:
+    """The widths of a task's policies, of observations and of actions.
+
+    A team has one policy, which is called for each agent with that agent's shared observation: the
+    scorer computes it, so no agent sees more of the state than it observes.
+    """
+    interface = interface_of(spec)
+    return interface.observation_dim, interface.action_dim
+
+
 def inspect(data: bytes, observation_dim: int, action_dim: int) -> None:
     """Reject a file that is not a feed-forward network of the right widths.
 
     Args:
       data: the bytes of the file.
-      observation_dim: S + 2, the width of its input.
-      action_dim: A, the width of its output.
+      observation_dim: the width of its input; S + 2 for a single agent.
+      action_dim: the width of its output; A for a single agent.
 
     Raises:
       Rejection: `too_large`, `onnx_malformed`, `onnx_version`, `onnx_domain`, `onnx_op`,

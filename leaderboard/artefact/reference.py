@@ -14,6 +14,12 @@ density φ by the midpoint rule. With c the multiple of h nearest to x:
 Beyond ±8.5, where x is clipped, Φ is within 1e-17 of 0 or 1. The products come out in units of h,
 so rounding one gives its index into the table; negative indices count from the table's end.
 
+A team's file is called for each agent with its shared observation, which ends with the agent's
+one-hot index. It computes every agent's π*_i from the channels that the agent observes, and adds
+up what the index selects:
+
+    a = Σ_i 1[this is agent i] · (π*_i(s[O_i]), 0, …, 0)
+
 Operators: Cast, Gemm, Clip, Round, Sub, Gather, Add, Mul, Exp.
 """
 
@@ -21,14 +27,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
+from leaderboard.artefact.gate import widths
 from sme_registry import SMESpec, materialize
-from sme_registry.errors import SpecError
 from sme_registry.io import require_packages
 from sme_registry.task import Layer
 
@@ -45,14 +51,14 @@ def optimal_onnx(spec: SMESpec) -> bytes:
     """π* of a task as an ONNX file.
 
     Args:
-      spec: the task, of a single agent.
+      spec: the task.
 
     Returns:
       The file's bytes: input `observations` `[B, S + 2]` float32, output `actions` `[B, A]`
-      float32 in [0, 1], the nearest float32 to π*(s) up to an error of about 1e-10.
+      float32 in [0, 1], the nearest float32 to π*(s) up to an error of about 1e-10. A team's has
+      the widths of `gate.widths`.
 
     Raises:
-      SpecError: the spec has a team.
       ResourceLimitError: the task does not fit in memory.
       MissingDependencyError: the package `onnx` is not installed.
     """
@@ -66,31 +72,63 @@ def optimal_onnx(spec: SMESpec) -> bytes:
     graph.constant("to_density", np.array(_h / math.sqrt(2.0 * math.pi)))
 
     x = graph.node("Cast", ["observations"], "states", to="DOUBLE")
-    layers = cast(list[Layer], materialize(spec).layers)
-    for index, (W, b) in enumerate(layers):
-        # π* does not depend on t/T and r_cum/k.
-        inputs = W if index > 0 else np.hstack([W, np.zeros((len(W), 2))])
-        x = _uniform_layer(graph, f"layer_{index}", x, inputs, b)
+    task = materialize(spec)
+    if spec.team is None:
+        x = _policy(graph, "", x, task.policies[0], task.observed[0])
+    else:
+        agents = zip(task.policies, task.observed, strict=True)
+        actions = [
+            _selected(graph, index, x, _policy(graph, f"agent_{index}/", x, layers, observed))
+            for index, (layers, observed) in enumerate(agents)
+        ]
+        x = actions[0]
+        for index, each in enumerate(actions[1:], start=1):
+            x = graph.node("Add", [x, each], f"agents_to_{index}")
     graph.node("Cast", [x], "actions", to="FLOAT")
     return graph.to_bytes("optimal")
+
+
+def _policy(
+    graph: _Graph, prefix: str, x: str, layers: Sequence[Layer], observed: Sequence[int]
+) -> str:
+    """Add π* of one agent of the observations `x`, float64; return the name of the result."""
+    for index, (W, b) in enumerate(layers):
+        inputs = W
+        if index == 0:  # π* does not depend on t/T, r_cum/k and what the agent does not observe
+            inputs = np.zeros((len(W), graph.observation_dim))
+            inputs[:, list(observed)] = W
+        x = _uniform_layer(graph, f"{prefix}layer_{index}", x, inputs, b)
+    return x
+
+
+def _selected(graph: _Graph, index: int, x: str, action: str) -> str:
+    """Add an agent's action, as wide as the widest one, times its entry of the one-hot index."""
+    agents = len(graph.owned)
+    entry = np.zeros((graph.observation_dim, graph.action_dim))
+    entry[graph.observation_dim - agents + index] = 1.0
+    indicator = graph.node(
+        "Gemm", [x, graph.constant(f"agent_{index}/entry", entry)], f"agent_{index}/indicator"
+    )
+    wide = graph.constant(f"agent_{index}/wide", np.eye(graph.owned[index], graph.action_dim))
+    widened = graph.node("Gemm", [action, wide], f"agent_{index}/widened")
+    return graph.node("Mul", [indicator, widened], f"agent_{index}/selected")
 
 
 def constant_onnx(spec: SMESpec) -> bytes:
     """The constant policy as an ONNX file: exactly ½ in every channel of every row.
 
     Args:
-      spec: the task, of a single agent.
+      spec: the task.
 
     Returns:
       The file's bytes, with the interface of `optimal_onnx`.
 
     Raises:
-      SpecError: the spec has a team.
       MissingDependencyError: the package `onnx` is not installed.
     """
     graph = _Graph(spec)
-    graph.constant("zero", np.zeros((spec.state_dim + 2, spec.action_dim), np.float32))
-    graph.constant("half", np.full(spec.action_dim, 0.5, np.float32))
+    graph.constant("zero", np.zeros((graph.observation_dim, graph.action_dim), np.float32))
+    graph.constant("half", np.full(graph.action_dim, 0.5, np.float32))
     graph.node("Gemm", ["observations", "zero", "half"], "actions")
     return graph.to_bytes("constant")
 
@@ -120,15 +158,13 @@ class _Graph:
     """An ONNX graph under construction. Values are referred to by name."""
 
     def __init__(self, spec: SMESpec) -> None:
-        if spec.team is not None:
-            raise SpecError(
-                f"team: {len(spec.team.agents)} agents: boards have single agents only. "
-                "Give a spec without a team."
-            )
         require_packages("writing reference policies", {"onnx": "onnx"}, "leaderboard")
         import onnx
 
-        self._onnx, self._spec = onnx, spec
+        self._onnx = onnx
+        self.observation_dim, self.action_dim = widths(spec)
+        agents = () if spec.team is None else spec.team.agents
+        self.owned = [agent.action_dim for agent in agents]  # action channels of each agent
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
@@ -144,13 +180,13 @@ class _Graph:
         return output
 
     def to_bytes(self, name: str) -> bytes:
-        """The model's bytes, from `observations` `[B, S + 2]` to `actions` `[B, A]`."""
+        """The model's bytes, from `observations` to `actions`."""
         value, FLOAT = self._onnx.helper.make_tensor_value_info, self._onnx.TensorProto.FLOAT
         graph = self._onnx.helper.make_graph(
             self._nodes,
             name,
-            [value("observations", FLOAT, ["batch", self._spec.state_dim + 2])],
-            [value("actions", FLOAT, ["batch", self._spec.action_dim])],
+            [value("observations", FLOAT, ["batch", self.observation_dim])],
+            [value("actions", FLOAT, ["batch", self.action_dim])],
             self._constants,
         )
         model = self._onnx.helper.make_model(

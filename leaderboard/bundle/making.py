@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from leaderboard.artefact.gate import inspect
+from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle.reading import Bundle, digest_of
 from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
 from leaderboard.documents.board import hex_of
@@ -172,7 +172,7 @@ def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
         return None
     try:
         data = _policy_bytes(run, run.policy, bundle)
-        inspect(data, run.spec.state_dim + 2, run.spec.action_dim)
+        inspect(data, *widths(run.spec))
     except Rejection as error:
         raise Rejection(error.code, f"{run.source}: {error.message}") from error
     artefact = Artefact(sha256=digest_of(data), size=len(data))

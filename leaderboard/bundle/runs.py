@@ -124,6 +124,11 @@ class _Row(StrictModel):
 
 
 def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
+    if record is not None and record.independent:
+        raise OptionError(
+            f"{folder}: has a model for each agent. A board takes one policy for each run, which "
+            "all agents of a team share. Train without --independent."
+        )
     if record is None or record.status != "finished" or not (folder / _MODEL).is_file():
         raise OptionError(
             f"{folder}: contains an unfinished run. Resume it (`sme train --resume`), or list it "

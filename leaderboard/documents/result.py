@@ -37,6 +37,13 @@ METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_l
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 
 
+class AgentScore(StrictModel):
+    """One agent of a team's run: N_m of each region over its own action channels, WD first."""
+
+    name: str
+    normalised_regret: _Regions
+
+
 class RunScore(StrictModel):
     """One run.
 
@@ -49,6 +56,8 @@ class RunScore(StrictModel):
       similarity: mean r̃ of each region; null where there is no policy.
       wd_regret, ood_regret, ood_decay, regret_slope, similarity_loss: defined at the head of this
         module.
+      agents: of a team, in the order of the channels that they own; empty for a single agent and
+        where there is no policy.
     """
 
     spec: Digest | None
@@ -62,6 +71,7 @@ class RunScore(StrictModel):
     ood_decay: Real
     regret_slope: Real
     similarity_loss: Real
+    agents: Annotated[tuple[AgentScore, ...], Field(strict=False)] = ()
 
 
 class Estimate(StrictModel):

@@ -12,7 +12,7 @@ import datetime
 import os
 from collections.abc import Callable
 
-from leaderboard.artefact.gate import inspect
+from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle import Bundle
 from leaderboard.documents.checks import check_submission
 from leaderboard.documents.submission import (
@@ -126,9 +126,7 @@ def _check_artefacts(store: Store, submission: Submission, artefact: ReadArtefac
     dimensions: dict[str, set[tuple[int, int]]] = {}
     for run in submission.runs:
         if run.artefact:
-            spec = instances[run.spec][1]
-            widths = spec.state_dim + 2, spec.action_dim
-            dimensions.setdefault(run.artefact.sha256, set()).add(widths)
+            dimensions.setdefault(run.artefact.sha256, set()).add(widths(instances[run.spec][1]))
     for digest, pairs in dimensions.items():
         data = artefact(digest) if artefact else store.objects.read(digest)
         for observation_dim, action_dim in sorted(pairs):

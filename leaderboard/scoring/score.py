@@ -20,13 +20,23 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 
-from leaderboard.artefact.sandbox import Actions, Observations, Sandbox
+from leaderboard.artefact.gate import widths
+from leaderboard.artefact.sandbox import Actions, Observations, Sandbox, SandboxLimits
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.checks import check_runs
-from leaderboard.documents.result import METRICS, ClassScore, Estimate, Result, RunScore, Scores
+from leaderboard.documents.result import (
+    METRICS,
+    AgentScore,
+    ClassScore,
+    Estimate,
+    Result,
+    RunScore,
+    Scores,
+)
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec, evaluate
@@ -174,19 +184,27 @@ def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]
     ]
 
 
+def agent_names(spec: SMESpec) -> list[str]:
+    """The agents of a team, in the order of the channels that they own; none without a team."""
+    return [] if spec.team is None else [agent.name for agent in spec.team.agents]
+
+
 def _evaluate(
     board: BoardDocument, spec: SMESpec, data: bytes, digest: str, progress: Progress
 ) -> EvaluationReport:
     """Evaluate a policy in the sandbox on the states of its own seed."""
     seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
     protocol = board.protocol.model_copy(update={"seed": seed})
-    with Sandbox(data, spec.state_dim + 2, spec.action_dim) as sandbox:
+    agents = max(1, len(agent_names(spec)))
+    limits = SandboxLimits(cpu_seconds=agents * SandboxLimits.cpu_seconds)
+    with Sandbox(data, *widths(spec), limits) as sandbox:
         evaluated = 0
 
         def policy(observations: Observations) -> Actions:
             nonlocal evaluated
-            # `evaluate` proceeds region by region, so these are the first states of a region.
-            if evaluated % protocol.states_per_region == 0:
+            # `evaluate` proceeds region by region and asks for each agent in turn, so these are
+            # the first states of a region, for each agent.
+            if evaluated % (agents * protocol.states_per_region) < agents * len(observations):
                 sandbox.check_rows(observations)
             evaluated += len(observations)
             return sandbox(observations)
@@ -241,6 +259,7 @@ def _run_score(
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
+    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, _levels(board))}
     return RunScore(
         spec=report.spec_digest,
         class_name=class_name,
@@ -248,7 +267,13 @@ def _run_score(
         evaluation_seed=report.protocol.seed,
         normalised_regret=regrets,
         similarity=similarity,
-        **run_metrics(regrets, similarity, _levels(board)),
+        agents=tuple(
+            AgentScore(
+                name=name, normalised_regret=tuple(r.normalised_regret for r in each.regions)
+            )
+            for name, each in report.agents.items()
+        ),
+        **metrics,
     )
 
 
@@ -258,6 +283,7 @@ def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunSc
     `spec` is the digest of the instance, None if the run is not listed.
     """
     regrets = (1.0,) * len(board.protocol.edges)
+    metrics: dict[str, Any] = {**run_metrics(regrets, None, _levels(board))}
     return RunScore(
         spec=spec,
         class_name=class_name,
@@ -265,7 +291,7 @@ def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunSc
         evaluation_seed=None,
         normalised_regret=regrets,
         similarity=None,
-        **run_metrics(regrets, None, _levels(board)),
+        **metrics,
     )
 
 

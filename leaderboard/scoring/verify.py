@@ -25,6 +25,7 @@ from leaderboard.documents.submission import Artefact, Run, SignedSubmission, Si
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.score import (
     Progress,
+    agent_names,
     evaluation_seed,
     failed_run,
     never_listed,
@@ -368,6 +369,7 @@ def _check_runs(store: Store, result: Result) -> None:
                 matches = score is not None and (
                     (score.spec, score.class_name, score.artefact, score.evaluation_seed)
                     == (spec, instances[spec][0], digest, seed)
+                    and [agent.name for agent in score.agents] == agent_names(instances[spec][1])
                 )
             case Run(spec=spec):
                 matches = score == failed_run(document, instances[spec][0], spec)
@@ -399,8 +401,8 @@ def _rescore(store: Store, id: str) -> None:
     if again.status != stored.status:
         _refuse_result(id, f"scored again, it is rejected: {again.code}: {again.message}")
     for number, (new, old) in enumerate(zip(again.runs, stored.runs, strict=True)):
-        for name in ("normalised_regret", "similarity"):
-            if not _close(getattr(new, name), getattr(old, name), RESCORED):
+        for name in ("normalised_regret", "similarity", "agents"):
+            if not _close(new.to_dict()[name], old.to_dict()[name], RESCORED):
                 _refuse_result(
                     id, f"runs.{number}.{name}: scored again, it differs by more than {RESCORED}"
                 )

@@ -281,11 +281,6 @@ class Store(Database):
 
 def _refuse_unfit(document: BoardDocument) -> None:
     suite = document.suite
-    if any(spec.team is not None for spec in suite.instances):
-        raise BoardError(
-            f"suite={document.suite_name}: has teams; a board needs single-agent tasks. "
-            "Choose another suite."
-        )
     if len(document.instances) != len(suite.instances):
         raise BoardError(
             f"suite={document.suite_name}: two classes share an instance. Change one of the seeds."

@@ -7,6 +7,7 @@ from sme_registry.evaluation.policies import (
     Policy,
     TeamPolicy,
     as_policy,
+    interface_of,
     load_sb3,
 )
 from sme_registry.evaluation.references import reference_policy
@@ -28,6 +29,7 @@ __all__ = [
     "TeamPolicy",
     "as_policy",
     "evaluate",
+    "interface_of",
     "load_sb3",
     "reference_policy",
     "resolve_protocol",

@@ -30,7 +30,7 @@ from leaderboard.errors import CODES
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
 from leaderboard.web.site import charts
-from leaderboard.web.site.rows import SHORT, TABS, https_only, run_rows, steps_text
+from leaderboard.web.site.rows import SHORT, TABS, agent_rows, https_only, run_rows, steps_text
 from sme_registry.io import to_json
 from sme_registry.spec import StrictModel
 
@@ -141,6 +141,7 @@ class Pages:
             codes=CODES,
             chart=chart,
             classes=classes,
+            agents=[] if result is None else agent_rows(result),
             regions=charts.region_labels(edges),
             runs=run_rows(submission, result, self._class_of),
         )

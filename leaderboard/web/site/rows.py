@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from leaderboard.documents.result import Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
 from leaderboard.scoring.ranking import REFERENCES
+from sme_registry.statistics import iqm
 
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
 
@@ -49,6 +50,36 @@ def run_rows(
         (class_of.get(run.spec, "not in this suite") if run else score.class_name, run, score)
         for run, score in pairs
     ]
+
+
+@dataclass(frozen=True)
+class AgentRow:
+    """One agent of a class of teams: interquartile means over the runs of the class."""
+
+    class_name: str
+    agent: str
+    wd_regret: float
+    ood_regret: float
+    normalised_regret: tuple[float, ...]  # of each region, WD first
+
+
+def agent_rows(result: Result) -> list[AgentRow]:
+    """The agents of each class of teams; a run without a policy counts as 1 for each of them."""
+    rows = []
+    for name, runs in itertools.groupby(
+        sorted(result.runs, key=lambda run: run.class_name), key=lambda run: run.class_name
+    ):
+        members = list(runs)
+        agents = next((run.agents for run in members if run.agents), ())
+        for index, agent in enumerate(agents):
+            regrets = [
+                run.agents[index].normalised_regret if run.agents else run.normalised_regret
+                for run in members
+            ]
+            ood = [sum(regret[1:]) / len(regret[1:]) for regret in regrets]
+            means = tuple(iqm(regrets).tolist())
+            rows.append(AgentRow(name, agent.name, means[0], float(iqm(ood)), means))
+    return rows
 
 
 def https_only(link: str | None) -> str | None:

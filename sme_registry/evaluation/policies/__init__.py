@@ -4,7 +4,7 @@ callable · model of Stable-Baselines3, sb3-contrib or sbx, or its .zip · .onnx
 an offline policy · `module:function` · name of a reference policy · for teams also a dict by agent.
 """
 
-from sme_registry.evaluation.policies.forms import as_policy
+from sme_registry.evaluation.policies.forms import as_policy, interface_of
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.policies.perceptron import Perceptron
 from sme_registry.evaluation.policies.policy import Member, Policy, TeamPolicy
@@ -17,6 +17,7 @@ __all__ = [
     "Policy",
     "TeamPolicy",
     "as_policy",
+    "interface_of",
     "load_sb3",
     "saved_sb3",
 ]

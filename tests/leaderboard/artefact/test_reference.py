@@ -6,10 +6,9 @@ import numpy as np
 import onnx
 import pytest
 
-from leaderboard.artefact.gate import inspect
+from leaderboard.artefact.gate import inspect, widths
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
 from sme_registry import SMESpec, evaluate, materialize
-from sme_registry.errors import SpecError
 
 SPECS = {
     "default": SMESpec(),
@@ -105,8 +104,28 @@ def test_the_same_spec_gives_the_same_bytes(made):
     assert made(SMESpec(complexity=3)) == made(SMESpec(complexity=3))
 
 
-@pytest.mark.parametrize("made", [optimal_onnx, constant_onnx])
-def test_a_team_has_no_reference_policy(made):
-    team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
-    with pytest.raises(SpecError, match=r"team: 2 agents: boards have single agents only"):
-        made(team)
+TEAM = SMESpec(
+    state_dim=4,
+    action_dim=5,
+    complexity=3,
+    k=5,
+    team={
+        "agents": [
+            {"name": "scout_0", "action_dim": 1, "observes": [0, 3]},
+            {"name": "driver_0", "action_dim": 3},
+            {"name": "driver_1", "action_dim": 1, "observes": [2]},
+        ]
+    },
+)
+
+
+@pytest.mark.parametrize(("made", "regret"), [(optimal_onnx, 0.0), (constant_onnx, 1.0)])
+def test_a_teams_reference_is_one_file_for_all_agents(made, regret, tmp_path):
+    data = made(TEAM)
+    inspect(data, *widths(TEAM))
+    (tmp_path / "policy.onnx").write_bytes(data)
+    report = evaluate(str(tmp_path / "policy.onnx"), TEAM, {"states_per_region": 500})
+    for each in (report, *report.agents.values()):
+        for region in each.regions:
+            assert region.normalised_regret == pytest.approx(regret, abs=1e-6)
+    assert list(report.agents) == ["scout_0", "driver_0", "driver_1"]

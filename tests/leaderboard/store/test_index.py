@@ -370,25 +370,6 @@ def test_a_board_is_created_only_in_a_new_or_empty_folder(tmp_path):
     assert (tmp_path / "board" / "board.json").read_bytes() == before
 
 
-def test_a_suite_with_teams_makes_no_board(tmp_path):
-    import sme_registry
-    from sme_registry.spec import EvaluationProtocol, Suite
-
-    team = sme_registry.load("SME/Team2-v1").to_dict()
-    del team["seed"]
-    suite = Suite.from_dict({"classes": [{"name": "Team", "setting": team, "seeds": [0]}]})
-    with pytest.raises(BoardError, match="single-agent"):
-        Store.create(
-            tmp_path / "board",
-            title="Teams",
-            suite_name="teams-v1",
-            suite=suite,
-            protocol_name="quick-v1",
-            protocol=EvaluationProtocol(states_per_region=200),
-        )
-    assert not (tmp_path / "board").exists()
-
-
 def test_a_result_of_a_killed_scorer_is_removed_on_opening(tmp_path, key):
     with tiny_board(tmp_path / "board") as store:
         signed = put_submission(store, key)

@@ -1,0 +1,169 @@
+"""Boards of teams: one shared policy, from each agent's own observations; regret by agent."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard import intake
+from leaderboard.artefact import sandbox
+from leaderboard.artefact.reference import optimal_onnx
+from leaderboard.bundle import make_bundle
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import Rejection, TamperedError
+from leaderboard.scoring import ranking, score
+from leaderboard.scoring.verify import verify
+from leaderboard.scoring.worker import run_scorers
+from leaderboard.store import Store
+from leaderboard.web.site import write_site
+from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry.errors import OptionError
+from sme_registry.spec import Suite, SuiteFile
+from tests.leaderboard.conftest import linear_onnx
+
+AGENTS = [
+    {"name": "scout_0", "action_dim": 1, "observes": [0]},
+    {"name": "driver_0", "action_dim": 2},
+]
+SETTING = {"state_dim": 2, "action_dim": 3, "team": {"agents": AGENTS}}
+SUITE = Suite.from_dict(
+    {
+        "classes": [
+            {"name": "team", "setting": SETTING, "seeds": [0, 1]},
+            {"name": "alone", "setting": {"state_dim": 2, "action_dim": 1}, "seeds": [0]},
+        ]
+    }
+)
+FILE = SuiteFile(name="mixed", version=1, digest=SUITE.digest, suite=SUITE)
+TEAM: SMESpec = SUITE.instances[0]
+ALONE: SMESpec = SUITE.instances[2]
+FIELDS: dict[str, Any] = {
+    "title": "Teams",
+    "suite_name": "mixed-v1",
+    "suite": SUITE,
+    "protocol_name": "small",
+    "protocol": EvaluationProtocol(states_per_region=100),
+    "runs_to_rank": 1,
+    "draws": 100,
+}
+DOCUMENT = BoardDocument(key="0" * 64, **FIELDS)
+WIDTHS = (6, 2)  # s, t/T, r_cum/k and two one-hot entries; the widest agent's channels
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Path:
+    with Store.create(tmp_path / "board", **FIELDS) as store:
+        intake.submit_references(store)
+    return tmp_path / "board"
+
+
+def bundle(folder: Path, team: bytes) -> Path:
+    """A bundle with this policy on one team, a failed run on the other, and a single agent."""
+    folder.mkdir()
+    (folder / "team.onnx").write_bytes(team)
+    (folder / "alone.onnx").write_bytes(linear_onnx(300))
+    policies = ["team.onnx", None, "alone.onnx"]
+    rows = [
+        {"spec": spec.digest, "policy": policy, "steps": 10, "seed": 0}
+        for spec, policy in zip(SUITE.instances, policies, strict=True)
+    ]
+    (folder / "runs.json").write_text(json.dumps(rows))
+    made = make_bundle(
+        folder / "bundle",
+        suite=FILE,
+        key=SigningKey.generate(),
+        runs=[folder / "runs.json"],
+        method="Shared",
+        submitter="A Lab",
+    )
+    return made.folder
+
+
+def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
+    board: Path, tmp_path: Path
+) -> None:
+    folder = bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS))
+    with Store.open(board) as store:
+        id = intake.submit_bundle(store, folder)
+    run_scorers(board, 1)
+    assert verify(board, rescore=3).rescored == 3
+    with Store.open(board, read_only=True) as store:
+        ranking.refuse_unpublishable(store.entries())  # the references of teams score 0 and 1
+        result = store.result(id)
+    assert result is not None
+    team, failed, alone = result.runs
+    assert [agent.name for agent in team.agents] == ["scout_0", "driver_0"]
+    # ρ of the team is the mean over channels, so its N lies between those of its agents.
+    low, high = sorted(agent.normalised_regret[0] for agent in team.agents)
+    assert low < team.normalised_regret[0] < high
+    assert (failed.agents, alone.agents) == ((), ())
+
+    write_site(Store.open(board, read_only=True), tmp_path / "site")
+    page = (tmp_path / f"site/submissions/{id.removeprefix('sha256:')}.html").read_text()
+    assert page.count("<bdi>driver_0</bdi>") == 1
+
+
+def test_no_agent_receives_state_channels_that_it_does_not_observe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[sandbox.Observations] = []
+    call = sandbox.Sandbox.__call__
+
+    def recorded(self: sandbox.Sandbox, observations: sandbox.Observations) -> sandbox.Actions:
+        seen.append(observations.copy())
+        return call(self, observations)
+
+    monkeypatch.setattr(sandbox.Sandbox, "__call__", recorded)
+    score._evaluate(DOCUMENT, TEAM, optimal_onnx(TEAM), "sha256:" + "0" * 64, lambda *_: None)
+    rows = np.concatenate(seen)
+    scout = rows[:, 4] == 1.0
+    assert scout.any()
+    assert not rows[scout, 1].any()  # scout_0 observes the first channel only
+    assert rows[~scout, 1].any()
+    np.testing.assert_array_equal(rows[:, 4] + rows[:, 5], 1.0)
+
+
+def test_the_rows_of_every_agent_are_checked_in_every_region(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checked: list[tuple[float, ...]] = []
+    monkeypatch.setattr(
+        sandbox.Sandbox, "check_rows", lambda self, seen: checked.append(tuple(seen[0, -2:]))
+    )
+    score._evaluate(DOCUMENT, TEAM, optimal_onnx(TEAM), "sha256:" + "0" * 64, lambda *_: None)
+    assert checked == [(1.0, 0.0), (0.0, 1.0)] * 6
+
+
+def test_a_policy_of_other_widths_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(Rejection, match="onnx_interface"):
+        bundle(tmp_path / "mine", linear_onnx(400, 4, 3))
+
+
+def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
+    with Store.open(board) as store:
+        intake.submit_bundle(store, bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS)))
+    run_scorers(board, 1)
+    results = sorted((board / "results").iterdir())
+    path = next(path for path in results if "driver_0" in path.read_text())
+    path.write_text(path.read_text().replace("driver_0", "driver_9", 1))
+    with pytest.raises(TamperedError, match=path.name):
+        verify(board)
+
+
+def test_a_run_of_independent_agents_is_refused(tmp_path: Path) -> None:
+    from sme_registry.training import train
+
+    train(
+        TEAM, algorithm="PPO", steps=32, folder=tmp_path / "run", num_envs=1, independent=True,
+        protocol={"states_per_region": 10}, progress=False,
+    )  # fmt: skip
+    with pytest.raises(OptionError, match="a model for each agent"):
+        make_bundle(
+            tmp_path / "bundle", suite=FILE, key=SigningKey.generate(), runs=[tmp_path / "run"],
+            method="M", submitter="S",
+        )  # fmt: skip
