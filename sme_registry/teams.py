@@ -19,22 +19,31 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.envs.types import Observation
-from sme_registry.errors import EpisodeError
+from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.spec import SpecLike
 
 __all__ = ["SMETeamEnv", "env", "parallel_env"]
 
 
-def parallel_env(spec: SpecLike = "Team2-v1", **kwargs: Any) -> SMETeamEnv:
+def parallel_env(
+    spec: SpecLike = "Team2-v1", *, max_cycles: int | None = None, **kwargs: Any
+) -> SMETeamEnv:
     """A team's task as a PettingZoo parallel environment.
 
     Args:
       spec: the task; one without a team is a team of one, `agent_0`.
+      max_cycles: PettingZoo's name of the spec's `horizon`.
       **kwargs: spec fields to override, `action_range`, `render_mode`.
 
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+      OptionError: `max_cycles` and `horizon` differ.
     """
+    if max_cycles is not None and kwargs.setdefault("horizon", max_cycles) != max_cycles:
+        raise OptionError(
+            f"max_cycles={max_cycles!r}: must equal horizon={kwargs['horizon']!r}, as both are the "
+            "length of an episode. Leave one of them out."
+        )
     return SMETeamEnv(spec, **kwargs)
 
 
@@ -42,7 +51,7 @@ def env(
     spec: SpecLike = "Team2-v1", **kwargs: Any
 ) -> AECEnv[str, Observation, npt.NDArray[np.float64]]:
     """A team's task as a PettingZoo AEC environment; arguments and errors as in `parallel_env`."""
-    return TurnBasedTeam(SMETeamEnv(spec, **kwargs))
+    return TurnBasedTeam(parallel_env(spec, **kwargs))
 
 
 class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
@@ -57,6 +66,11 @@ class TurnBasedTeam(OrderEnforcingWrapper):  # type: ignore[misc]
 
     def __init__(self, parallel: Any) -> None:
         super().__init__(parallel_to_aec_wrapper(parallel))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.unwrapped!r})"
+
+    __str__ = __repr__
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         super().reset(seed=seed, options=options)

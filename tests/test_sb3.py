@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sme_registry.sb3 import SMEVecEnv
+from sme_registry.sb3 import SMETeamVecEnv, SMEVecEnv
 
 # Ends early and late, pays late, and its lanes drift apart.
 HARD = sme_registry.SMESpec(horizon=12, k=5, D=0.2, r_min=0.1, complexity=2, seed=4)
@@ -282,3 +282,31 @@ def test_without_sb3_the_way_to_install_it_is_named() -> None:
     root = Path(sme_registry.__file__).resolve().parents[1]
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root)
     assert "[train]" in done.stdout, done.stderr
+
+
+def test_frames_are_those_of_a_dummy_vec_env_of_singles() -> None:
+    pytest.importorskip("pygame")
+    ours = SMEVecEnv(HARD, 3, render_mode="rgb_array")
+    few = SMEVecEnv(HARD, 3, render_mode="rgb_array", render_lanes=[1])
+    theirs = dummy(HARD, render_mode="rgb_array")
+    assert ours.render_mode == "rgb_array"
+    assert ours.metadata["render_fps"] == 10
+    for env in (ours, few, theirs):
+        env.seed(3)
+        env.reset()
+    ours.action_space.seed(0)
+    for _ in range(15):
+        actions = np.stack([ours.action_space.sample() for _ in range(3)])
+        for env in (ours, few, theirs):
+            env.step(actions)
+        frames = ours.get_images()
+        np.testing.assert_array_equal(frames, theirs.get_images())
+        np.testing.assert_array_equal(few.render(), frames[1])
+    np.testing.assert_array_equal(ours.render(), theirs.render())
+
+
+def test_a_vec_env_is_shown_with_its_task_and_its_lanes() -> None:
+    assert repr(SMEVecEnv("Default", 2)) == "SMEVecEnv(SME/Default-v1, num_envs=2)"
+    name = SMEVecEnv("Default", 2, k=3).get_attr("sme_spec")[0].content_name
+    assert repr(SMEVecEnv("Default", 2, k=3)) == f"SMEVecEnv(SME/{name}, num_envs=2)"
+    assert "num_envs=8, 2 teams of 4 agents" in repr(SMETeamVecEnv("Team4", 2))

@@ -16,6 +16,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.notice import compiling
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
     LANE_STATE,
@@ -110,7 +111,8 @@ def engine(task: Task, backend: Backend | None = None) -> Engine:
 
 
 def _numba_engine(task: Task) -> Engine:
-    from sme_registry.compiled import kernels  # imports and loads Numba: 0.3 s of CPU
+    with compiling():  # where nothing is cached yet; else it loads Numba: 0.3 s of CPU
+        from sme_registry.compiled import kernels
 
     if task not in _packed:
         _packed[task] = kernels.pack(task)

@@ -6,11 +6,15 @@ At a reset no action was taken: the same keys hold NaN, so that every info has o
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.types import Array, Mask
+
+if TYPE_CHECKING:
+    from sme_registry.envs.batch import BatchStep
 
 NUMBERS = "similarity", "step_reward", "regret", "accumulated_reward"
 """The keys whose values are numbers; `optimal_action` `[A]` is the fifth."""
@@ -27,6 +31,18 @@ def batch_at_reset(lanes: int, action_dim: int) -> dict[str, Array]:
     """The info of `B` resets: fresh arrays of NaN, `optimal_action` `[B, A]`, others `[B]`."""
     numbers = {key: np.full(lanes, np.nan) for key in NUMBERS}
     return {"optimal_action": np.full((lanes, action_dim), np.nan), **numbers}
+
+
+def of_all_agents(step: BatchStep, lane: int, rescaled: bool) -> dict[str, Any]:
+    """One lane's step as one agent's: the actions of all channels, the means over the agents."""
+    similarity, step_reward, regret, _, accumulated = step.values[:, :, lane].mean(axis=1).tolist()
+    return {
+        "optimal_action": from_unit(step.optimal[lane], rescaled),
+        "similarity": similarity,
+        "step_reward": step_reward,
+        "regret": regret,
+        "accumulated_reward": accumulated,
+    }
 
 
 def masked(info: dict[str, Array], mask: Mask | None = None) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import require_packages
 from sme_registry.spec import SMESpec
+from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ class Renderer:
                     f"render_mode='human': no window can be opened here ({error}). "
                     "Use render_mode='rgb_array'."
                 ) from None
-            pg.display.set_caption(f"SME {self._spec.content_name}")
+            pg.display.set_caption(title(self._spec))
             self._clock = pg.time.Clock()
         self._draw(self._window)
         pg.event.pump()
@@ -277,13 +278,13 @@ class Renderer:
 
 
 def _title(spec: SMESpec) -> str:
-    """The axes by their symbols, and the name of the spec by content."""
+    """The axes by their symbols, and the name of the task."""
     parts = [f"SME   S = {spec.state_dim}", f"A = {spec.action_dim}", f"L = {spec.complexity}"]
     rest = {"k": spec.k, "r_min": spec.r_min, "D": spec.D}
     parts += [f"{name} = {value:g}" for name, value in rest.items()]
     if spec.team is not None:
         parts.append(f"mean of {len(spec.team.agents)} agents")
-    return "   ".join([*parts, spec.content_name])
+    return "   ".join([*parts, title(spec)])
 
 
 def _columns(values: Sequence[float], left: int, right: int) -> list[tuple[int, int, float]]:

@@ -26,6 +26,7 @@ from sme_registry.envs.base import (
 from sme_registry.envs.types import Action, Array, Observation
 from sme_registry.errors import EpisodeError
 from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.spec.catalogue import title
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
@@ -217,6 +218,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         info["optimal_action"] = arguments.from_unit(info["optimal_action"], self._rescaled)
         if self.render_mode is not None:
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
+
+    def __repr__(self) -> str:
+        return f"SMEEnv({title(self.sme_spec)})"
 
     def _checked(self, action: Any) -> Array:
         """The action as `[A]` float64 in the unit range."""

@@ -31,6 +31,7 @@ from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.types import Array, Lanes, Observation
 from sme_registry.errors import ActionError, EpisodeError, OptionError, did_you_mean
 from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
 _ONLY_LANE: Lanes = np.zeros(1, np.int64)
@@ -304,17 +305,10 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     def _record_step(self, joint: Array, done: BatchStep) -> None:
         """Record a step of the team as one: all channels, and the means over the agents."""
-        similarity, step_reward, regret, _, accumulated = done.values[:, :, 0].mean(axis=1).tolist()
-        info = {
-            "optimal_action": arguments.from_unit(done.optimal[0], self._rescaled),
-            "similarity": similarity,
-            "step_reward": step_reward,
-            "regret": regret,
-            "accumulated_reward": accumulated,
-        }
+        info = infos.of_all_agents(done, 0, self._rescaled)
         self._record(self._joint_view(), (arguments.from_unit(joint[0], self._rescaled), info))
 
     def __repr__(self) -> str:
-        return f"SMETeamEnv({self.sme_spec.content_name}, {len(self.possible_agents)} agents)"
+        return f"SMETeamEnv({title(self.sme_spec)}, {len(self.possible_agents)} agents)"
 
     __str__ = __repr__

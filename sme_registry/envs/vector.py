@@ -14,11 +14,14 @@ from gymnasium.vector.utils import batch_space
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import GymnasiumMixin, check_time_limit
 from sme_registry.envs.batch import Batch
+from sme_registry.envs.batch_rendering import METADATA, batch_renderer
 from sme_registry.envs.lanes import Lane
+from sme_registry.envs.rendering import Frame
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
 from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.spec.catalogue import title
 
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
@@ -32,7 +35,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
       num_envs: B, the lanes, at least 1.
       action_range: "unit" or "symmetric".
       autoreset_mode: Gymnasium's: "NextStep" (default), "SameStep" or "Disabled".
-      render_mode: only None; render a single environment.
+      render_mode: None or "rgb_array".
+      render_lanes: the lanes to draw, such as `[0, 1]`; None draws each of them.
       max_episode_steps: refused below the horizon (Gymnasium passes it on).
       **overrides: spec fields to change.
 
@@ -49,20 +53,16 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         action_range: ActionRange = "unit",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        render_lanes: Sequence[int] | None = None,
         max_episode_steps: int | None = None,
         **overrides: Any,
     ) -> None:
         num_envs = integer_in("num_envs", num_envs, 1)
-        if render_mode is not None:
-            raise OptionError(
-                f"render_mode={render_mode!r}: must be None: a batch cannot be rendered. Make a "
-                "single environment to watch an episode."
-            )
         if not isinstance(autoreset_mode, AutoresetMode):
             choice("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
-        self.render_mode = None
+        self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
+        self.render_mode = render_mode
         self._task = arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
         sme = self._task.spec
         if max_episode_steps is not None:
@@ -74,6 +74,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (S + 2,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._renderer = batch_renderer(
+            render_mode, render_lanes, self._batch, self.single_action_space
+        )
 
         self._begun = np.zeros(num_envs, bool)
         self._ended = np.zeros(num_envs, bool)
@@ -124,6 +127,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._begin(lanes, observation, states)
         self._begun[lanes] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
+        if self._renderer is not None:
+            self._renderer.record(lanes.tolist())
         info = infos.batch_at_reset(self.num_envs, self.sme_spec.action_dim)
         return observation, infos.masked(info, mask)
 
@@ -157,7 +162,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             actions, (B, A), self._rescaled, ignored=ended_before if any_ended_before else None
         )
 
-        observation, optimal, values, terminated, truncated = self._batch.advance(unit_actions)
+        done = self._batch.advance(unit_actions)
+        observation, optimal, values, terminated, truncated = done
         similarity, step_reward, regret, reward, accumulated = values[:, 0]
         info = {
             "optimal_action": arguments.from_unit(optimal, self._rescaled),
@@ -166,19 +172,32 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             "regret": regret,
             "accumulated_reward": accumulated,
         }
+        began: Lanes = np.flatnonzero(ended_before)
         if any_ended_before:
             for array in (reward, terminated, truncated):
                 array[ended_before] = 0
-            self._begin(np.flatnonzero(ended_before), observation, info=info)
+            self._begin(began, observation, info=info)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
         last: dict[str, Any] = {}
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended, self._any_ended = ended, any_ended
         elif any_ended:
-            last = self._last(observation, info, ended)
-            self._begin(np.flatnonzero(ended), observation, info=info)
+            last, began = self._last(observation, info, ended), np.flatnonzero(ended)
+            self._begin(began, observation, info=info)
+        if self._renderer is not None:
+            self._renderer.record(began.tolist(), unit_actions, done)
         return observation, reward, terminated, truncated, last | infos.masked(info)
+
+    def render(self) -> tuple[Frame, ...] | None:
+        """A frame of each lane, `[H, W, 3]` uint8; white for lanes not in `render_lanes`.
+
+        None without a `render_mode`.
+
+        Raises:
+          EpisodeError: before the first reset.
+        """
+        return None if self._renderer is None else self._renderer.frame_of_each()
 
     def _last(
         self, observation: Observation, info: dict[str, Array], ended: Mask
@@ -223,11 +242,14 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         if not self._lanes:
             shared = {
                 "task": self.task, "sme_spec": self.sme_spec, "spec": self.spec,
-                "action_space": self.single_action_space, "render_mode": None,
+                "action_space": self.single_action_space, "render_mode": self.render_mode,
                 "observation_space": self.single_observation_space,
             }  # fmt: skip
             self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
         return self._lanes
+
+    def __repr__(self) -> str:
+        return f"SMEVectorEnv({title(self.sme_spec)}, num_envs={self.num_envs})"
 
     def _begin(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import gymnasium
@@ -23,13 +24,16 @@ from sme_registry.compiled.values import (
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import renamed_by_content
 from sme_registry.envs.batch import Batch
+from sme_registry.envs.batch_rendering import METADATA, batch_renderer
 from sme_registry.envs.lanes import Lane
+from sme_registry.envs.rendering import Frame
 from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
 from sme_registry.spec import ActionRange, SMESpec, SpecLike
+from sme_registry.spec.catalogue import title
 from sme_registry.task import Task
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
@@ -131,6 +135,8 @@ class _BatchVecEnv(LanesVecEnv):
         observation_dim: int,
         action_dim: int,
         env_spec: EnvSpec | None = None,
+        render_mode: str | None = None,
+        render_lanes: Sequence[int] | None = None,
     ) -> None:
         self.num_teams, self.agents = integer_in("num_envs", num_envs, 1), task.names
         self._task, self._batch, self._action_dim = task, Batch(task, self.num_teams), action_dim
@@ -138,7 +144,7 @@ class _BatchVecEnv(LanesVecEnv):
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
         observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
         shared = {
-            "render_mode": None, "spec": env_spec, "sme_spec": task.spec, "task": task,
+            "render_mode": render_mode, "spec": env_spec, "sme_spec": task.spec, "task": task,
             "observation_space": observation_space, "action_space": action_space,
         }  # fmt: skip
         teams = range(self.num_teams)
@@ -149,7 +155,24 @@ class _BatchVecEnv(LanesVecEnv):
                 for name in self.agents
             ]
         )
+        joint_space, _ = arguments.action_space(action_range, task.spec.action_dim)
+        self._renderer = batch_renderer(render_mode, render_lanes, self._batch, joint_space)
+        self.metadata = {**self.metadata, "render_fps": METADATA["render_fps"]}
         self._allocate()
+
+    def __repr__(self) -> str:
+        lanes = f"num_envs={self.num_envs}"
+        if self.num_envs != self.num_teams:
+            lanes += f", {self.num_teams} teams of {len(self.agents)} agents"
+        return f"{type(self).__name__}({title(self._task.spec)}, {lanes})"
+
+    def get_images(self) -> list[Frame]:
+        """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them.
+
+        Raises:
+          EpisodeError: before the first reset.
+        """
+        return [] if self._renderer is None else [*self._renderer.frames()]
 
     def _allocate(self) -> None:
         """The values of a step, `[5, n, teams]`, and for each key of infos a view of each lane."""
@@ -211,6 +234,8 @@ class _BatchVecEnv(LanesVecEnv):
                 self._batch.initial_states.seed(team, seed)
             self._batch.begin(np.array([team]), joint, start)
             self._begun[team] = True
+        if self._renderer is not None:
+            self._renderer.record(teams)
         return self._observations(joint)
 
     def _start(self, options: list[dict[str, Any]]) -> Array | None:
@@ -240,7 +265,8 @@ class _BatchVecEnv(LanesVecEnv):
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         n, shape = len(self.agents), (self.num_envs, self._action_dim)
         unit = arguments.to_unit(actions, shape, self._rescaled)
-        done = self._batch.advance(self._joint_actions(unit))
+        joint = self._joint_actions(unit)
+        done = self._batch.advance(joint)
 
         np.copyto(self._values, done.values)
         reward = done.values[REWARD].T.reshape(-1)
@@ -261,6 +287,8 @@ class _BatchVecEnv(LanesVecEnv):
                 lane_infos[lane]["terminal_observation"] = last[lane]
                 self.reset_infos[lane] = self._info_at_reset(lane)
             self._batch.begin(np.flatnonzero(ended), done.observation)
+        if self._renderer is not None:
+            self._renderer.record(np.flatnonzero(ended).tolist(), joint, done)
         return self._observations(done.observation), reward.astype(np.float32), dones, lane_infos
 
     def _observations(self, joint: Observation) -> Observation:
@@ -284,6 +312,8 @@ class SMEVecEnv(_BatchVecEnv):
       spec_or_id: the task: a spec, its fields, an id, a digest or a path.
       num_envs: B, the lanes, at least 1.
       action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
+      render_mode: None or "rgb_array", for `VecVideoRecorder`.
+      render_lanes: the lanes to draw, such as `[0, 1]`; None draws each of them.
       **overrides: spec fields to change.
 
     Raises:
@@ -298,6 +328,8 @@ class SMEVecEnv(_BatchVecEnv):
         num_envs: int = 1,
         *,
         action_range: ActionRange = "symmetric",
+        render_mode: str | None = None,
+        render_lanes: Sequence[int] | None = None,
         **overrides: Any,
     ) -> None:
         named = registered_or_new(spec_or_id)
@@ -307,7 +339,9 @@ class SMEVecEnv(_BatchVecEnv):
         kwargs = {**named.kwargs, "action_range": action_range, **overrides}
         env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), task.spec)
         S, A = task.spec.state_dim, task.spec.action_dim
-        super().__init__(task, num_envs, action_range, S + 2, A, env_spec)
+        super().__init__(
+            task, num_envs, action_range, S + 2, A, env_spec, render_mode, render_lanes
+        )
 
 
 class SMETeamVecEnv(_BatchVecEnv):
@@ -325,6 +359,8 @@ class SMETeamVecEnv(_BatchVecEnv):
         team of one.
       num_envs: the teams, at least 1; `num_envs` of the VecEnv is the lanes, teams times agents.
       action_range: "symmetric", [−1, 1], or "unit", [0, 1].
+      render_mode: None or "rgb_array", for `VecVideoRecorder`.
+      render_lanes: the teams to draw, such as `[0, 1]`; None draws each of them.
       **overrides: spec fields to change.
 
     Raises:
@@ -337,6 +373,8 @@ class SMETeamVecEnv(_BatchVecEnv):
         num_envs: int = 1,
         *,
         action_range: ActionRange = "symmetric",
+        render_mode: str | None = None,
+        render_lanes: Sequence[int] | None = None,
         **overrides: Any,
     ) -> None:
         task = arguments.load_overridden(type(self), spec_or_id, overrides)
@@ -344,7 +382,10 @@ class SMETeamVecEnv(_BatchVecEnv):
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])
         observation_dim, action_dim = shared_observation_dim(task), shared_action_dim(task)
-        super().__init__(task, num_envs, action_range, observation_dim, action_dim)
+        super().__init__(
+            task, num_envs, action_range, observation_dim, action_dim,
+            render_mode=render_mode, render_lanes=render_lanes,
+        )  # fmt: skip
 
     def _observations(self, joint: Observation) -> Observation:
         return shared_observation(self._task, joint).reshape(self.num_envs, -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import sme_registry
+from sme_registry import teams
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import (
@@ -382,5 +384,36 @@ def test_a_saved_team_is_the_same_team_at_the_other_end(tmp_path: Path) -> None:
     spec = sme_registry.load("DuoDeep").derive(seed="0xfeed")
     path = sme_registry.save(spec, tmp_path / "duo.json")
     ours, theirs = begun(spec), begun(path)
-    assert repr(ours) == repr(theirs) == f"SMETeamEnv({spec.content_name}, 2 agents)"
+    assert repr(ours) == repr(theirs) == f"SMETeamEnv(SME/{spec.content_name}, 2 agents)"
     assert ours.step(middle(ours))[1] == theirs.step(middle(theirs))[1]
+
+
+def test_max_cycles_is_pettingzoos_name_of_the_horizon() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # importing it raises a deprecation warning of its own
+        from pettingzoo.test.max_cycles_test import max_cycles_test
+    max_cycles_test(teams)
+    assert sme_registry.make_parallel("Team4", max_cycles=7).sme_spec.horizon == 7
+    both = sme_registry.make_aec("Team4", max_cycles=7, horizon=7)
+    assert both.unwrapped.sme_spec == sme_registry.load("Team4").derive(horizon=7)
+    with pytest.raises(OptionError, match="max_cycles=7: must equal horizon=8"):
+        sme_registry.make_aec("Team4", max_cycles=7, horizon=8)
+    with pytest.raises(SpecError, match="horizon=0"):
+        sme_registry.make_parallel("Team4", max_cycles=0)
+
+
+def test_environments_are_shown_with_their_task() -> None:
+    parallel = "SMETeamEnv(SME/Team4-v1, 4 agents)"
+    assert repr(sme_registry.make_parallel("Team4")) == parallel
+    for shown in (repr, str):
+        assert shown(sme_registry.make_aec("Team4")) == f"TurnBasedTeam({parallel})"
+
+
+def test_infos_of_an_aec_environment_are_empty_before_its_first_step() -> None:
+    # PettingZoo's seed_test compares them, and NaN equals nothing.
+    env = sme_registry.make_aec("Team2")
+    env.reset(seed=0)
+    assert env.infos == {"agent_0": {}, "agent_1": {}}
+    for _ in env.possible_agents:
+        env.step(env.action_space(env.agent_selection).sample())
+    assert np.isfinite(env.last()[-1]["regret"])
