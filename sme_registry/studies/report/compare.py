@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.io import to_json, write_atomically
+from sme_registry.io import refuse_unwritable, to_json, write_atomically
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import TextTable, difference_table
@@ -94,6 +94,7 @@ def write_comparison(
     """
     from sme_registry.studies.report.figures.differences import draw_class_curves, draw_differences
 
+    refuse_unwritable(Path(out) / "differences.csv")
     table = compare(folder, first, second, metrics)
     contents: dict[str, str | bytes] = {
         "differences.csv": table.to_csv(index=False, lineterminator="\n"),
