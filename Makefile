@@ -5,6 +5,8 @@ VENV := .venv
 BOARD := runs/board
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
+FRAMEWORKS := rllib sbx tianshou
+SITE := 'import site; print(site.getsitepackages()[0])'
 
 # The first sufficiently new interpreter; override with `make PYTHON=/path/to/python3.11 test`.
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
@@ -12,7 +14,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo demo-full serve test check bench docs clean
+.PHONY: help install demo demo-full serve test check bench docs frameworks clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -45,6 +47,19 @@ bench: $(INSTALLED)    ## measure speed against peers in the same run
 
 docs: $(INSTALLED)     ## regenerate the generated pages of docs/
 	$(PY) docs/generate.py
+
+frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for RLlib, sbx and Tianshou, each in an environment of its own
+
+# Each environment sees the packages of .venv; pip adds the framework, and replaces what it needs in
+# another version. These versions were tried last. TorchRL is in .venv.
+framework-rllib: PACKAGES := "ray[rllib]==2.60.0"
+framework-sbx: PACKAGES := "sbx-rl==0.28.0"
+framework-tianshou: PACKAGES := "tianshou==2.0.1"
+framework-%: $(INSTALLED)
+	$(PY) -m venv build/$@
+	$(PY) -c $(SITE) > "$$(build/$@/bin/python -c $(SITE))/shared.pth"
+	build/$@/bin/python -m pip install --quiet --disable-pip-version-check $(PACKAGES)
+	build/$@/bin/python -m pytest -q -rsP tests/test_examples.py -k $*
 
 clean:                 ## remove the virtual environment, caches and built packages
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .benchmarks

@@ -9,8 +9,7 @@ observations (MAPPO), a collector and a loss. Two details are specific to these 
 
 - Each agent has its own network (`share_params=False`). In Team4 all agents have the same
   observations and different optimal actions, so a shared network would also need the agent's index.
-- The wrapper keeps only the infos present at reset, which are empty here. With `return_state=True`
-  it returns the state instead, from which the task computes the regret of the actions.
+- The regret printed is that of the agent's own channels, even if the team shares one reward.
 """
 
 from __future__ import annotations
@@ -46,14 +45,12 @@ GROUP = "team"  # the wrapper stacks the agents of a group, [..., agent, channel
 def make(spec: sme_registry.SMESpec) -> PettingZooWrapper:
     """The team as a TorchRL environment, with its agents stacked in one group."""
     team = sme_registry.make_parallel(spec)
-    return PettingZooWrapper(team, return_state=True, group_map={GROUP: team.possible_agents})
+    return PettingZooWrapper(team, group_map={GROUP: team.possible_agents})
 
 
 def regret(task: sme_registry.Task, steps: TensorDict) -> np.ndarray:
-    """Mean regret `[n]` in [0, 1] of each agent on its own channels, even if the team is paid."""
-    states = steps["state"].flatten(0, -2).numpy()
-    actions = steps[GROUP, "action"].flatten(-2).flatten(0, -2).numpy()
-    similarities = task.similarities_of(actions, task.optimal_action(states))
+    """Mean regret `[n]` in [0, 1] of each agent on its own channels."""
+    similarities = steps["next", GROUP, "info", "similarity"].flatten(0, -2).numpy()
     return (1.0 - task.reward_of(similarities)).mean(axis=0)
 
 
