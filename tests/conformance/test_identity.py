@@ -65,6 +65,19 @@ def test_a_json_env_spec_makes_the_task_in_a_process_that_did_not_register_it() 
     assert json.loads(answer) == [SMESpec(complexity=3, seed=11).digest, -1.0]
 
 
+def test_a_single_environment_needs_nothing_that_only_new_vectors_have() -> None:
+    # So that it works with Gymnasium 0.29, which CleanRL pins: `AutoresetMode` is of 1.1.
+    vectors = fresh_python(
+        "import gymnasium, gymnasium.vector, sys\n"
+        "del gymnasium.vector.AutoresetMode\n"
+        "env = gymnasium.make('sme_registry:SME/DefaultSymmetric-v1')\n"
+        "env.reset(seed=0)\n"
+        "env.step(env.action_space.sample())\n"
+        "print('sme_registry.envs.vector' in sys.modules, end='')"
+    )
+    assert vectors == "False"
+
+
 def test_overrides_give_the_derived_digest_and_do_not_keep_the_name() -> None:
     env = gymnasium.make("SME/Default-v1", complexity=10, seed=3)
     derived = sme_registry.load("Default").derive(complexity=10, seed=3)
