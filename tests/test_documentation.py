@@ -21,8 +21,12 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "docs/specs.md", "docs/teams.md", "docs/training.md", "docs/datasets.md"]
-)
+    "page",
+    [
+        "README.md", "docs/specs.md", "docs/teams.md", "docs/training.md", "docs/datasets.md",
+        "docs/figures.md",
+    ],
+)  # fmt: skip
 def test_the_python_of_a_page_runs_from_top_to_bottom(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.plots.style import COLOURS, GREY, canvas, entitle, figure_of, literal, look
+from sme_registry.plots.style import (
+    COLOURS,
+    GREY,
+    canvas,
+    draw_band,
+    entitle,
+    figure_of,
+    literal,
+    look,
+    name_bands,
+)
 from sme_registry.statistics import smoothed
 from sme_registry.task.draw import Array
 
@@ -109,6 +119,8 @@ def learning_curve(
         for index, (name, curves) in enumerate(lines.items()):
             _draw_method(axes, name, curves, look(index))
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
+        if any(len(curves) > 1 for curves in lines.values()):
+            name_bands(axes, "quartiles of runs (line: median)")
         _label_axes(axes)
         if title and ax is None:
             entitle(figure_of(axes), title)
@@ -153,7 +165,7 @@ def _draw_method(
     label = literal(name)
     if len(curves) > 1:
         label += f" (n = {len(curves)})"
-        axes.fill_between(x, low, high, color=style["color"], alpha=0.16, linewidth=0)
+        draw_band(axes, x, low, high, style["color"])
     axes.plot(x, middle, **style, linewidth=2, markersize=4.5, markevery=0.13, label=label)
 
 

@@ -15,11 +15,13 @@ from sme_registry.plots.style import (
     COLOURS,
     GREY,
     canvas,
+    draw_band,
     draw_reference,
     entitle,
     figure_of,
     literal,
     look,
+    name_bands,
 )
 from sme_registry.spec import catalogue
 from sme_registry.statistics import iqm
@@ -89,6 +91,8 @@ def decay_curve(
                 _draw_agents(axes, everything[0], measure)
             if references:
                 _draw_references(axes, methods, measure, averaged=isinstance(reports, Mapping))
+            if len(everything) > len(methods):
+                name_bands(axes, "quartiles of runs (line: IQM)")
             _label_axes(axes, everything, measure)
         tasks = catalogue.titles(report.spec.named(report.task) for report in everything)
         if title is None and len(tasks) == 1:
@@ -136,7 +140,7 @@ def _draw_method(axes: Axes, method: _Method, measure: str, style: Mapping[str, 
     label = literal(method.label)
     if len(runs) > 1:
         low, high = np.quantile(runs, [0.25, 0.75], axis=0)
-        axes.fill_between(x, low, high, color=style["color"], alpha=0.16, linewidth=0)
+        draw_band(axes, x, low, high, style["color"])
         label += f" (n = {len(runs)})"
     axes.plot(x, iqm(runs), **style, markersize=4.5, linewidth=2, label=label)
 

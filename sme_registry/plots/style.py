@@ -79,9 +79,10 @@ def styled() -> Iterator[None]:
 def new_figure(size: tuple[float, float]) -> Figure:
     """An empty figure of this width and height in inches, in the style of the `styled` block."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size)
+    from sme_registry.plots.notebook import NotebookFigure
+
+    figure = NotebookFigure(figsize=size)
     FigureCanvasAgg(figure)
     return figure
 
@@ -106,7 +107,7 @@ def drawing(
     with styled():
         figure = new_figure(size)
         yield figure, files
-        files |= _encoded(figure, formats)
+        files |= encoded(figure, formats)
 
 
 def save_figure(
@@ -136,8 +137,7 @@ def save_figure(
         targets = [path.with_name(f"{path.name}.{ending}") for ending in formats]
         for target in targets:
             checked_format(target)
-    with styled():
-        files = _encoded(figure, formats)
+    files = encoded(figure, formats)
     return [write_atomically(t, files[e]) for t, e in zip(targets, formats, strict=True)]
 
 
@@ -230,6 +230,16 @@ def legend_above(axes: Axes, **options: Any) -> None:
     )
 
 
+def draw_band(axes: Axes, x: Any, low: Any, high: Any, colour: Any) -> None:
+    """The spread of a method's runs around its line."""
+    axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+
+
+def name_bands(axes: Axes, label: str) -> None:
+    """An entry of the legend that says what bands and lines are."""
+    axes.fill_between([], [], [], color=GREY, alpha=0.3, linewidth=0, label=label)
+
+
 def draw_reference(axes: Axes, name: str, x: Any, y: Any, label: str, colour: Any = GREY) -> None:
     """The line of a reference policy: over x, or across the panel if x is None.
 
@@ -293,15 +303,22 @@ def look(index: int) -> Mapping[str, Any]:
     return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
 
 
+def wrapped(text: str, width: float) -> str:
+    """Text in lines of at most this many inches, at nine points."""
+    return textwrap.fill(text, max(8, int(11 * width)))
+
+
 def literal(text: str) -> str:
     """Text that Matplotlib prints as it is, not as a formula."""
     return text.replace("$", r"\$")
 
 
-def _encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
+def encoded(figure: Figure, formats: Iterable[str]) -> dict[str, bytes]:
+    """The bytes of a figure in each format; equal figures give equal bytes."""
     files = {}
-    for ending in formats:
-        content = io.BytesIO()
-        figure.savefig(content, format=ending, dpi=_DPI, metadata=_UNDATED[ending])
-        files[ending] = content.getvalue()
+    with styled():
+        for ending in formats:
+            content = io.BytesIO()
+            figure.savefig(content, format=ending, dpi=_DPI, metadata=_UNDATED[ending])
+            files[ending] = content.getvalue()
     return files

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from sme_registry.errors import (
 )
 from sme_registry.wrappers import RecordRegret
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
+from tests.geometry import assert_readable
 
 
 def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
@@ -98,7 +100,7 @@ def test_an_unfinished_run_is_diagnosed_from_its_checkpoint(run: Path, tmp_path:
 
 
 def test_the_command_writes_a_page_its_data_and_its_figures(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, figures: list[Any]
 ) -> None:
     pytest.importorskip("matplotlib")
     from sme_registry.diagnosis import networks
@@ -109,9 +111,12 @@ def test_the_command_writes_a_page_its_data_and_its_figures(
     assert result.exit_code == 0, result.output
     assert "Why" in result.stdout
     page = (tmp_path / "d" / "diagnosis.md").read_text()
-    figures = sorted(path.name for path in (tmp_path / "d").glob("*.png"))
-    assert len(figures) == 5
-    assert all(f"]({name})" in page for name in figures)
+    names = sorted(path.name for path in (tmp_path / "d").glob("*.png"))
+    assert len(names) == 5
+    assert all(f"]({name})" in page for name in names)
+    assert all((tmp_path / "d" / name).with_suffix(".pdf").exists() for name in names)
+    for figure in figures:
+        assert_readable(figure)
     read = Diagnosis.read(tmp_path / "d" / "diagnosis.json")
     assert read.measurements.capacity is not None
     assert read.measurements.capacity.layers == (10, 64, 64, 4)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -25,6 +26,7 @@ pytest.importorskip("matplotlib")
 from sme_registry.cli.app import app
 from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.write import write_report
+from tests.geometry import assert_readable
 
 SIGNATURES = {"png": b"\x89PNG", "pdf": b"%PDF"}
 FIGURES = {
@@ -188,6 +190,59 @@ def test_no_figure_cuts_off_what_it_draws(analysis: Analysis, figures: list[Any]
                         assert bottom <= y <= top, picture.name
     bottoms = {axes.get_ylim()[0] for axes in figures[2].axes}
     assert (pictures[2].name, bottoms) == ("wd-regret", {0.0})
+
+
+def test_eight_algorithms_with_long_names_leave_every_figure_readable(
+    analysis: Analysis, figures: list[Any]
+):
+    names = [f"PPO (learning_rate = 0.000{i}, n_steps = 256)" for i in range(1, 9)]
+    pictures, _ = draw_figures(_with_algorithms(analysis, names), ("png",), {})
+    assert len(figures) == len(pictures) == len(FIGURES)
+    for figure in figures:
+        assert_readable(figure)
+
+
+def _with_algorithms(analysis: Analysis, names: list[str]) -> Analysis:
+    """The analysis as if Alpha had been trained under each of these names."""
+
+    def renamed(table: pd.DataFrame) -> pd.DataFrame:
+        alpha = table[table.algorithm == "Alpha"]
+        return pd.concat([alpha.assign(algorithm=name) for name in names], ignore_index=True)
+
+    tables = ("results", "runs", "regions", "levels", "contrasts", "aggregates", "profiles",
+              "learning_curves")  # fmt: skip
+    pair = {"first": names[0], "second": names[1]}
+    return dataclasses.replace(
+        analysis, algorithms=tuple(names), learners=tuple(names),
+        improvements=analysis.improvements[:1].assign(**pair),
+        differences=analysis.differences.assign(**pair),
+        **{table: renamed(getattr(analysis, table)) for table in tables},
+    )  # fmt: skip
+
+
+def test_within_and_out_of_distribution_are_compared_on_one_range(
+    analysis: Analysis, figures: list[Any]
+):
+    pictures, _ = draw_figures(analysis, ("png",), {})
+    drawn = dict(zip([picture.name for picture in pictures], figures, strict=True))
+    for name in ("contrasts-regret", "aggregates", "differences", "improvements"):
+        wd, ood = drawn[name].axes[:2]
+        assert wd.get_xlim() == ood.get_xlim(), name
+
+
+def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(
+    analysis: Analysis, figures: list[Any]
+):
+    from sme_registry.studies.report.figures.maps import draw_regions
+
+    regions = analysis.regions.assign(similarity=np.linspace(0.91, 0.96, len(analysis.regions)))
+    draw_regions(dataclasses.replace(analysis, regions=regions), ("png",))
+    panels = [axes for axes in figures[0].axes if axes.images]
+    assert len(panels) == len(analysis.algorithms)
+    assert {axes.images[0].get_clim() for axes in panels} == {(0.9, 1.0)}
+    first = panels[0].images[0].get_array()[0, 0]
+    assert panels[0].texts[0].get_text() == f"{first:.3f}".removeprefix("0")
+    assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figures[0].axes)
 
 
 def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):

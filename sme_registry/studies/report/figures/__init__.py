@@ -7,6 +7,7 @@ of them; a hollow marker stands for fewer than `ENOUGH_RUNS` runs, bars for 95 %
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sme_registry.studies.report.analysis import Analysis
@@ -59,5 +60,14 @@ def draw_figures(
         *([plane] if isinstance(plane, Picture) else ()),
         *curves.draw_offline(analysis, formats),
     ]
+    if not analysis.levels.empty and analysis.levels.runs.min() == 1:
+        pictures = [_with_single_runs(picture) for picture in pictures]
     reasons = [reason for table, reason in _REASONS.items() if getattr(analysis, table).empty]
     return pictures, reasons if isinstance(plane, Picture) else [*reasons, plane]
+
+
+def _with_single_runs(picture: Picture) -> Picture:
+    """The picture, whose caption says that a single run has no interval, if it has intervals."""
+    if not any(words in picture.caption for words in ("95 %", "interquartile")):
+        return picture
+    return replace(picture, caption=f"{picture.caption} A single run has no interval.")

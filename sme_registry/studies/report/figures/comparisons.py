@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from sme_registry.evaluation.report import NOT_COMPARABLE
-from sme_registry.plots.style import GREY, drawing, legend_below, literal
+from sme_registry.plots.style import GREY, drawing, legend_below, literal, wrapped
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import Grid, Look, Picture
 from sme_registry.studies.report.frames import RUN
 from sme_registry.studies.report.tables import ENOUGH_RUNS, METRICS
+
+_LABELS = 2.4  # inches of the names of rows
 
 
 def draw_contrasts(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
@@ -183,5 +185,8 @@ def name_rows(grid: Grid, places: Mapping[str, float], *, shaded: bool = True) -
         for y in places.values() if shaded else ():
             axes.axhspan(y - 0.42, y + 0.42, color="#f4f4f4", zorder=0.5, linewidth=0)
     first = grid.panels[0]
-    first.set_yticks([*places.values()], [literal(name) for name in places], fontsize=8)
+    labels = [wrapped(literal(name), _LABELS) for name in places]
+    first.set_yticks([*places.values()], labels, fontsize=8)
+    more = max(label.count("\n") for label in labels)
+    grid.figure.set_figheight(grid.figure.get_figheight() + 0.13 * more * len(labels))
     first.set_ylim(max(places.values()) + 0.6, -0.6)

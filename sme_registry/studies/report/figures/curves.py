@@ -159,7 +159,7 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
             f"learning-curves-{re.sub('[ .]', '-', group.axis or group.name).lower()}",
             f"Learning curves: {group.name}",
             "Median over runs, with the interquartile range as a band"
-            + (f", averaged over {window} evaluations" if window > 1 else "")
+            + (f", each a running median over {window} evaluations" if window > 1 else "")
             + ". Above: return in % of the optimum's. Below: mean exact regret per step, 0 for the "
             "optimum.",
             grid.files,

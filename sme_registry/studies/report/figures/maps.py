@@ -19,7 +19,7 @@ from sme_registry.plots.maps import (
     scale_ticks,
     similarity_on_grid,
 )
-from sme_registry.plots.style import drawing, literal
+from sme_registry.plots.style import drawing, literal, wrapped
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
 from sme_registry.studies.report.tables import by_place
@@ -105,7 +105,7 @@ def draw_maps(
             if y == 0:
                 axes.set_title(classes[x])
             if x == 0:
-                axes.set_ylabel(literal(names[y]))
+                axes.set_ylabel(wrapped(literal(names[y]), 1.7))
             if (classes[x], names[y]) not in maps:
                 axes.set_axis_off()
                 continue

@@ -19,6 +19,7 @@ from sme_registry.plots.style import (
     drawing,
     legend_below,
     literal,
+    wrapped,
 )
 from sme_registry.studies.report.analysis import Analysis
 
@@ -139,6 +140,23 @@ def panel_grid(
             if share_x and index:
                 panel[-1].sharex(stacks[0][-1])
         yield Grid(figure, files, stacks[:panels], across)
+        _wrap_titles(figure, stacks[:panels], width / across, down)
+
+
+def _wrap_titles(figure: Figure, stacks: Any, width: float, down: int) -> None:
+    """Wrap titles and x labels to the width of a panel in inches; the figure grows with them."""
+    grown = 0
+    for texts in (
+        [stack[0].title for stack in stacks],
+        [stack[-1].xaxis.label for stack in stacks],
+    ):
+        more = 0
+        for each in texts:
+            lines = str(each.get_text()).splitlines()
+            each.set_text("\n".join(wrapped(line, 0.9 * width) for line in lines))
+            more = max(more, each.get_text().count("\n") + 1 - max(1, len(lines)))
+        grown += more
+    figure.set_figheight(figure.get_figheight() + 0.17 * grown * down)
 
 
 def looks(analysis: Analysis) -> dict[str, Look]:
