@@ -47,7 +47,9 @@ def sweep(
     file = StudyFile(name=name, digest=plan.digest, plan=plan)
     status = run_study(file, folder, jobs=jobs, console=err())
     for path in write_report(folder):
-        if path.name == "index.html" or path.stem.startswith("regret-"):
+        if path.name == "index.html" or path.stem.startswith(
+            ("regret-", "wd-regret", "ood-regret")
+        ):
             out().print(escape(str(path)), soft_wrap=True)
     if status.failed:
         failed = f"{len(status.failed)} of {len(status.cells)} cells failed"

@@ -1,7 +1,8 @@
 """How long a study will take: from a table of costs, and from finished cells once there are some.
 
-A cell takes, in seconds of one core, with P its steps, E its evaluations, T the horizon, N the
-states of its evaluation in and out of distribution, L the layers of the optimal policy:
+A cell takes, in seconds of one core, with P its steps (times the agents of a team), E its
+evaluations, T the horizon, N the states of its evaluation in and out of distribution, L the layers
+of the optimal policy:
 
     start + P · step + E · T · batch step + N · (state + layer · (L − 1))
 
@@ -19,7 +20,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
-from sme_registry.studies.engine.algorithms import REFERENCE
+from sme_registry.studies.engine.algorithms import REFERENCE, independent_name
 from sme_registry.studies.engine.result import CellResult
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
@@ -88,16 +89,22 @@ def makespan(seconds: Sequence[float], workers: int) -> float:
 
 def _work(cell: Cell) -> Span:
     """A cell's seconds by the table, without its start."""
-    trains = not cell.uses.startswith(REFERENCE)
+    uses = independent_name(cell.uses) or cell.uses
+    transitions = 0 if uses.startswith(REFERENCE) else cell.steps * _agents(cell.spec)
     states = cell.protocol.states_per_region * len(cell.protocol.edges)
-    step = SECONDS_PER_STEP.get(cell.uses, _UNKNOWN)
+    step = SECONDS_PER_STEP.get(uses, _UNKNOWN)
 
     def bound(i: int) -> float:
-        training = cell.steps * step[i] if trains else 0.0
+        training = transitions * step[i]
         curve = cell.evaluations * cell.spec.horizon * _BATCH_STEP[i]
         return training + curve + states * (_STATE[i] + _LAYER[i] * (cell.spec.complexity - 1))
 
     return Span(bound(0), bound(1))
+
+
+def _agents(spec: SMESpec) -> int:
+    """How many transitions a step gives."""
+    return 1 if spec.team is None else len(spec.team.agents)
 
 
 def _setting(cell: Cell) -> SMESpec:

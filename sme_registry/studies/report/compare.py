@@ -92,6 +92,7 @@ def write_comparison(
       MissingDependencyError: Matplotlib is not installed.
       UnknownNameError, OptionError: see `compare`; or a file cannot be written.
     """
+    from sme_registry.plots.style import WRITTEN
     from sme_registry.studies.report.figures.differences import draw_class_curves, draw_differences
 
     refuse_unwritable(Path(out) / "differences.csv")
@@ -102,10 +103,9 @@ def write_comparison(
     }
     contents |= {f"{each.name}.tex": each.latex() for each in comparison_tables(table)}
     analysis = _analysis(folder, first, second)
-    formats = ("png", "pdf")
     for draw in (draw_differences, draw_class_curves):
-        for picture in draw(analysis, formats):
-            contents |= {f"{picture.name}.{each}": picture.files[each] for each in formats}
+        for picture in draw(analysis, WRITTEN):
+            contents |= {f"{picture.name}.{each}": picture.files[each] for each in WRITTEN}
     return [write_atomically(Path(out) / name, content) for name, content in contents.items()]
 
 
