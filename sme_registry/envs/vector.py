@@ -23,6 +23,8 @@ from sme_registry.io import choice, integer_in
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
 
+_NO_LANE: Lanes = np.empty(0, np.int64)
+
 
 class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     """`num_envs` lanes of one task, bit-equal to as many `SMEEnv`s with the same seeds.
@@ -172,22 +174,24 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             "regret": regret,
             "accumulated_reward": accumulated,
         }
-        began: Lanes = np.flatnonzero(ended_before)
+        began = _NO_LANE
         if any_ended_before:
+            began = np.flatnonzero(ended_before)
             for array in (reward, terminated, truncated):
                 array[ended_before] = 0
             self._begin(began, observation, info=info)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
-        last: dict[str, Any] = {}
+        returned = infos.masked(info)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended, self._any_ended = ended, any_ended
         elif any_ended:
-            last, began = self._last(observation, info, ended), np.flatnonzero(ended)
+            began = np.flatnonzero(ended)
+            returned |= self._last(observation, info, ended)
             self._begin(began, observation, info=info)
         if self._renderer is not None:
             self._renderer.record(began.tolist(), unit_actions, done)
-        return observation, reward, terminated, truncated, last | infos.masked(info)
+        return observation, reward, terminated, truncated, returned
 
     def render(self) -> tuple[Frame, ...] | None:
         """A frame of each lane, `[H, W, 3]` uint8; white for lanes not in `render_lanes`.
