@@ -413,7 +413,7 @@ def test_the_table_has_three_lines_for_each_agent(report):
     before, after = text.split("actions clipped")
     for name, agent in report.agents.items():
         assert name not in before
-        block = after[after.index(f" {name}") :].splitlines()[:3]
+        block = after[after.index(name) :].splitlines()[:3]
         linear = agent.references["linear_least_squares"]
         assert f"{agent.regions[2].similarity:.3f}" in block[0]
         assert f"{agent.regions[2].normalised_regret:.3f}" in block[1]
