@@ -14,7 +14,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python; do \
 	$$python -c '$(NEW_ENOUGH)' >/dev/null 2>&1 && echo $$python && break; done)
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo demo-full serve test check bench docs frameworks clean
+.PHONY: help install demo demo-full serve test check bench lowest docs frameworks clean
 
 help:            ## show this list
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -44,6 +44,9 @@ check: $(INSTALLED)    ## check style, formatting, types and import contracts
 
 bench: $(INSTALLED)    ## measure speed against peers in the same run
 	$(PY) -m pytest benchmarks --benchmark-enable --benchmark-quiet -q
+
+lowest:          ## run the core's tests with the lowest versions that pyproject.toml allows; before a release
+	PYTHON=$(PYTHON) .ci/lowest
 
 docs: $(INSTALLED)     ## regenerate the generated pages of docs/
 	$(PY) docs/generate.py
