@@ -88,7 +88,8 @@ def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) 
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
     caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()]
     if board.practice:
-        caption.append(f"A practice board: {board.runs_to_rank} runs in each class give a rank.")
+        runs = "one run" if board.runs_to_rank == 1 else f"{board.runs_to_rank} runs"
+        caption.append(f"A practice board: {runs} in each class suffice for a rank.")
     columns = {"rank": "number", "method": "text", "submitter": "text"}
     ranking = Table(
         f"{LABELS[metric]} on {board.suite_name} (0 optimal, 1 the constant ½; 95 % intervals)",
