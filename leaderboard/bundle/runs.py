@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from sme_registry.studies import CellStatus
 
 _RECORD, _MODEL, _PLAN = "run.json", "model.zip", "plan.json"
+_INDEPENDENT = (
+    "has a model for each agent. A board takes one policy for each run, which all agents of a team "
+    "share. Train a shared one."
+)
 _RANGES = {"unit": "[0, 1]", "symmetric": "[-1, 1]"}
 
 
@@ -125,10 +129,7 @@ class _Row(StrictModel):
 
 def _trained(folder: Path, record: RunRecord | None) -> SubmittedRun:
     if record is not None and record.independent:
-        raise OptionError(
-            f"{folder}: has a model for each agent. A board takes one policy for each run, which "
-            "all agents of a team share. Train without --independent."
-        )
+        raise OptionError(f"{folder}: {_INDEPENDENT}")
     if record is None or record.status != "finished" or not (folder / _MODEL).is_file():
         raise OptionError(
             f"{folder}: contains an unfinished run. Resume it (`sme train --resume`), or list it "
@@ -187,6 +188,8 @@ def _cell(study: Path, status: CellStatus) -> SubmittedRun:
         raise OptionError(
             f"{source}: its model was not kept. Run the study in a new folder with --keep-models."
         )
+    if cell.uses.startswith("independent:"):
+        raise OptionError(f"{source}: {_INDEPENDENT}")
     result = CellResult.from_dict(read_json(study / "cells" / f"{stem}.json"))
     steps = max((cell.steps, *result.curve.steps))  # the last rollout can exceed the plan
     changed = to_json(cell.hyperparameters) if cell.hyperparameters else "default hyperparameters"

@@ -171,7 +171,9 @@ def _subject(
     return diagnosis.load_run(run)
 
 
-def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> Subject | None:
+def _other_cell(
+    run: str, task: str | None, cell: str | None, against: str
+) -> Subject | TeamSubject | None:
     """The cell that --against names, as STUDY:KEY or as a key of the same study; else None."""
     from sme_registry import diagnosis
 

@@ -20,7 +20,7 @@ from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy, load_sb3
 from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
-from sme_registry.spec.study import Cell
+from sme_registry.spec.study import INDEPENDENT, Cell
 from sme_registry.task.draw import Array
 from sme_registry.training import RunRecord, checkpoint
 from sme_registry.training import episodes as episode_files
@@ -153,7 +153,7 @@ def _team_policy(policy: Any, spec: SMESpec, action_range: str | None) -> TeamPo
     return team
 
 
-def load_cell(study: str | Path, key: str) -> Subject:
+def load_cell(study: str | Path, key: str) -> Subject | TeamSubject:
     """A finished cell of a study that kept its model.
 
     Args:
@@ -161,7 +161,8 @@ def load_cell(study: str | Path, key: str) -> Subject:
       key: the cell's digest, with or without `sha256:`, or its first digits.
 
     Raises:
-      OptionError: the folder holds no study, or the cell's model was not kept.
+      OptionError: the folder holds no study, the cell's model was not kept, or each agent of a
+        team has its own.
       UnknownNameError: no finished cell, or more than one, has such a key.
       MalformedDocumentError, SpecError: its result is damaged.
       PolicyError, MissingDependencyError: its model cannot be loaded.
@@ -169,13 +170,20 @@ def load_cell(study: str | Path, key: str) -> Subject:
     study = Path(study)
     path = _cell_path(study, key)
     cell, log = _read_cell(path)
+    if cell.uses.startswith(INDEPENDENT):
+        raise OptionError(
+            f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
+            "--independent`, and diagnose that run."
+        )
     model = _cell_model(study, path.stem, cell)
-    policy = numpy_policy(
-        model, cell.spec, action_range=None if callable(model) else cell.action_range
-    )
     fields = ("hyperparameters", "seed", "action_range", "steps")
     plan = {"algorithm": cell.uses, **{field: getattr(cell, field) for field in fields}}
     name = f"{cell.uses}, cell {path.stem[:12]}"
+    reference = callable(model) or isinstance(model, dict)
+    action_range = None if reference else cell.action_range
+    if cell.spec.team is not None:
+        return TeamSubject(name, cell.spec, _team_policy(model, cell.spec, action_range), plan)
+    policy = numpy_policy(model, cell.spec, action_range=action_range)
     return Subject(name, cell.spec, policy, plan, log, networks.exploration(model, policy))
 
 

@@ -11,12 +11,21 @@ from typer.testing import CliRunner
 
 from sme_registry import SMESpec, evaluate, load, materialize
 from sme_registry.cli import app
-from sme_registry.diagnosis import TeamDiagnosis, diagnose, load_policy, load_run
+from sme_registry.diagnosis import (
+    TeamDiagnosis,
+    TeamSubject,
+    diagnose,
+    load_cell,
+    load_policy,
+    load_run,
+)
 from sme_registry.diagnosis.document import POLICY
 from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLDS
 from sme_registry.diagnosis.team_render import headline, markdown, team_sentence
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.studies import run_study
 
 SPEC = SMESpec(
     horizon=20,
@@ -181,6 +190,31 @@ def test_every_reason_of_every_question_has_words(one_fails: TeamDiagnosis) -> N
             assert team_sentence(other)
     assert "driver_1" in headline(one_fails)
     assert "| driver_1 |" in markdown(one_fails, ["who_agents.png"])
+
+
+def test_a_cell_of_a_study_of_teams_is_diagnosed(tmp_path: Any) -> None:
+    setting = SPEC.to_dict()
+    setting.pop("seed")
+    algorithms = [
+        {"name": name, "uses": uses, "steps": steps}
+        for name, uses, steps in (("linear", "reference:linear", 0), ("A2C", "A2C", 10))
+    ]
+    fields = {
+        "classes": [{"name": "team", "setting": setting, "seeds": [2]}],
+        "algorithms": algorithms,
+        "seeds": 1,
+        "evaluations": 1,
+        "evaluation_episodes": 1,
+        "protocol": {"states_per_region": 16},
+    }
+    plan = StudyPlan.from_dict(fields)
+    file = StudyFile(name="teams", digest=plan.digest, plan=plan)
+    run_study(file, tmp_path / "study", executor="in-process", keep_models=True)
+    for path in (tmp_path / "study" / "cells").iterdir():
+        subject = load_cell(tmp_path / "study", path.stem)
+        assert isinstance(subject, TeamSubject)
+        diagnosis = diagnose(subject, states=128, episodes=8)
+        assert len(diagnosis.agents) == 3
 
 
 def test_comparisons_and_probes_are_refused_for_teams() -> None:
