@@ -21,7 +21,7 @@ from sme_registry.terminal import escape_latex
 __all__ = ["COLUMN_WIDTH", "latex_table", "text_width"]
 
 COLUMN_WIDTH = 225.0  # of LaTeX's own article; those of journals and conferences are wider
-_NAMES_WIDTH = 62.0  # at least, of the column of names
+_NAMES_WIDTH = 62.0  # at least, of the column of names, unless they are shorter
 _SEPARATION, _INDENT = 6.0, 8.0  # between two columns, and of the lines below a heading
 _LINES = 44  # of a float, on a page with its caption
 _PACKAGES = "% needs \\usepackage{booktabs,tabularx,array}\n"
@@ -42,9 +42,9 @@ def latex_table(
       width: of the column that it must fit, in points.
     """
     room = width - _across_width(frame, names)
-    head, blocks = (
-        _across(frame, names, room) if room >= _NAMES_WIDTH else _stacked(frame, names, width)
-    )
+    longest = max(text_width(", ".join(row[:names])) for row in _rows(frame))
+    fits = room >= min(longest, _NAMES_WIDTH)
+    head, blocks = _across(frame, names, room) if fits else _stacked(frame, names, width)
     spec = "@{}>{\\raggedright\\arraybackslash}X" + "r" * (len(head) - 1) + "@{}"
     parts = []
     for index, rows in enumerate(_pages(blocks)):

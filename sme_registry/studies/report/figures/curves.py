@@ -95,7 +95,8 @@ def _draw_axis(
     for name, algorithm, shift in panels.side_by_side(looks, 0.5):
         own = levels[levels.algorithm == name]
         places, enough = scale.shifted(at[own.index], shift), own.runs >= ENOUGH_RUNS
-        panels.marks(axes, own, "iqm", places, enough, algorithm, upright=True, joined=ordered)
+        joined = ordered and scale.spacing != "nominal"
+        panels.marks(axes, own, "iqm", places, enough, algorithm, upright=True, joined=joined)
     scale.apply(axes, [literal(label) for label in _class_labels(analysis, group)])
     axes.grid(visible=False, axis="x")
     return scale
