@@ -18,7 +18,7 @@
     └── MissingDependencyError    an optional package is not installed (also an ImportError)
 
 A message gives the field, its value, the allowed range and the fix:
-`hidden_width=0: must be in [1, 4096]. Leave it out for the default, 64.`
+`hidden_width=0: must be in [1, 4096]. Correct it, or leave it out for the default, 64.`
 """
 
 from __future__ import annotations

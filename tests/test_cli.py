@@ -56,6 +56,13 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(sme_registry.__file__).parents[1]))
 
 
+def test_show_does_not_call_another_task_by_a_name_of_the_catalogue() -> None:
+    good("new", "mine.json", "--k", "2", "--name", "Default")
+    title = good("show", "mine.json").stdout.splitlines()[0]
+    assert load("mine.json").content_name in title
+    assert "Default-v1" not in title
+
+
 def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: Path) -> None:
     good("new", "k2.json", "--k", "2", "--seed", "7")
     printed = good(
@@ -78,6 +85,8 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: P
     assert "--task" in refused("suite", "other.json")
     assert (tmp_path / "mine.json").read_bytes() == before
     assert not (tmp_path / "other.json").exists()
+    assert "is the file of a suite, not of a task" in refused("train", "mine.json")
+    assert "--suite FILE" in refused("train", wider.instances[2].digest)
 
 
 def test_help_lists_every_command_and_the_version_is_the_packages() -> None:

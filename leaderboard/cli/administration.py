@@ -20,6 +20,7 @@ from leaderboard.cli.options import (
 )
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json
+from sme_registry.terminal.templates import plural
 
 
 def init(
@@ -85,13 +86,14 @@ def init(
     ) as store:
         intake.submit_references(store)
         document = store.document
-    folder, classes = escape(str(board)), len(file.suite.classes)
+    folder = escape(str(board))
+    classes, instances = len(file.suite.classes), len(file.suite.instances)
+    runs = document.runs_needed
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     out().print(
-        f"A ranked entry needs {document.runs_needed} trained policies: one on each of the suite's "
-        f"{len(file.suite.instances)} instances, and at least {runs_to_rank} in each of its "
-        f"{classes} classes.",
+        f"A ranked entry needs {plural(runs, 'trained policy', 'trained policies')}: one on each "
+        f"instance of the suite ({instances}), at least {runs_to_rank} in each class ({classes}).",
         soft_wrap=True,
     )
     out().print(f"Next, score the reference rows: sme-leaderboard score {folder}")

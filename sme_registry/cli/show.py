@@ -248,9 +248,11 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
         for member in file.suite.classes
     ]
     out().print(Table(_title(file), {**columns, "task": "name"}, rows, caption=file.digest))
-    first = file.suite.instances[0].digest
-    if first in known_specs():  # tasks of a file outside the catalogue have no name to train by
-        out().print(f"To train on a task: sme train {first[:_SHORT]}", soft_wrap=True)
+    digests = [spec.digest for spec in file.suite.instances]
+    if all(digest in known_specs() for digest in digests):
+        out().print(f"To train on a task: sme train {digests[0][:_SHORT]}", soft_wrap=True)
+    else:  # a task outside the catalogue cannot be found by its digest
+        out().print("To train on these tasks: sme study new plan.json -a PPO --suite FILE")
 
 
 def _changes(member: SuiteClass) -> str:
@@ -262,4 +264,7 @@ def _changes(member: SuiteClass) -> str:
 
 
 def _title(file: Envelope) -> str:
-    return f"[bold]{file.versioned_name}[/]  {escape(file.description)}"
+    name = file.versioned_name
+    if isinstance(file, EnvFile) and name in catalogue.names(EnvFile):
+        name = catalogue.unique_name(file.spec)  # a file of the user may use the same name
+    return f"[bold]{name}[/]  {escape(file.description)}"

@@ -13,6 +13,7 @@ from sme_registry.cli.files import check_document_path
 from sme_registry.cli.plan_options import ClassOptions, with_options
 from sme_registry.spec import Suite, SuiteFile
 from sme_registry.terminal import err, out
+from sme_registry.terminal.templates import plural
 
 
 @with_options(ClassOptions)
@@ -42,7 +43,8 @@ def suite(
         name=name or path.stem, description=description, digest=members.digest, suite=members
     )
     file.write(path)
-    tasks = f"{len(members.classes)} classes, {len(members.instances)} instances"
+    classes = plural(len(members.classes), "class", "classes")
+    tasks = f"{classes}, {plural(len(members.instances), 'instance')}"
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     hint = f"{tasks}. To run an algorithm on them: sme study new plan.json --suite {path} -a PPO"
     err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)

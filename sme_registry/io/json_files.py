@@ -46,6 +46,8 @@ def _reason(error: ValueError | RecursionError) -> str:
     if isinstance(error, UnicodeDecodeError):
         return f"not UTF-8 text (byte {error.start}). Save it as UTF-8 JSON."
     if isinstance(error, json.JSONDecodeError):
+        if error.doc.startswith("\ufeff"):
+            return "starts with a byte order mark (BOM). Save it as UTF-8 without BOM."
         return f"not JSON: {error.msg} at line {error.lineno}, column {error.colno}."
     if isinstance(error, RecursionError):
         return "nested too deeply. Valid documents have at most ten levels."

@@ -40,7 +40,7 @@ def _integer_only(value: Any) -> Any:
     """Reject what Python calls equal to an integer: `Literal[1]` takes True and 1.0 for 1."""
     number = plain_number(value)
     if type(number) is not int:
-        raise ValueError("must be 1. Leave it out for the default, 1.")
+        raise ValueError("must be 1. Correct it, or leave it out for the default, 1.")
     return number
 
 

@@ -78,6 +78,7 @@ class Envelope(StrictModel):
                     f"{name}: digest: missing: must be the digest of the {cls.content}. To add "
                     f"it, {remedy}."
                 )
+        _refuse_another_kind(cls, data, name)
         envelope = super().from_dict(data, source)
         expected = getattr(envelope, cls.content).digest
         if envelope.digest != expected:
@@ -158,3 +159,13 @@ class ProtocolFile(Envelope):
     content = "protocol"
 
     protocol: EvaluationProtocol
+
+
+def _refuse_another_kind(kind: type[Envelope], data: Any, source: str) -> None:
+    """Say that a file is a suite, say, and not a task, rather than which fields it lacks."""
+    words = {"spec": "task", "plan": "study plan"}
+    if isinstance(data, dict) and kind.content not in data:
+        for other in Envelope.__subclasses__():
+            if other.content in data:
+                actual, expected = (words.get(each.content, each.content) for each in (other, kind))
+                raise SpecError(f"{source}: is the file of a {actual}, not of a {expected}.")

@@ -149,5 +149,6 @@ def _by_content(name: str) -> ResolvedSpec:
     hint = f" Did you mean 'sha256:{near[0]}'?" if near else ""
     raise UnknownNameError(
         f"{name!r}: no task in the catalogue or its suites has this digest.{hint} "
-        "A digest cannot be turned back into a spec: load its file instead."
+        "A digest cannot be turned back into a spec: load its file instead. On the tasks of a "
+        "suite's file: `sme study new plan.json --suite FILE -a PPO`."
     )

@@ -51,7 +51,7 @@ def _seed(value: Any) -> int | str:
         return number
     raise ValueError(
         f"must be an integer in [0, {MAX_SEED}), or for a sealed task a string "
-        "'0x…' of 1 to 64 hex digits. Leave it out for the default, 0."
+        "'0x…' of 1 to 64 hex digits. Correct it, or leave it out for the default, 0."
     )
 
 

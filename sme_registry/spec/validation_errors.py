@@ -63,8 +63,8 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
     if kind in ("model_type", "model_attributes_type"):
         return f"{path}{': ' if path else ''}must be an object of named fields, got {value}."
     fix = "Correct it."
-    if "default" in schema:
-        fix = f"Leave it out for the default, {short_repr(schema['default'])}."
+    if schema.get("default") is not None:
+        fix = f"Correct it, or leave it out for the default, {short_repr(schema['default'])}."
     allowed = f"must be {_allowed(root, schema)}" if schema else line["msg"]
     return f"{path}={value}: {allowed}. {fix}"
 

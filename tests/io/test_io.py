@@ -26,7 +26,7 @@ MALFORMED = {
     "minus infinity": (b'{"r_min": -Infinity}', "-Infinity is not valid JSON."),
     "duplicate key": (b'{"k": 1, "k": 2}', "the key 'k' occurs twice."),
     "inner duplicate key": (b'{"spec": {"k": 1, "k": 1}}', "the key 'k' occurs twice."),
-    "byte order mark": (b'\xef\xbb\xbf{"k": 1}', "BOM"),
+    "byte order mark": (b'\xef\xbb\xbf{"k": 1}', "Save it as UTF-8 without BOM."),
     "not UTF-8": (b'{"k": "\xff"}', "not UTF-8 text (byte 7). Save it as UTF-8 JSON."),
     "UTF-16": ('{"k": 1}'.encode("utf-16"), "not UTF-8 text"),
     "null bytes": (b"\x00" * 100, "not JSON"),

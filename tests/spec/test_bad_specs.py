@@ -16,7 +16,10 @@ BAD = [
     # fields, what the message must contain
     ({"state_dim": 0}, ["state_dim=0: must be an integer in [1, 1048576].", "the default, 8."]),
     ({"action_dim": -3}, ["action_dim=-3: must be an integer in [1, 1048576]."]),
-    ({"k": 0}, ["k=0: must be an integer in [1, 2147483647].", "Leave it out for the default, 1."]),
+    (
+        {"k": 0},
+        ["k=0: must be an integer in [1, 2147483647].", "or leave it out for the default, 1."],
+    ),
     ({"k": "10"}, ["k='10': must be an integer in"]),
     ({"k": 1.0}, ["k=1.0: must be an integer in"]),
     ({"k": True}, ["k=True: must be an integer in"]),
@@ -38,7 +41,7 @@ BAD = [
         {"policy_init": "unit"},
         ["policy_init='unit': must be 'semi_orthogonal' or 'unit_variance'."],
     ),
-    ({"schema_version": 2}, ["schema_version=2: must be 1. Leave it out"]),
+    ({"schema_version": 2}, ["schema_version=2: must be 1. Correct it, or leave it out"]),
     ({"schema_version": True}, ["schema_version=True: must be 1."]),
     ({"schema_version": 1.0}, ["schema_version=1.0: must be 1."]),
     ({"seed": -1}, ["seed=-1: must be an integer in [0, 9007199254740992)"]),
@@ -139,7 +142,8 @@ def test_the_constructor_raises_the_same_error_as_from_dict():
         SMESpec(**fields)
     assert str(of_constructor.value) == str(of_dict.value)
     assert str(of_dict.value).splitlines()[1:] == [
-        "  k=0: must be an integer in [1, 2147483647]. Leave it out for the default, 1.",
+        "  k=0: must be an integer in [1, 2147483647]. Correct it, or leave it out for the "
+        "default, 1.",
         "  team.agents.0.action_dim=0: must be an integer in [1, 1048576]. Correct it.",
     ]
 

@@ -1,0 +1,81 @@
+"""`RecordVectorRegret`, for a vector of environments."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+from sme_registry.wrappers.recorder import Recorder, measured
+
+
+class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
+    """Records the exact regret of each episode of a vector environment; see the package.
+
+    Each entry of `info["episode"]` is `[num_envs]`, 0 where no episode ended; `info["_episode"]`
+    is True where one did. All autoreset modes work.
+
+    Args:
+      env: a vector of environments of this package: `make_vec`, `SyncVectorEnv` or
+        `AsyncVectorEnv`. `RecordEpisodeStatistics` goes inside.
+      path: see `RecordRegret`.
+      force: see `RecordRegret`.
+
+    Raises:
+      OptionError: see `RecordRegret`.
+
+    Attributes:
+      episodes: see `RecordRegret`.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        path: str | os.PathLike[str] | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, path=None if path is None else str(path), force=force)
+        VectorWrapper.__init__(self, env)
+        self._recorder = Recorder(env.num_envs, path, force)
+        self.episodes = self._recorder.episodes
+
+    @property
+    def online_regret(self) -> float:
+        """Mean regret over all steps so far, in [0, 1]; NaN before the first."""
+        return self._recorder.online_regret
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes; those that have not ended are not recorded."""
+        mask = (options or {}).get("reset_mask")
+        result = self.env.reset(seed=seed, options=options)
+        self._recorder.begin(slice(None) if mask is None else np.asarray(mask, bool))
+        return result
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step of every lane."""
+        observations, rewards, terminated, truncated, info = self.env.step(actions)
+        regret, similarity = (np.array(value, np.float64) for value in measured(info))
+        if "final_info" in info:  # SAME_STEP: `info` is of the next episode where one ended
+            final = info["_final_info"]
+            last_regret, last_similarity = measured(info["final_info"])
+            regret[final], similarity[final] = last_regret[final], last_similarity[final]
+        ended = terminated | truncated
+        episode = self._recorder.add(rewards, regret, similarity, terminated, ended)
+        if episode:
+            info["episode"] = {**episode, **info.get("episode", {})}
+            info["_episode"] = ended
+        return observations, rewards, terminated, truncated, info
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the file and the environment."""
+        self._recorder.close()
+        self.env.close(**kwargs)
