@@ -57,6 +57,11 @@ class Analysis:
         return next(iter(self.classes))
 
     @property
+    def state_dims(self) -> list[int]:
+        """The different state dimensions of the runs, in rising order."""
+        return sorted(set(self.results.state_dim))
+
+    @property
     def has_teams(self) -> bool:
         """Whether any run is of a team."""
         return not self.agents.empty

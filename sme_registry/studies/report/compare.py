@@ -43,7 +43,8 @@ def compare(
       One row for each metric and class, and one for "all classes": first_level and second_level,
       IQM over the paired runs; difference, the IQM of the paired differences, with the ends low
       and high of its 95 % bootstrap interval (NaN for a single pair); pairs; enough_pairs; and the
-      verdict on the first algorithm: better, worse or open. `tables` has the formulas.
+      verdict on the first algorithm: better, worse or open. `sme_registry.statistics` has the
+      formulas.
 
     Raises:
       UnknownNameError: the study has no finished run of such an algorithm, or no such metric.

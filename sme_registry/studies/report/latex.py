@@ -109,7 +109,7 @@ def _stacked(frame: pd.DataFrame, names: int, width: float) -> tuple[list[str], 
             source += _line([f"\\hangindent2em\\quad {_breakable(name)}", escape_latex(cell)])
             lines += _lines(name, room)
         blocks.append(_Block(source, lines))
-    return [_joined(frame.columns[:names]), ""], blocks
+    return [_joined(frame.columns[:names]), "value"], blocks
 
 
 def _pages(blocks: Iterable[_Block]) -> Iterable[str]:

@@ -20,6 +20,7 @@ from sme_registry.studies.report.classes import AXES, SEVERAL
 from sme_registry.studies.report.exports import TextTable
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import Findings
+from sme_registry.terminal import duration
 from sme_registry.terminal.templates import environment, plural
 
 __all__ = ["page"]
@@ -90,12 +91,11 @@ def page(
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
     """What the numbers were made from: a name, a digest or other code, and a text."""
     file, plan = analysis.file, analysis.file.plan
-    hours = analysis.runs.seconds.sum() / 3600.0
     states = f"{plan.protocol.states_per_region:,} states per region"
     yield "plan", file.digest, file.versioned_name
     yield "protocol", plan.protocol.digest, states
     runs = f"{len(analysis.runs):,} of {plural(len(plan.cells), 'run')}"
-    yield "runs", "", f"{runs} finished, in {hours:,.1f} CPU hours"
+    yield "runs", "", f"{runs} finished, in {duration(analysis.runs.seconds.sum())} of CPU time"
     episodes = plural(plan.evaluation_episodes, "episode")
     yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"
     for algorithm in plan.algorithms:

@@ -318,3 +318,38 @@ def test_every_verdict_has_words_on_the_page(analysis: Analysis):
     assert "No algorithm" in text_of(
         page(analysis, found.model_copy(update={"algorithms": ()}), [], [], [])
     )
+
+
+def headline(finding: AlgorithmFinding, base: str = "hard") -> str:
+    from sme_registry.studies.report import page as module
+    from sme_registry.studies.report.classes import AXES, SEVERAL
+    from sme_registry.terminal.templates import environment
+
+    templates = environment(Path(module.__file__).parent / "templates", autoescape=True)
+    templates.globals |= {"axes": AXES, "several": SEVERAL}
+    templates.filters["by_class"] = list
+    words: Any = templates.get_template("findings.jinja").module
+    return " ".join(str(words.headline(finding, base)).split())
+
+
+def test_little_learning_comes_before_any_change() -> None:
+    worst = Contrast(
+        class_name="c", axis="k", setting="k = 25", base=0.95, level=0.98, change=0.03, low=0.02,
+        high=0.04, pairs=5, enough_pairs=True, verdict="worse",
+    )  # fmt: skip
+    common = {"algorithm": "A", "verdict": "slightly_hurt", "base_wd_regret": 0.95, "worst": worst}
+    text = headline(AlgorithmFinding(**common, base_unlearnt=True))
+    assert text.startswith("A has learnt almost nothing")
+    assert "most" not in text.removeprefix("A has learnt almost nothing")
+    text = headline(AlgorithmFinding(**common))
+    assert text.startswith("A is hurt slightly, most by reward interval k: on c its WD regret")
+
+
+def test_classes_that_are_easier_than_the_first_are_called_easier() -> None:
+    better = Contrast(
+        class_name="c", axis="k", setting="k = 1", base=0.5, level=0.2, change=-0.3, low=-0.4,
+        high=-0.2, pairs=5, enough_pairs=True, verdict="better",
+    )  # fmt: skip
+    text = headline(AlgorithmFinding(algorithm="A", verdict="none_shown", better=(better,)))
+    assert text.startswith("Other classes are easier for A than the first one, hard:")
+    assert "No class was shown to make" not in text

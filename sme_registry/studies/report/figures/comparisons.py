@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots.style import GREY, drawing, legend_below, literal, wrapped
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
@@ -150,14 +149,15 @@ def draw_decay(analysis: Analysis, formats: Sequence[str]) -> Picture:
         axes.set_xlabel("similarity r̃ within distribution")
         axes.set_ylabel(f"points of r̃ lost in the shell up to ε = {outside.epsilon_high.max():g}")
         legend_below(figure, axes.get_legend_handles_labels()[0])
-    dims = sorted(set(inside.state_dim))
+    dims = analysis.state_dims
     caption = (
         "One mark a run: its similarity in the unit cube, and the hundredths of r̃ that it loses in "
         "the outermost shell. Below 0 a run is better outside, which an agent can be whose actions "
         "saturate before it has learnt."
     )
     if len(dims) > 1:
-        caption += f" It includes runs with S = {', '.join(map(str, dims))}. {NOT_COMPARABLE}"
+        caption += f" It includes runs with S = {', '.join(map(str, dims))}."
+        caption += panels.epsilon_remark(analysis)
     return Picture("decay", "Similarity lost outside against similarity inside", caption, files)
 
 

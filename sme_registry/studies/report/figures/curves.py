@@ -9,7 +9,6 @@ from typing import Any
 
 import pandas as pd
 
-from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots.style import GREY, literal, shades
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import SEVERAL, Group, axis_values, setting_label
@@ -39,7 +38,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
         yield Picture(
             f"regret-{group.axis.replace('.', '-')}",
             f"Normalised regret along the {group.name}",
-            f"{_REGRET_CAPTION} {NOT_COMPARABLE}",
+            f"{_REGRET_CAPTION}{panels.epsilon_remark(analysis)}",
             _draw_panels(analysis, formats, [(group, metric) for metric in panels.HEADINGS]),
         )
         return
@@ -47,7 +46,7 @@ def draw_regret(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]
         yield Picture(
             metric.replace("_", "-"),
             f"Normalised regret {heading}, along each axis",
-            _REGRET_CAPTION + (f" {NOT_COMPARABLE}" if metric == "ood_regret" else ""),
+            _REGRET_CAPTION + (panels.epsilon_remark(analysis) if metric == "ood_regret" else ""),
             _draw_panels(analysis, formats, [(group, metric) for group in groups]),
         )
 
@@ -68,7 +67,10 @@ def _draw_panels(
             if one_group:
                 log = ", log scale" if scale.spacing == "log" else ""
                 axes.set_xlabel(literal(group.name) + log)
-        grid.panels[0].set_ylim(bottom=0.0)  # last: it ends autoscaling, for all panels
+        # From 0, with headroom in proportion. Last: it ends autoscaling, for all panels.
+        grid.panels[0].update_datalim([(0.0, 0.0)], updatex=False)
+        grid.panels[0].autoscale_view(scalex=False)
+        grid.panels[0].set_ylim(bottom=0.0)
         grid.label_rows("normalised regret")
         panels.legend(grid.figure, {**looks, "linear (LSQ)": LINEAR, "constant ½": CONSTANT})
     return grid.files
@@ -155,16 +157,20 @@ def draw_learning_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator
                 grid.label_rows(label, index)
             labels = _class_labels(analysis, group, with_symbol=True)
             panels.legend(grid.figure, dict(zip(labels, looks.values(), strict=True)), across=4)
-        window = rows.window.max()
         yield Picture(
             f"learning-curves-{re.sub('[ .]', '-', group.axis or group.name).lower()}",
             f"Learning curves: {group.name}",
-            "Median over runs, with the interquartile range as a band"
-            + (f", each a running median over {window} evaluations" if window > 1 else "")
-            + ". Above: return in % of the optimum's. Below: mean exact regret per step, 0 for the "
-            "optimum.",
+            f"{curves_caption(rows)} Above: return in % of the optimum's. Below: mean exact "
+            "regret per step, 0 for the optimum.",
             grid.files,
         )
+
+
+def curves_caption(rows: pd.DataFrame) -> str:
+    """What the lines and bands of these rows of `learning_curves` are."""
+    window = rows.window.max()
+    smoothed = f", each a running median over {window} evaluations" if window > 1 else ""
+    return f"Median over runs, with the interquartile range as a band{smoothed}."
 
 
 def _draw_classes(axes: Any, rows: pd.DataFrame, looks: Mapping[str, Look]) -> None:

@@ -9,7 +9,7 @@ from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.comparisons import class_places, name_rows
-from sme_registry.studies.report.figures.curves import line_with_band, step_text
+from sme_registry.studies.report.figures.curves import curves_caption, line_with_band, step_text
 from sme_registry.studies.report.figures.panels import Picture
 from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS, METRICS
 
@@ -77,13 +77,11 @@ def draw_class_curves(analysis: Analysis, formats: Sequence[str]) -> Iterator[Pi
             axes.locator_params(axis="x", nbins=4)
             axes.xaxis.set_major_formatter(step_text)
             axes.set_xlabel("steps")
-        grid.panels[0].set_ylim(bottom=0.0)
         grid.label_rows(CURVES[_MEASURE])
         panels.legend(grid.figure, looks)
     yield Picture(
         "learning-curves-by-class",
         "Learning curves of all algorithms by class",
-        "Median over runs of the mean exact regret per step, with the interquartile range as a "
-        "band: 0 is the optimum.",
+        f"{curves_caption(rows)} Mean exact regret per step, 0 for the optimum.",
         grid.files,
     )

@@ -11,7 +11,6 @@ import pandas as pd
 
 from sme_registry.errors import SMEError
 from sme_registry.evaluation import as_policy
-from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots.maps import (
     colour_scale,
     draw_similarity,
@@ -21,6 +20,7 @@ from sme_registry.plots.maps import (
 )
 from sme_registry.plots.style import drawing, literal, wrapped
 from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.panels import WIDTH, Picture, panel_grid
 from sme_registry.studies.report.tables import by_place
 
@@ -55,7 +55,7 @@ def draw_regions(analysis: Analysis, formats: Sequence[str]) -> Picture:
         "regions",
         "Similarity within and out of distribution",
         "IQM over runs of r̃, 1 for the optimum, in the unit cube (WD) and in each shell around "
-        f"it. A dash: no run has finished. {NOT_COMPARABLE}",
+        f"it. A dash: no run has finished.{panels.epsilon_remark(analysis)}",
         grid.files,
         is_map=True,
     )

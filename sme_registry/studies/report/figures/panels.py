@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from sme_registry.evaluation.report import NOT_COMPARABLE
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -157,6 +158,11 @@ def _wrap_titles(figure: Figure, stacks: Any, width: float, down: int) -> None:
             more = max(more, each.get_text().count("\n") + 1 - max(1, len(lines)))
         grown += more
     figure.set_figheight(figure.get_figheight() + 0.17 * grown * down)
+
+
+def epsilon_remark(analysis: Analysis) -> str:
+    """For captions with levels ε of several runs; "" where all have one state dimension."""
+    return f" {NOT_COMPARABLE}" if len(analysis.state_dims) > 1 else ""
 
 
 def looks(analysis: Analysis) -> dict[str, Look]:
