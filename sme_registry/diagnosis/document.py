@@ -12,11 +12,12 @@ Normalised regret does not depend on k, r_min or D, so it compares runs on diffe
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import Literal, Self
 
 from pydantic import JsonValue
 
-from sme_registry.errors import DigestMismatchError
+from sme_registry.errors import DigestMismatchError, UnknownNameError, did_you_mean
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 
@@ -41,6 +42,7 @@ __all__ = [
     "TimeDependence",
     "Training",
     "Verdict",
+    "verdict_on",
 ]
 
 Answer = Literal["yes", "no", "cannot tell"]
@@ -162,7 +164,7 @@ class Training(StrictModel):
 
     source: Literal["episodes", "evaluations"]  # with exploration, or of the deterministic policy
     rows: Integer  # of the log
-    steps: Integer  # environment steps at its last row
+    steps: Integer  # environment steps at its last row: an incomplete episode has none
     window: Integer
     first_regret: Real
     best_regret: Real  # the lowest
@@ -238,6 +240,23 @@ class Comparison(StrictModel):
     answers: dict[str, tuple[Answer, Answer]]  # to each question whose answers differ
 
 
+def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
+    """The verdict on a question, by its name in data or as people read it.
+
+    Raises:
+      UnknownNameError: there is no such question.
+    """
+    by_name = {verdict.question: verdict for verdict in verdicts}
+    name = "_".join(question.replace("_", " ").casefold().split())
+    if name in by_name:
+        return by_name[name]
+    known = [each.replace("_", " ") for each in by_name]
+    wanted = name.replace("_", " ")
+    partial = [each for each in known if wanted and wanted in each]
+    hint = did_you_mean(partial[0] if partial else wanted, known)
+    raise UnknownNameError(f"question={question!r}: must be one of {', '.join(known)}.{hint}")
+
+
 class Diagnosis(StrictModel):
     """The diagnosis of one policy."""
 
@@ -256,8 +275,12 @@ class Diagnosis(StrictModel):
     versions: dict[str, str]  # of Python and of the packages that the numbers depend on
 
     def verdict(self, question: str) -> Verdict:
-        """The verdict on a question, such as "sparsity"."""
-        return next(verdict for verdict in self.verdicts if verdict.question == question)
+        """The verdict on a question, such as "credit assignment" or "credit_assignment".
+
+        Raises:
+          UnknownNameError: there is no such question.
+        """
+        return verdict_on(question, self.verdicts)
 
     def _repr_markdown_(self) -> str:
         """The page, for notebooks."""

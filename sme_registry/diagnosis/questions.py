@@ -13,7 +13,7 @@ __all__ = ["THRESHOLDS", "Case", "Outcome", "Question", "Rule", "add_to"]
 THRESHOLDS = {
     "solved": 0.1,  # normalised regret at most: nothing is left to explain
     "constant_level": 0.95,  # normalised regret at least: no better than the constant ½
-    "unlearnt": 0.9,  # normalised regret of a channel or of another run, at least
+    "unlearnt": 0.9,  # normalised regret of a channel, at least
     "channel_learnt": 0.6,  # normalised regret of a channel, at most
     "excess_saturation": 0.2,  # share of entries at a bound beyond the optimum's
     "dominant_share": 0.5,  # of the squared error, for an offset or a scale
@@ -41,7 +41,9 @@ THRESHOLDS = {
     "regressed": 0.1,  # its rise from its best
     "probe_better": 0.5,  # the probe's normalised regret over the agent's, at most
     "probe_no_better": 0.8,  # at least
-    "difference": 0.1,  # of normalised regret between two runs
+    "difference": 0.1,  # of normalised regret between two runs, at least
+    "no_difference": 0.02,  # at most: the run is about as good as the other, or better
+    "learnt_little": 0.8,  # normalised regret of the other run, at least
 }
 
 

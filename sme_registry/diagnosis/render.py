@@ -55,9 +55,16 @@ def words(macro: str, *arguments: Any, template: str = "sentences.jinja") -> str
 
 def sentence(verdict: Verdict) -> str:
     """The verdict's reason, with its evidence and thresholds, in a few sentences."""
-    macro = "compared" if verdict.reason in COMPARISON_REASONS else verdict.question
-    macro = "solved" if verdict.reason == "solved" else macro
-    return words(macro, verdict.reason, verdict.evidence, verdict.thresholds)
+    reason, evidence, thresholds = verdict.reason, verdict.evidence, verdict.thresholds
+    if reason not in COMPARISON_REASONS:
+        macro = "solved" if reason == "solved" else verdict.question
+        return words(macro, reason, evidence, thresholds)
+    text = words("compared", reason, evidence, thresholds)
+    own_answer, own_reason = evidence["own_answer"], evidence["own_reason"]
+    if own_answer == "cannot tell":
+        return text
+    alone = words(verdict.question, own_reason, evidence, thresholds)
+    return f"{text} {words('alone', own_answer)} {alone}"
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -78,26 +85,19 @@ def title(diagnosis: Diagnosis | TeamDiagnosis) -> str:
 def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
     """What `sme diagnose` prints, part by part."""
     from rich.markup import escape
-    from rich.table import Table as RichTable
 
-    from sme_registry.terminal import Table
+    from sme_registry.terminal import Answers, Paragraph, Table
 
     yield f"[bold]{escape(title(diagnosis))}[/]"
-    yield escape(headline(diagnosis))
-    yield ""
+    yield Paragraph(headline(diagnosis))
     for heading, rows in _rows(diagnosis).items():
-        table = RichTable(title=heading, title_justify="left", show_header=False, box=None)
-        table.add_column(style="cyan", no_wrap=True, min_width=19)
-        table.add_column(no_wrap=True, min_width=11)
-        table.add_column(overflow="fold")
-        for question, answer, text in rows:
-            table.add_row(question, f"[{COLOURS[answer]}]{answer}[/]", escape(text))
-        yield table
+        yield ""
+        yield Answers(heading, rows, COLOURS)
     if diagnosis.comparison is not None:
         yield ""
-        heading = escape(words("comparison", diagnosis.comparison))
+        yield Paragraph(words("comparison", diagnosis.comparison))
         numbers = ("this run", "other run", "difference")
-        differences = Table(heading, {"": "text", **dict.fromkeys(numbers, "number")})
+        differences = Table("", {"": "text", **dict.fromkeys(numbers, "number")})
         for row in diagnosis.comparison.differences:
             values = (f"{row.value:.3f}", f"{row.other:.3f}", f"{row.value - row.other:+.3f}")
             differences.add_row(label(row.quantity), *values)

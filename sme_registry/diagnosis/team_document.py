@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Level, Measurements, Score, Verdict
+from sme_registry.diagnosis.document import Level, Measurements, Score, Verdict, verdict_on
+from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 
 __all__ = ["AgentDiagnosis", "Credit", "TeamDiagnosis"]
@@ -57,9 +58,21 @@ class TeamDiagnosis(StrictModel):
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:
-        """The verdict on a question about the team, such as "blame"."""
-        return next(verdict for verdict in self.verdicts if verdict.question == question)
+        """The verdict on a question about the team, such as "blame".
+
+        Raises:
+          UnknownNameError: there is no such question.
+        """
+        return verdict_on(question, self.verdicts)
 
     def agent(self, name: str) -> AgentDiagnosis:
-        """One agent, by its name."""
-        return next(agent for agent in self.agents if agent.name == name)
+        """One agent, by its name.
+
+        Raises:
+          UnknownNameError: the team has no such agent.
+        """
+        by_name = {agent.name: agent for agent in self.agents}
+        if name not in by_name:
+            hint = did_you_mean(name, by_name)
+            raise UnknownNameError(f"agent={name!r}: must be one of {', '.join(by_name)}.{hint}")
+        return by_name[name]

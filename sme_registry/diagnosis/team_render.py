@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from sme_registry.diagnosis.document import POLICY, Verdict
 from sme_registry.diagnosis.render import COLOURS, label, sentence, templates, title, words
 from sme_registry.diagnosis.team_document import AgentDiagnosis, TeamDiagnosis
-from sme_registry.terminal import Table, fixed
+from sme_registry.terminal import Answers, Paragraph, Table, fixed
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -44,34 +44,23 @@ def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
     from rich.markup import escape
 
     yield f"[bold]{escape(title(diagnosis))}[/]"
-    yield escape(headline(diagnosis))
+    yield Paragraph(headline(diagnosis))
     yield Table(
         "",
         {name: "number" if index else "name" for index, name in enumerate(_COLUMNS)},
         [[escape(cell) for cell in row] for row in _numbers(diagnosis)],
-        caption="N: normalised regret over the agent's channels · gain if optimal: of the team's "
-        "step reward, if this agent alone acted optimally",
     )
-    yield from _answers("Who is to blame", _team_rows(diagnosis))
+    yield Paragraph(
+        "N: normalised regret over the agent's channels · gain if optimal: of the team's step "
+        "reward, if this agent alone acted optimally",
+        style="dim italic",
+    )
+    yield Answers("Who is to blame", _team_rows(diagnosis), COLOURS)
     for agent in diagnosis.agents:
         rows = [row for row in _agent_rows(agent) if row[1] == "yes"]
-        yield from _answers(f"Where the error of {agent.name} is", rows)
-    yield escape(words("left_out", diagnosis.left_out, template=_SENTENCES))
-
-
-def _answers(heading: str, rows: _Rows) -> Iterator[RenderableType]:
-    from rich.markup import escape
-    from rich.table import Table as RichTable
-
-    if not rows:
-        return
-    answers = RichTable(title=heading, title_justify="left", show_header=False, box=None)
-    answers.add_column(style="cyan", no_wrap=True, min_width=19)
-    answers.add_column(no_wrap=True, min_width=4)
-    answers.add_column(overflow="fold")
-    for question, answer, text in rows:
-        answers.add_row(question, f"[{COLOURS[answer]}]{answer}[/]", escape(text))
-    yield answers
+        if rows:
+            yield Answers(f"Where the error of {agent.name} is", rows, COLOURS)
+    yield Paragraph(words("left_out", diagnosis.left_out, template=_SENTENCES))
 
 
 def markdown(diagnosis: TeamDiagnosis, figures: Sequence[str] = ()) -> str:

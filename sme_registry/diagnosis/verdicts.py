@@ -1,12 +1,15 @@
 """Verdicts on the measurements: a question, its answer, the branch that decided, its evidence.
 
-A run compared with another that differs in a single field of the spec has the question of that
-field decided by the difference in normalised regret.
+If a run is compared with another whose spec is easier in a single field, the difference in
+normalised regret answers the question of that field: "yes" if it is clear, "no" if there is none
+although the other run has learnt. The evidence of the run alone is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+
+from pydantic import JsonValue
 
 from sme_registry.diagnosis.document import Answer, Comparison, Level, Measurements, Verdict
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
@@ -21,10 +24,19 @@ QUESTIONS = {**WHERE, **WHY}
 
 COMPARISON_REASONS: dict[str, Answer] = {
     "field_raises_regret": "yes",
-    "field_does_not_raise_regret": "no",
-    "other_run_unlearnt": "cannot tell",
+    "regret_same_or_lower": "no",
+    "difference_too_small": "cannot tell",
+    "other_run_learnt_little": "cannot tell",
 }
 """Of the questions about single fields of the spec, in place of the rule's own reasons."""
+
+_FIELD_IS_OFF = {"paid_every_step", "no_reward_threshold", "no_survival_threshold"}
+"""Reasons that hold by definition: no other run can contradict them."""
+
+_SIGNS = {"rewards_gated", "episodes_cut_short"}
+"""Reasons of a "yes" that an inconclusive comparison leaves open. The effect is present in the
+policy's episodes, but the run without it was not clearly better. A probe is an experiment of its
+own, and stands."""
 
 SOLVED: dict[str, Answer] = {"solved": "no"}
 """Of every "why" question."""
@@ -58,12 +70,13 @@ def _verdict(case: Case, name: str, question: Question) -> Verdict:
         regret = case.measurements.policy.normalised_regret
         outcome = Outcome("solved", {"normalised_regret": regret}, ("solved",))
     else:
-        compared, outcome = _compared(case, name), question.rule(case)
-        # A decision wins; between two "cannot tell", the comparison knows more.
-        if compared is not None and (
-            answers[compared.reason] != "cannot tell" or answers[outcome.reason] == "cannot tell"
-        ):
-            outcome = compared
+        alone, compared = question.rule(case), _compared(case, name)
+        outcome = alone
+        if compared is not None and _decides(answers, compared.reason, alone.reason):
+            own = {"own_answer": answers[alone.reason], "own_reason": alone.reason}
+            thresholds = dict.fromkeys((*alone.thresholds, *compared.thresholds))
+            evidence = {**alone.evidence, **compared.evidence, **own}
+            outcome = Outcome(compared.reason, evidence, tuple(thresholds))
     return Verdict(
         question=name,
         kind=question.kind,
@@ -72,6 +85,15 @@ def _verdict(case: Case, name: str, question: Question) -> Verdict:
         evidence=outcome.evidence,
         thresholds={threshold: _T[threshold] for threshold in outcome.thresholds},
     )
+
+
+def _decides(answers: dict[str, Answer], compared: str, alone: str) -> bool:
+    """Whether a comparison, rather than the run alone, gives the verdict."""
+    if alone in _FIELD_IS_OFF:
+        return False
+    if answers[compared] != "cannot tell":
+        return True
+    return answers[alone] == "cannot tell" or alone in _SIGNS
 
 
 _FIELD_QUESTIONS = {
@@ -85,20 +107,27 @@ _FIELD_QUESTIONS = {
 
 
 def _compared(case: Case, question: str) -> Outcome | None:
-    """The verdict of a run that differs in one field alone; None for any other question or run."""
+    """The outcome of a comparison with a run that is easier in one field alone; None for any other
+    question or run.
+    """
     other = case.comparison
     if other is None or len(other.spec_fields) != 1 or other.plan_fields:
         return None
     (field, (value, other_value)), *_ = other.spec_fields.items()
     if _FIELD_QUESTIONS.get(field) != question:
         return None
+    if not _is_harder(value, other_value):
+        return None
     regret = other.differences[0]
-    if regret.value - regret.other >= _T["difference"]:
+    difference = regret.value - regret.other
+    if difference >= _T["difference"]:
         reason = "field_raises_regret"
-    elif regret.value - regret.other > -_T["difference"] and regret.other >= _T["unlearnt"]:
-        reason = "other_run_unlearnt"
+    elif regret.other >= _T["learnt_little"]:
+        reason = "other_run_learnt_little"
+    elif difference > _T["no_difference"]:
+        reason = "difference_too_small"
     else:
-        reason = "field_does_not_raise_regret"
+        reason = "regret_same_or_lower"
     return Outcome(
         reason,
         {
@@ -109,5 +138,11 @@ def _compared(case: Case, question: str) -> Outcome | None:
             "normalised_regret": regret.value,
             "other_normalised_regret": regret.other,
         },
-        ("difference", "unlearnt"),
+        ("difference", "no_difference", "learnt_little"),
     )
+
+
+def _is_harder(value: JsonValue, other_value: JsonValue) -> bool:
+    """Whether a field makes the run's task the harder one: each is harder at a higher value."""
+    numbers = isinstance(value, int | float) and isinstance(other_value, int | float)
+    return numbers and value > other_value  # type: ignore[operator]

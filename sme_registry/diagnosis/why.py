@@ -40,7 +40,9 @@ def _exploration(case: Case) -> Outcome:
     evidence |= {
         "regret": regret,
         "exploration_cost": cost if reported else None,
-        **log.model_dump(include={"steps", "improvement_step", "constant_regret", "best_regret"}),
+        **log.model_dump(
+            include={"source", "steps", "improvement_step", "constant_regret", "best_regret"}
+        ),
     }
     if log.improvement_step is not None:
         return Outcome("beat_constant_in_training", evidence)
@@ -178,7 +180,15 @@ def _budget(case: Case) -> Outcome:
     if log is None:
         return Outcome("no_training_log", {})
     evidence = log.model_dump(
-        include={"rows", "steps", "best_regret", "best_step", "last_regret", "recent_improvement"}
+        include={
+            "source",
+            "rows",
+            "steps",
+            "best_regret",
+            "best_step",
+            "last_regret",
+            "recent_improvement",
+        }
     )
     if log.rows < _T["log_rows"]:
         return Outcome("log_too_short", evidence, ("log_rows",))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy
 from sme_registry.evaluation.references import reference_policy
+from sme_registry.terminal import out
 
 SPEC = SMESpec(horizon=20)
 DEEP = SMESpec(horizon=20, complexity=10, seed=1)
@@ -22,6 +27,18 @@ def optimum(spec: SMESpec) -> Any:
 def diagnosis_of(policy: Any, spec: SMESpec = SPEC, **options: Any) -> Diagnosis:
     settings = {"states": 2048, "episodes": 8, **options}
     return diagnose(load_policy(policy, spec), **settings)
+
+
+def printed(parts: Iterable[Any], width: int | None) -> list[str]:
+    """The lines on a terminal of this width, or in a pipe."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        console = out()
+        if width is not None:
+            console = Console(file=text, width=width, force_terminal=True, color_system=None)
+        for part in parts:
+            console.print(part)
+    return [line.rstrip() for line in text.getvalue().splitlines()]
 
 
 def faults(diagnosis: Diagnosis) -> set[str]:

@@ -18,7 +18,7 @@ from sme_registry.diagnosis.document import (
     Measurements,
     Training,
 )
-from tests.diagnosis.policies import SPEC, diagnosis_of, shrunk
+from tests.diagnosis.policies import SPEC, diagnosis_of, printed, shrunk
 
 DECLARED = {
     (question, reason)
@@ -28,7 +28,6 @@ DECLARED = {
     (question, reason)
     for question in ("credit_assignment", "sparsity", "capacity", "dimension", "survival")
     for reason in verdicts.COMPARISON_REASONS
-    if (question, reason) != ("survival", "other_run_unlearnt")  # its rule always decides
 }
 FIELDS = {"k": (5, 1), "r_min": (0.5, 0.0), "complexity": (10, 1), "state_dim": (16, 8),
           "action_dim": (8, 4), "D": (0.5, 0.0)}  # fmt: skip
@@ -86,8 +85,8 @@ def random_verdicts(count: int) -> Iterator[Verdict]:
             field = generator.choice(list(FIELDS))
             regret = Difference(
                 quantity="normalised_regret",
-                value=generator.choice((0.5, 0.95)),
-                other=generator.choice((0.5, 0.95)),
+                value=generator.choice((0.5, 0.55, 0.55, 0.95)),
+                other=generator.choice((0.5, 0.5, 0.95)),
             )
             comparison = Comparison(
                 name="the other", spec_fields={field: FIELDS[field]}, plan_fields={},
@@ -98,13 +97,17 @@ def random_verdicts(count: int) -> Iterator[Verdict]:
 
 def test_every_question_and_reason_is_reached_and_has_a_sentence() -> None:
     reached = set()
-    for verdict in random_verdicts(1500):
+    for verdict in random_verdicts(2000):
         reached.add((verdict.question, verdict.reason))
         text = render.sentence(verdict)
         assert text.endswith(".")
         assert "None" not in text
         assert " ," not in text
         assert " ." not in text
+        if verdict.reason in verdicts.COMPARISON_REASONS:
+            own = (verdict.question, verdict.evidence["own_reason"])
+            assert own in DECLARED
+            assert ("this run alone" in text) == (verdict.evidence["own_answer"] != "cannot tell")
     assert reached == DECLARED
 
 
@@ -129,3 +132,23 @@ def test_markdown_holds_every_sentence_the_headline_and_the_figures() -> None:
     rules = [line for line in tables if set(line) <= {"|", "-"}]
     assert len(rules) == 6 if diagnosis.comparison and diagnosis.comparison.answers else 5
     assert all(line.endswith("|") for line in tables)
+
+
+@pytest.mark.parametrize("width", [60, 120, None])
+def test_a_diagnosis_is_readable_at_every_width_and_in_a_pipe(width: int | None) -> None:
+    from sme_registry.diagnosis import diagnose, load_policy
+
+    other = load_policy(shrunk, SMESpec(horizon=20, k=5, r_min=0.5), name="other")
+    diagnosis = diagnose(load_policy(shrunk, SPEC), against=other, states=64, episodes=8)
+    lines = printed(render.terminal(diagnosis), width)
+    assert max(map(len, lines)) <= (width or 80)
+    shown = " ".join(" ".join(lines).split())
+    assert render.headline(diagnosis) in shown
+    for verdict in diagnosis.verdicts:
+        question = render.label(verdict.question)
+        if width is None:
+            line = lines.index(f"{question}: {verdict.answer}")
+            assert lines[line + 1].startswith("    ")
+            assert f"{question}: {verdict.answer} {render.sentence(verdict)}" in shown
+        else:
+            assert any(line.split()[:1] == question.split()[:1] for line in lines)

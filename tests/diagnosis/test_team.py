@@ -21,11 +21,12 @@ from sme_registry.diagnosis import (
 )
 from sme_registry.diagnosis.document import POLICY
 from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLDS
-from sme_registry.diagnosis.team_render import headline, markdown, team_sentence
-from sme_registry.errors import OptionError
+from sme_registry.diagnosis.team_render import headline, markdown, team_sentence, terminal
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies import run_study
+from tests.diagnosis.policies import printed
 
 SPEC = SMESpec(
     horizon=20,
@@ -71,6 +72,20 @@ def one_fails() -> TeamDiagnosis:
 
 def answers(diagnosis: TeamDiagnosis) -> dict[str, str]:
     return {verdict.question: verdict.answer for verdict in diagnosis.verdicts}
+
+
+def test_an_unknown_question_or_agent_of_a_team_is_refused(one_fails: TeamDiagnosis) -> None:
+    assert one_fails.verdict("unequal agents") is one_fails.verdict("unequal_agents")
+    with pytest.raises(UnknownNameError, match="Did you mean 'blame'"):
+        one_fails.verdict("blam")
+    with pytest.raises(UnknownNameError, match=r"must be one of scout_0, .* Did you mean 'driver_"):
+        one_fails.agent("driver_2")
+
+
+def test_a_team_in_a_pipe_has_short_lines(one_fails: TeamDiagnosis) -> None:
+    lines = printed(terminal(one_fails), None)
+    assert "blame: yes" in lines
+    assert max(map(len, lines)) <= 100
 
 
 def test_the_agent_that_fails_is_to_blame(one_fails: TeamDiagnosis) -> None:

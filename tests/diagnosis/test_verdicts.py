@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sme_registry.diagnosis import Subject, Verdict, diagnose, load_policy, verdicts
-from sme_registry.diagnosis.document import CapacityProbe
+from sme_registry import SMESpec
+from sme_registry.diagnosis import Subject, Verdict, diagnose, load_policy, render, verdicts
+from sme_registry.diagnosis.document import CapacityProbe, Comparison, Difference
 from sme_registry.diagnosis.subject import Log
+from sme_registry.errors import SMEError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (
     DEEP,
@@ -207,28 +209,147 @@ def test_a_comparison_in_one_field_decides_its_question_and_in_two_decides_none(
     )
     verdict = diagnosis.verdict("credit_assignment")
     raised = regret.value - regret.other >= 0.1
-    assert verdict.reason == ("field_raises_regret" if raised else "field_does_not_raise_regret")
+    assert verdict.reason == ("field_raises_regret" if raised else "regret_same_or_lower")
     assert verdict.evidence["field"] == "k"
     two = load_policy(saturated, k5.derive(r_min=0.5))
     diagnosis = diagnose(two, against=better, states=256, episodes=8)
     assert diagnosis.verdict("credit_assignment").answer == "cannot tell"
 
 
-def test_a_run_that_has_not_learnt_either_does_not_clear_a_field() -> None:
-    def credit(policy: Any, other: Any, k: int = 100) -> Verdict:
-        spec, other_spec = SPEC.derive(k=k, horizon=100), SPEC.derive(k=101 - k, horizon=100)
+def compared(
+    spec: SMESpec,
+    field: str,
+    values: tuple[Any, Any],
+    regrets: tuple[float, float],
+    **measured: Any,
+) -> dict[str, Verdict]:
+    """The verdicts on a run against another that differs in one field, at these regrets."""
+    plain = diagnosis_of(constant(spec), spec, states=64).measurements
+    policy = plain.policy.model_copy(update={"normalised_regret": regrets[0]})
+    uniform = {**plain.uniform, "policy": policy}
+    measurements = plain.model_copy(update={"uniform": uniform, **measured})
+    assert measurements.policy.normalised_regret == regrets[0]
+    regret = Difference(quantity="normalised_regret", value=regrets[0], other=regrets[1])
+    comparison = Comparison(
+        name="other", spec_fields={field: values}, plan_fields={}, differences=(regret,), answers={}
+    )
+    return {v.question: v for v in verdicts.judge(measurements, spec, comparison)}
+
+
+@pytest.mark.parametrize(
+    ("question", "field", "values"),
+    [
+        ("credit_assignment", "k", (5, 1)),
+        ("sparsity", "r_min", (0.75, 0.0)),
+        ("capacity", "complexity", (10, 1)),
+        ("dimension", "state_dim", (16, 8)),
+        ("dimension", "action_dim", (8, 4)),
+        ("survival", "D", (0.9, 0.0)),
+    ],
+)
+@pytest.mark.parametrize(
+    ("regrets", "answer", "reason"),
+    [
+        ((0.94, 0.5), "yes", "field_raises_regret"),
+        ((0.94, 0.83), "yes", "field_raises_regret"),
+        ((0.94, 0.85), "cannot tell", "other_run_learnt_little"),
+        ((0.85, 0.85), "cannot tell", "other_run_learnt_little"),
+        ((0.5, 0.85), "cannot tell", "other_run_learnt_little"),
+        ((0.55, 0.5), "cannot tell", "difference_too_small"),
+        ((0.51, 0.5), "no", "regret_same_or_lower"),
+        ((0.3, 0.5), "no", "regret_same_or_lower"),
+    ],
+)
+def test_a_field_is_cleared_only_by_a_run_that_has_learnt_and_is_no_better(
+    question: str, field: str, values: Any, regrets: Any, answer: str, reason: str
+) -> None:
+    spec = SPEC.derive(**{field: values[0]})
+    verdict = compared(spec, field, values, regrets)[question]
+    assert (verdict.answer, verdict.reason) == (answer, reason)
+    text = render.sentence(verdict)
+    assert "not raise" not in text
+    assert ("does not explain" in text) == (answer == "no")
+    assert verdict.evidence["other_normalised_regret"] == regrets[1]
+    assert verdict.thresholds["learnt_little"] == 0.8
+
+
+def test_the_evidence_of_the_run_alone_is_kept_in_a_comparison() -> None:
+    spec = SPEC.derive(r_min=0.75)
+    alone = diagnosis_of(constant(spec), spec, states=64).verdict("sparsity")
+    assert alone.answer == "yes"
+    verdict = compared(spec, "r_min", (0.75, 0.0), (0.94, 0.85))["sparsity"]
+    assert verdict.answer == "cannot tell"
+    assert verdict.evidence.items() >= alone.evidence.items()
+    assert verdict.evidence["own_answer"] == "yes"
+    assert verdict.evidence["own_reason"] == "rewards_gated"
+    assert verdict.thresholds.items() >= alone.thresholds.items()
+    text = render.sentence(verdict)
+    assert "this run alone says yes" in text
+    assert render.sentence(alone) in text
+
+
+def test_an_inconclusive_comparison_leaves_a_no_and_a_probe_as_they_are() -> None:
+    inconclusive = (0.94, 0.85)
+    assert compared(SPEC, "D", (0.1, 0.0), inconclusive)["survival"].reason != (
+        "other_run_learnt_little"
+    )
+    probe = CapacityProbe(
+        layers=(10, 4), states=1000, gradient_steps=1, train_normalised_regret=0.95,
+        test_normalised_regret=0.95, seconds=0,
+    )  # fmt: skip
+    found = compared(SPEC, "complexity", (10, 1), inconclusive, capacity=probe)["capacity"]
+    assert found.reason == "network_cannot_fit"
+
+
+def test_a_field_at_its_easier_value_is_not_blamed() -> None:
+    """Worse at k = 1 than the other run at k = 5: k cannot be the cause."""
+    worse = (0.9, 0.5)
+    credit = compared(SPEC, "k", (1, 5), worse)["credit_assignment"]
+    assert (credit.answer, credit.reason) == ("no", "paid_every_step")
+    assert compared(SPEC, "r_min", (0.0, 0.5), worse)["sparsity"].reason == "no_reward_threshold"
+    assert compared(SPEC, "complexity", (1, 10), worse)["capacity"].reason == "not_probed"
+    assert compared(SPEC, "state_dim", (8, 16), worse)["dimension"].reason == "not_separated"
+
+
+def test_a_run_against_one_that_has_learnt_or_not() -> None:
+    def credit(policy: Any, other: Any) -> Verdict:
+        spec, other_spec = SPEC.derive(k=100, horizon=100), SPEC.derive(k=1, horizon=100)
         subject, against = load_policy(policy, spec), load_policy(other, other_spec)
         return diagnose(subject, against=against, states=256, episodes=8).verdict(
             "credit_assignment"
         )
 
     unlearnt, learnt = constant(SPEC), shrunk
-    verdict = credit(unlearnt, unlearnt)
-    assert (verdict.answer, verdict.reason) == ("cannot tell", "other_run_unlearnt")
-    assert verdict.evidence["field"] == "k"
-    assert verdict.thresholds["unlearnt"] == 0.9
-    # Any of these decides: the run itself has learnt, the other has, k = 1 needs no other run.
-    assert credit(learnt, unlearnt).answer == "no"
+    assert credit(unlearnt, unlearnt).reason == "other_run_learnt_little"
+    assert credit(learnt, unlearnt).answer == "cannot tell"
     assert credit(learnt, learnt).answer == "no"
     assert credit(unlearnt, learnt).answer == "yes"
-    assert credit(unlearnt, unlearnt, k=1).reason == "paid_every_step"
+
+
+def test_a_verdict_has_the_name_that_is_shown_and_the_name_in_data() -> None:
+    diagnosis = diagnosis_of(shrunk, states=64)
+    by_data = diagnosis.verdict("credit_assignment")
+    assert diagnosis.verdict("credit assignment") is by_data
+    assert diagnosis.verdict(" Credit  Assignment ") is by_data
+    for question in verdicts.QUESTIONS:
+        assert diagnosis.verdict(render.label(question)).question == question
+    with pytest.raises(SMEError, match=r"action channels, .*Did you mean 'sparsity'"):
+        diagnosis.verdict("sparcity")
+    with pytest.raises(UnknownNameError, match="Did you mean 'credit assignment'"):
+        diagnosis.verdict("credit")
+    with pytest.raises(UnknownNameError, match="question='': must be one of"):
+        diagnosis.verdict("")
+
+
+@pytest.mark.parametrize(
+    ("source", "row"), [("episodes", "complete episode"), ("evaluations", "ev")]
+)
+def test_steps_of_a_log_are_not_called_the_steps_of_training(source: Any, row: str) -> None:
+    log = Log(source, np.arange(1, 82) * 100.0, np.full(81, 0.93), np.zeros(81), np.zeros(81))
+    subject = Subject("it", SPEC, load_policy(constant(SPEC), SPEC).policy, {"steps": 8192}, log)
+    diagnosis = diagnose(subject, states=64, episodes=8)
+    for question in ("exploration", "budget"):
+        text = render.sentence(diagnosis.verdict(question))
+        assert f"training log (last {row}" in text
+        assert "step 8,100)" in text
+        assert "8,100 steps" not in text
