@@ -43,7 +43,8 @@ def test_the_page_on_own_agents_works_from_training_to_the_board(
 ) -> None:
     for package in ("torch", "matplotlib", "onnx", "onnxruntime", "cryptography"):
         pytest.importorskip(package)
-    from leaderboard.cli import app
+    from leaderboard.cli import app as leaderboard
+    from sme_registry.cli import app as sme
 
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "own_agents.md").read_text()
@@ -51,14 +52,15 @@ def test_the_page_on_own_agents_works_from_training_to_the_board(
     namespace: dict[str, Any] = {"__name__": "page"}
     for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
         exec(compile(block.replace("STEPS = 5_000", "STEPS = 200"), "page", "exec"), namespace)
-    commands = re.findall(r"^sme-leaderboard (.*)$", page, re.M)
-    assert len(commands) == 7
-    for command in commands:
+    commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", page, re.M)
+    assert len(commands) == 11
+    for program, command in commands:
         arguments = shlex.split(command)
         key = ["--key", "my.key"] if arguments[0] in ("keygen", "new", "submit") else []
+        app = sme if program == "sme" else leaderboard
         result = CliRunner().invoke(app, [*arguments, *key])
         assert result.exit_code == 0, result.output
-    assert "My DDPG" in result.output
+        assert arguments[0] != "rank" or "My DDPG" in result.output
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from sme_registry import SMESpec, evaluate, materialize
-from sme_registry.errors import MissingDependencyError, OptionError, PolicyError
+from sme_registry.errors import (
+    MalformedDocumentError,
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+)
 
 pytest.importorskip("matplotlib")
 
@@ -174,7 +179,14 @@ def test_decay_curve_of_different_state_dims_warns_that_levels_differ(tmp_path, 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(([],), "must be one or more evaluation reports"), (("r", "m"), "measures=")],
+    [
+        (([],), "must be one or more evaluation reports"),
+        (({"A": []},), "must be one or more evaluation reports"),
+        ((3,), "reports=3: must be an EvaluationReport, the path of an evaluation.json"),
+        (([None],), "reports=None: must be"),
+        (({"A": [{}]},), "reports={}: must be"),
+        (("r", "m"), "measures="),
+    ],
 )
 def test_decay_curve_rejects_invalid_arguments(tmp_path, report, arguments, message):
     reports = report if arguments[0] == "r" else arguments[0]
@@ -313,6 +325,26 @@ def test_learning_curve_of_a_table_is_that_of_its_runs():
         assert np.array_equal(left.get_data(), right.get_data())
 
 
+def test_decay_curve_reads_files_and_folders_of_reports(tmp_path, report):
+    path = report.write(tmp_path / "evaluation.json")
+    measures = ["similarity"]
+    expected = plots.decay_curve(report, measures=measures).axes[0].lines[0].get_ydata()
+    methods = {"A": path, "B": [str(tmp_path)], "C": report}
+    for reports in (path, str(path), tmp_path, [tmp_path], methods):
+        lines = plots.decay_curve(reports, measures=measures).axes[0].lines
+        assert np.array_equal(lines[0].get_ydata(), expected)
+    for missing in (tmp_path / "none.json", tmp_path / "none"):
+        with pytest.raises(MalformedDocumentError, match="none"):
+            plots.decay_curve(missing)
+
+
+def test_learning_curve_takes_a_method_with_one_run_alone(tmp_path):
+    (tmp_path / "episodes.csv").write_text("step,regret\n10,0.5\n20,0.25\n")
+    for run in (tmp_path, str(tmp_path), {"step": [10, 20], "regret": [0.5, 0.25]}):
+        line = plots.learning_curve({"TD3": run}).axes[0].lines[0]
+        assert (line.get_ydata()[0], line.get_ydata()[-1]) == (0.5, 0.25)
+
+
 def test_learning_curve_reads_the_folders_of_runs(tmp_path):
     (tmp_path / "episodes.csv").write_text("step,regret\n10,0.5\n20,0.25\n")
     line = plots.learning_curve({"TD3": [tmp_path, tmp_path / "episodes.csv"]}).axes[0].lines[0]
@@ -324,6 +356,10 @@ def test_learning_curve_reads_the_folders_of_runs(tmp_path):
     [
         ({}, "one or more runs"),
         ({"A": []}, "one or more runs"),
+        (3, "runs=3: must map each method's name to its runs"),
+        ("runs/a", "runs='runs/a': must map each method's name to its runs"),
+        ({"A": 3}, r"runs\['A'\]=3: must be one or more runs"),
+        ({"A": "no/such/run"}, "no/such/run: cannot be read"),
         ({"regret": [1.0]}, "columns step and regret"),
         ({"regret": [1.0, 2.0], "step": [1]}, "columns step and regret of equal length"),
         ({"A": [EPISODES[:5], EPISODES[40:]]}, "share no steps"),

@@ -3,7 +3,7 @@
 An allow-list; everything else is rejected with a stable code (`errors.CODES`):
 
     ModelProto → GraphProto → NodeProto → AttributeProto → TensorProto
-    one domain, one opset in 13 … 23, the operators of `OPERATORS`
+    one domain, one opset in 13 … 23, the operators of `sme_registry.export.operators`
     one float32 input [batch, S + 2], one float32 output [batch, A]; for teams see `widths`
     dense tensors inside the file, whose data match their dimensions
 
@@ -28,6 +28,7 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec
 from sme_registry.evaluation import interface_of
+from sme_registry.export.operators import FEED_FORWARD
 
 IR_VERSIONS = range(4, 14)  # before 4 every tensor had to be an input, too
 OPSETS = range(13, 24)
@@ -38,20 +39,6 @@ MAX_ATTRIBUTES = 8192
 MAX_FIELDS = 65_536
 MAX_NAME = 256
 MAX_RANK = 8
-
-# Operators that map rows to rows with weights. Excluded: randomness, loops and branches, sequences,
-# text, and arrays whose size is a number in the model, as of ConstantOfShape or Tile.
-_NAMES = """
-    Abs Acos Acosh Add And ArgMax ArgMin Asin Asinh Atan Atanh BatchNormalization Cast Ceil Celu
-    Clip Concat Constant Cos Cosh Div Elu Equal Erf Exp Flatten Floor Gather GatherElements Gelu
-    Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity LayerNormalization LeakyRelu Less
-    LessOrEqual Log LogSoftmax MatMul Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow
-    RMSNormalization Reciprocal ReduceL1 ReduceL2 ReduceLogSumExp ReduceMax ReduceMean ReduceMin
-    ReduceProd ReduceSum ReduceSumSquare Relu Reshape Round Selu Sigmoid Sign Sin Sinh Slice Softmax
-    Softplus Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
-    Xor
-"""
-OPERATORS = frozenset(_NAMES.split())
 
 _ONNX_DOMAINS = (b"", b"ai.onnx")
 _STANDARD = "Export the network to standard operators only"
@@ -165,12 +152,13 @@ class _Inspection:
                 "must be ONNX's own, ''",
                 _STANDARD,
             )
-        if operator not in OPERATORS:
+        if operator not in FEED_FORWARD:
             _refuse(
                 "onnx_op",
                 f"op_type={operator!r}",
-                "must be an operator of a feed-forward network (`gate.OPERATORS`)",
-                "Export the deterministic actor alone, or rewrite it with those operators",
+                "must be an operator of a feed-forward network (see docs/own_agents.md)",
+                "Export the deterministic actor alone with `sme_registry.export_onnx`, which "
+                "removes what it can and says how to rewrite the rest",
             )
         self._names("node", node.get("name", b""), *node["input"], *node["output"])
         self._attributes += len(node["attribute"])

@@ -9,6 +9,7 @@ included. Its actions are compared with the policy's, and a file that differs is
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from sme_registry.evaluation.policies.policy import Interface
 from sme_registry.evaluation.policies.sb3 import torch_policy
 from sme_registry.export import perceptron, torch_modules
 from sme_registry.export.network import INPUT, Network
+from sme_registry.export.operators import FEED_FORWARD
+from sme_registry.export.shapes import fold_shapes, read_by
 from sme_registry.io import choice, refuse_unwritable, require_packages, write_atomically
 from sme_registry.spec import ACTION_RANGES, ActionRange, SpecLike
 from sme_registry.task import load_spec
@@ -62,7 +65,8 @@ def export_onnx(
         model's .zip does not contain it.
 
     Returns:
-      The path: opset 17, weights inside, any batch size.
+      The path: opset 17, weights inside, any batch size. A `UserWarning` names the operators
+      that boards do not accept, if the file has any.
 
     Raises:
       UnknownNameError, SpecError: no such task, or a field out of range.
@@ -75,7 +79,17 @@ def export_onnx(
         raise OptionError(f"path={os.fspath(path)!r}: must end in .onnx.")
     refuse_unwritable(path)
     data = onnx_bytes(policy, spec, action_range=action_range, vec_normalize=vec_normalize)
-    return write_atomically(path, data)
+    written = write_atomically(path, data)
+    refused = _refused_by_boards(data)
+    if refused:
+        warnings.warn(
+            f"{written}: has the operators {', '.join(refused)}, which boards do not accept; "
+            "evaluations do. To submit it, export the feed-forward actor alone, and write it with "
+            "`@`, slices, `split(n, -1)`, `cat` and `view(-1, n)`. docs/own_agents.md says which "
+            "operators pass.",
+            stacklevel=2,
+        )
+    return written
 
 
 def onnx_bytes(
@@ -95,10 +109,11 @@ def onnx_bytes(
         choice("action_range", action_range, ACTION_RANGES)
     interface = None if spec is None else interface_of(load_spec(spec))
     network = _network(policy, interface, action_range, vec_normalize)
-    written = network.to_onnx()
-    # Without `Expand` if that makes no difference: boards accept no tensors of computed sizes.
-    for data in (_finished(written, expand=False), _finished(written, expand=True)):
+    written, width = network.to_onnx(), network.observation_dim
+    # In the simplest form that makes no difference: boards accept no tensors of computed sizes.
+    for form in ("broadcast", "folded", "as written"):
         try:
+            data = _finished(written, width, form)
             _refuse_difference(data, network)
         except PolicyError as error:
             difference = error
@@ -157,31 +172,43 @@ def _loaded(policy: Any) -> Any:
     )
 
 
-def _finished(data: bytes, expand: bool) -> bytes:
+def _finished(data: bytes, observation_dim: int, form: str) -> bytes:
     """The model with the range of its actions in its metadata, and unused nodes removed.
 
     Args:
       data: the model.
-      expand: False removes the operator `Expand`, of a distribution's parameters for example.
-        Operators that work entry by entry broadcast in any case.
+      observation_dim: the width of its input.
+      form: "as written"; "folded", with sizes as numbers (`fold_shapes`); or "broadcast",
+        also without equal rows and the operator `Expand`, of a distribution's parameters for
+        example. Operators that work entry by entry broadcast in any case.
     """
     import onnx
 
     model = onnx.load_model_from_string(data)
-    if not expand:
+    if form == "broadcast":
         for node in model.graph.node:
             if node.op_type == "Expand":
                 node.op_type = "Identity"
                 del node.input[1:]
+    if form != "as written":
+        fold_shapes(model, observation_dim, broadcast=form == "broadcast")
     used, kept = {output.name for output in model.graph.output}, []
     for node in reversed(model.graph.node):
         if used.intersection(node.output):
-            used.update(node.input)
+            used.update(read_by(node))
             kept.append(node)
     del model.graph.node[:]
     model.graph.node.extend(reversed(kept))
     onnx.helper.set_model_props(model, {ACTION_RANGE: "unit"})
     return bytes(model.SerializeToString())
+
+
+def _refused_by_boards(data: bytes) -> list[str]:
+    """The operators of a model that boards do not accept."""
+    import onnx
+
+    model = onnx.load_model_from_string(data)
+    return sorted({node.op_type for node in model.graph.node} - FEED_FORWARD)
 
 
 def _refuse_difference(data: bytes, network: Network) -> None:
@@ -198,13 +225,15 @@ def _refuse_difference(data: bytes, network: Network) -> None:
     except Exception as error:
         raise PolicyError(
             f"policy: its ONNX file fails on {len(observations)} observations: {error}. The "
-            "network must treat the rows of a batch alike, whatever their number."
+            "network must treat the rows of a batch alike, whatever their number. For sizes write "
+            "`x.shape[0]` or -1 instead of `len(x)`."
         ) from error
     expected = np.clip(network.act(observations), 0.0, 1.0)
     same_shape = actions.shape == expected.shape
     differences = np.abs(actions - expected) if same_shape else np.full(1, np.inf)
     difference = float(differences.max())
-    typical = float(np.quantile(differences, 0.99))
+    with np.errstate(invalid="ignore"):  # of infinite differences
+        typical = float(np.quantile(differences, 0.99))
     if not (typical <= TOLERANCE and difference <= _LARGEST_DIFFERENCE):
         raise PolicyError(
             f"policy: its ONNX file differs from its own actions by {difference:.1e}: must be at "

@@ -5,7 +5,6 @@ By PyTorch's tracing exporter: its successor needs another package and is ten ti
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import inspect
 import io
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError
+from sme_registry.evaluation.policies.modules import device_of, evaluating
 from sme_registry.evaluation.policies.policy import Interface
 from sme_registry.export.network import INPUT, OPSET, OUTPUT, Network
 from sme_registry.io import require_packages
@@ -38,8 +38,8 @@ def network(policy: Any, interface: Interface, symmetric: bool) -> Network:
     def act(observations: Observation) -> Any:
         import torch
 
-        with _evaluating(module), torch.no_grad():
-            actions = module.unclipped(torch.as_tensor(observations, device=_device(module)))
+        with evaluating(module), torch.no_grad():
+            actions = module.unclipped(torch.as_tensor(observations, device=device_of(module)))
         return actions.cpu().numpy()
 
     width = interface.observation_dim
@@ -51,9 +51,9 @@ def traced(module: Any, width: int) -> bytes:
     import torch
 
     stream: Any = io.BytesIO()
-    rows = torch.zeros((2, width), device=_device(module))
+    rows = torch.zeros((2, width), device=device_of(module))
     # Warnings of tracing are for PyTorch's developers: the file is compared with the module.
-    with _evaluating(module), warnings.catch_warnings(action="ignore"), torch.no_grad():
+    with evaluating(module), warnings.catch_warnings(action="ignore"), torch.no_grad():
         try:
             torch.onnx.export(
                 module,
@@ -123,10 +123,10 @@ def _refuse_output(policy: Any, module: Any, interface: Interface) -> None:
     """Raise if the policy does not map tensors to actions `[B, A]`."""
     import torch
 
-    rows = torch.full((3, interface.observation_dim), 0.5, device=_device(module))
+    rows = torch.full((3, interface.observation_dim), 0.5, device=device_of(module))
     function = getattr(policy, "_orig_mod", policy)
     parameter = next(module.parameters(), None)
-    with _evaluating(module), torch.no_grad():
+    with evaluating(module), torch.no_grad():
         try:
             returned = function(rows if parameter is None else rows.to(parameter.dtype))
         except Exception as error:
@@ -149,20 +149,3 @@ def _refuse_output(policy: Any, module: Any, interface: Interface) -> None:
         "alone, such as `lambda o: actor(o)[0]` for a tuple or `lambda o: actor(o).mean` for a "
         f"distribution. {_OTHER_LIBRARIES}"
     )
-
-
-def _device(module: Any) -> Any:
-    parameter = next(module.parameters(), None)
-    return "cpu" if parameter is None else parameter.device
-
-
-@contextlib.contextmanager
-def _evaluating(module: Any) -> Iterator[None]:
-    """Evaluation mode; afterwards each part is in the mode that it had."""
-    before = [(part, part.training) for part in module.modules()]
-    module.eval()
-    try:
-        yield
-    finally:
-        for part, training in before:
-            part.training = training

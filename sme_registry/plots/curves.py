@@ -92,9 +92,10 @@ def learning_curve(
     A line is the median over a method's runs of their running medians, and a band their quartiles.
 
     Args:
-      runs: from each method's name to its runs (seeds), each as in `training_curve`; or a table, a
-        pandas frame or a mapping of `[N]` arrays, with the columns `step` and `regret`, and
-        `method` and `seed` where there are several.
+      runs: from each method's name to its runs (seeds), each as in `training_curve`, where a
+        single path or table needs no list; or one table of all, a pandas frame or a mapping of
+        `[N]` arrays, with the columns `step` and `regret`, and `method` and `seed` where there
+        are several.
       path: a file to write, .png, .pdf or .svg; None writes none.
       title: above a new figure.
       window: number of episodes in each run's median; None as in `training_curve`.
@@ -108,7 +109,7 @@ def learning_curve(
         argument is out of range.
       MissingDependencyError: Matplotlib is not installed.
     """
-    methods = _table(runs) if "regret" in runs else {str(k): list(v) for k, v in runs.items()}
+    methods = _methods(runs)
     if not methods or not all(methods.values()):
         raise OptionError("runs: must hold one or more runs of each method.")
     lines = {
@@ -167,6 +168,24 @@ def _draw_method(
         label += f" (n = {len(curves)})"
         draw_band(axes, x, low, high, style["color"])
     axes.plot(x, middle, **style, linewidth=2, markersize=4.5, markevery=0.13, label=label)
+
+
+def _methods(runs: Any) -> dict[str, list[Any]]:
+    """The runs of each method."""
+    if not hasattr(runs, "keys"):
+        raise OptionError(
+            f"runs={runs!r:.60}: must map each method's name to its runs, such as "
+            '{"TD3": ["runs/a", "runs/b"]}, or be a table. One run is a `training_curve`.'
+        )
+    if "regret" in runs:
+        return _table(runs)
+    methods = {}
+    for name, each in runs.items():
+        alone = isinstance(each, str | os.PathLike) or hasattr(each, "keys")
+        if not alone and not isinstance(each, Iterable):
+            raise OptionError(f"runs[{name!r}]={each!r:.60}: must be one or more runs.")
+        methods[str(name)] = [each] if alone else list(each)
+    return methods
 
 
 def _table(table: Mapping[str, Any]) -> dict[str, list[Any]]:

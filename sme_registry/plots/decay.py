@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -31,7 +32,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Measure = Literal["similarity", "normalised_regret"]
-Reports = EvaluationReport | Sequence[EvaluationReport] | Mapping[str, Sequence[EvaluationReport]]
+Report = EvaluationReport | str | os.PathLike[str]
+Reports = Report | Sequence[Report] | Mapping[str, Report | Sequence[Report]]
+
+_EVALUATION = "evaluation.json"
 
 _MEASURES = {
     "similarity": "similarity r̃  (1 = optimal)",
@@ -61,6 +65,7 @@ def decay_curve(
       reports: one or more reports, each a line named by its policy; or a mapping from a method's
         name to the reports of its runs (seeds or instances), each a line of their IQM, with their
         quartiles as a band. A single report of a team also has a thinner line for each agent.
+        A report may be given by its path, evaluation.json, or by the folder that contains it.
       path: a file to write, .png, .pdf or .svg; None writes none.
       measures: "similarity", "normalised_regret", or both.
       references: whether to draw the reference policies as thin lines. In a mapping they are means
@@ -74,8 +79,9 @@ def decay_curve(
       The figure.
 
     Raises:
-      OptionError: no report, different regions, an unknown measure or suffix, another number of
-        axes than of measures, or the file cannot be written.
+      OptionError: no report, neither a report nor a path, different regions, an unknown measure or
+        suffix, another number of axes than of measures, or the file cannot be written.
+      SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
     """
     methods = _methods(reports)
@@ -104,10 +110,8 @@ def decay_curve(
 
 def _methods(reports: Reports) -> list[_Method]:
     """The lines to draw; those of equal labels on different tasks are told apart by their task."""
-    if isinstance(reports, EvaluationReport):
-        reports = [reports]
     if isinstance(reports, Mapping):
-        methods = [_Method(name, list(runs)) for name, runs in reports.items()]
+        methods = [_Method(name, _reports(runs)) for name, runs in reports.items()]
         for method in methods:
             if len({_levels(report) for report in method.reports}) > 1:
                 raise OptionError(
@@ -115,15 +119,35 @@ def _methods(reports: Reports) -> list[_Method]:
                     "method with one protocol."
                 )
     else:
-        specs = {r.spec_digest: r.spec.named(r.task) for r in reports}
+        everything = _reports(reports)
+        specs = {r.spec_digest: r.spec.named(r.task) for r in everything}
         tasks = catalogue.titles(specs.values())
         methods = [
             _Method(r.policy if len(tasks) == 1 else f"{r.policy}, {tasks[r.spec_digest]}", [r])
-            for r in reports
+            for r in everything
         ]
     if not methods or not all(method.reports for method in methods):
         raise OptionError("reports: must be one or more evaluation reports. Give one.")
     return methods
+
+
+def _reports(given: Report | Iterable[Report]) -> list[EvaluationReport]:
+    """One report or several, those given by their paths read."""
+    if isinstance(given, EvaluationReport | str | os.PathLike) or not isinstance(given, Iterable):
+        given = [given]
+    reports = []
+    for each in given:
+        if isinstance(each, str | os.PathLike):
+            path = Path(each) / _EVALUATION if Path(each).is_dir() else Path(each)
+            reports.append(EvaluationReport.read(path))
+        elif isinstance(each, EvaluationReport):
+            reports.append(each)
+        else:
+            raise OptionError(
+                f"reports={each!r:.60}: must be an EvaluationReport, the path of an "
+                f"{_EVALUATION}, or the folder of a run."
+            )
+    return reports
 
 
 def _levels(report: EvaluationReport) -> tuple[float, ...]:

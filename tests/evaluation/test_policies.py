@@ -475,3 +475,72 @@ def test_python_evaluates_everything_that_the_command_line_does(form, tmp_path, 
     by_command = json.loads(done.stdout)
     assert evaluate(form, "task.json", "quick-v1").to_dict() == by_command
     sys.modules.pop("own", None)
+
+
+def torch_actor(torch):
+    """A module with dropout, so that the mode matters, and gradients."""
+    torch.manual_seed(0)
+    nn = torch.nn
+    return nn.Sequential(nn.Linear(5, 8), nn.Dropout(0.5), nn.Linear(8, 2), nn.Sigmoid())
+
+
+def regrets(policy, **kw):
+    return [region.normalised_regret for region in evaluated(policy, **kw).regions]
+
+
+def test_modules_and_functions_of_pytorch_are_policies():
+    torch = pytest.importorskip("torch")
+    actor = torch_actor(torch).eval()
+
+    def act(observations):
+        with torch.no_grad():
+            return actor(torch.from_numpy(observations)).numpy()
+
+    expected = regrets(act)
+    assert regrets(lambda o: actor(torch.from_numpy(o))) == expected  # with gradients
+    assert regrets(lambda o: actor(torch.from_numpy(o)).detach()) == expected
+    assert regrets(lambda o: actor(torch.from_numpy(o)).bfloat16()) == pytest.approx(
+        expected, abs=0.01
+    )
+    actor.train()
+    assert regrets(actor) == expected
+    assert actor.training
+    assert evaluated(actor).policy == "Sequential"
+    assert regrets(actor.double()) == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_module_of_pytorch_is_named_on_the_command_line(tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    (tmp_path / "my_actor.py").write_text(
+        "import torch\nactor = torch.nn.Linear(10, 4)\nact = lambda o: actor(torch.as_tensor(o))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    for name in ("my_actor:actor", "my_actor:act"):
+        result = CliRunner().invoke(app, ["evaluate", name, "Default", "--protocol", "quick"])
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(
+    ("last", "message"),
+    [
+        (lambda y: (y, y), r"'Actor': returns an object of type tuple.*\[0\]` for a tuple"),
+        (lambda y: y[:, :1], r"shape \(200, 1\): must be of shape \(200, 2\)"),
+        (lambda y: y * float("nan"), "NaN or infinite"),
+    ],
+)
+def test_modules_with_unusable_actions_are_refused(last, message):
+    torch = pytest.importorskip("torch")
+
+    class Actor(torch.nn.Module):
+        def forward(self, x):
+            return last(x[:, :2])
+
+    with pytest.raises(PolicyError, match=message):
+        evaluated(Actor())
+
+
+def test_a_function_of_tensors_is_told_that_observations_are_arrays():
+    torch = pytest.importorskip("torch")
+    actor = torch_actor(torch)
+    with pytest.raises(PolicyError, match=r"NumPy arrays: `torch\.as_tensor\(observations\)`"):
+        evaluated(lambda o: actor(o))

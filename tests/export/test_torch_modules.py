@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sme_registry import export_onnx
+from sme_registry.evaluation.policies.onnx import start_session
 from tests.export.test_export import SPEC, refused, same
 
 torch = pytest.importorskip("torch")
@@ -80,12 +81,30 @@ def made(name: str) -> tuple[Any, str]:
         "agent's method": (agent.act, "symmetric"),
         "lambda of an agent": (lambda x: agent.act(x)[:, :2], "symmetric"),
         "no parameters": (lambda x: x[:, :2], "unit"),
+        **{f"sizes {i}": (function, "unit") for i, function in enumerate(sizes(nn.Linear(5, 12)))},
     }[name]
+
+
+def sizes(net: Any) -> list[Any]:
+    """Networks that PyTorch writes with shape arithmetic, although only the batch size varies."""
+    return [
+        lambda x: net(x).chunk(6, -1)[0],
+        lambda x: net(x).view(x.shape[0], -1)[:, :2],
+        lambda x: net(x).reshape(x.size(0), 3, -1).mean(1)[:, :2],
+        lambda x: net(x).view(x.shape[0], 2, -1)[:, 0, :1] + x.view(x.shape[0], -1)[:, :2],
+        lambda x: net(x).unflatten(1, (3, 4)).flatten(1)[:, :2],
+        lambda x: net(x)[:, : x.shape[-1] // 2],
+        lambda x: net(x)[:, :2] + torch.ones(x.shape[0], 2) * 0.1,
+        lambda x: torch.where(x > 0.5, x, torch.zeros_like(x))[:, :2],
+        lambda x: ((x - x.mean(1, keepdim=True)) / x.std(1, keepdim=True))[:, :2],
+        lambda x: x[:, :2] * torch.arange(x.shape[1])[1:3],
+    ]
 
 
 NAMES = (
     "sequential", "squashed", "residual", "double", "batch norm", "lambda", "method",
     "agent's method", "lambda of an agent", "no parameters",
+    *(f"sizes {i}" for i in range(10)),
 )  # fmt: skip
 
 
@@ -122,3 +141,39 @@ def test_a_network_acts_as_before(name: str, tmp_path: Path) -> None:
 )
 def test_what_cannot_be_exported_is_refused(policy: Any, message: str, tmp_path: Path) -> None:
     refused(policy, tmp_path, message)
+
+
+class Recurrent(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.gru = nn.GRU(5, 2, batch_first=True)
+
+    def forward(self, x: Any) -> Any:
+        return self.gru(x[:, None])[0][:, 0]
+
+
+@pytest.mark.parametrize(
+    ("policy", "operator"),
+    [
+        (Recurrent(), "GRU"),
+        (lambda x: torch.cat([x, torch.zeros(x.shape[0], 1)], 1)[:, 4:6], "ConstantOfShape"),
+        (lambda x: x.repeat(1, 2)[:, 4:6], "Tile"),
+    ],
+)
+def test_a_file_that_no_board_accepts_is_written_with_a_warning(
+    policy: Any, operator: str, tmp_path: Path
+) -> None:
+    message = (
+        rf"policy\.onnx: has the operators .*{operator}.*boards do not accept.*`split\(n, -1\)`"
+    )
+    with pytest.warns(UserWarning, match=message):
+        path = export_onnx(policy, SPEC, tmp_path / "policy.onnx")
+    observations = np.random.default_rng(1).random((7, 5), dtype=np.float32)
+    with torch.no_grad():
+        expected = policy(torch.from_numpy(observations)).clamp(0.0, 1.0).numpy()
+    actions = start_session(path).run(None, {"observations": observations})[0]
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+
+
+def test_a_length_that_tracing_fixes_is_named(tmp_path: Path) -> None:
+    refused(lambda x: x[:, :4].view(len(x), 2, 2)[:, 0], tmp_path, r"`x\.shape\[0\]` or -1")

@@ -12,7 +12,7 @@ from typing import Any, cast
 from sme_registry.envs.shared import shared_observation_of
 from sme_registry.envs.types import Observation
 from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
-from sme_registry.evaluation.policies import sb3
+from sme_registry.evaluation.policies import modules, sb3
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.policies.onnx import load_onnx
 from sme_registry.evaluation.policies.policy import (
@@ -43,11 +43,14 @@ def as_policy(
 
     Args:
       policy: one of
-        a callable from observations `[B, S + 2]` float32 to actions `[B, A]`;
+        a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, NumPy arrays or
+        PyTorch tensors;
+        a `torch.nn.Module`, which is called on a tensor, in evaluation mode and without gradients;
         a model of Stable-Baselines3, or any other with `predict(observations, deterministic=True)`;
         the path of such a model's .zip (loading it can run code of its author);
         the path of an .onnx file, or of the .npz of an offline policy;
-        `module:function`, imported from the working directory or an installed package;
+        `module:function` (or a module of PyTorch), imported from the working directory or an
+        installed package;
         the name of a reference policy, one of `references.POLICIES`;
         for a team, a dict from each agent's name to its own policy (or a folder of such files,
         `<agent>.zip`), from the agent's observations
@@ -175,12 +178,14 @@ def _prepare(
         sb3.check_not_normalised(policy)
         act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
         episodes = sb3.episode_predictor(policy)
+    elif modules.is_module(policy):
+        act = modules.module_predictor(policy)
     elif not callable(policy):
         raise PolicyError(
             f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
             f"[B, {interface.observation_dim}] to actions [B, {interface.action_dim}], a "
-            "Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, module:function, or "
-            "the name of a reference policy."
+            "torch.nn.Module, a Stable-Baselines3 model, the path of a .zip, .onnx or .npz file, "
+            "module:function, or the name of a reference policy."
         )
     return Policy(
         name or _name_of(policy),

@@ -18,6 +18,7 @@ import numpy as np
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Array, Observation
 from sme_registry.errors import ActionError, PolicyError
+from sme_registry.evaluation.policies import modules
 from sme_registry.spec import ActionRange, SMESpec
 from sme_registry.task import draw
 
@@ -81,7 +82,7 @@ class Policy:
           PolicyError: it fails, or does not return `[B, A]` finite numbers.
         """
         try:
-            returned = self.act(observations)
+            returned = modules.without_tensor(self.act(observations))
             shape = (len(observations), self.action_dim)
             a = arguments.to_unit(returned, shape, self.action_range == "symmetric")
             if not np.isfinite(a).all():
@@ -99,6 +100,7 @@ class Policy:
             raise PolicyError(
                 f"policy {self.name!r} failed on observations of shape {observations.shape}: "
                 f"{type(error).__name__}: {error}{self.hint and f'. {self.hint}'}"
+                f"{modules.advice_on(error)}"
             ) from error
 
 

@@ -1,0 +1,83 @@
+"""PyTorch modules as policies, and the actions that functions return as tensors.
+
+PyTorch is never imported here: who has a module or a tensor has imported it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from sme_registry.envs.types import Observation
+from sme_registry.errors import PolicyError
+
+
+def is_module(policy: Any) -> bool:
+    """Whether a policy is a `torch.nn.Module`."""
+    torch = _torch()
+    return torch is not None and isinstance(policy, torch.nn.Module)
+
+
+def module_predictor(module: Any) -> Callable[[Observation], Any]:
+    """A module's actions, in evaluation mode and without gradients."""
+    torch = _torch()
+
+    def act(observations: Observation) -> Any:
+        parameter = next(module.parameters(), None)
+        x = torch.as_tensor(observations, device=device_of(module))
+        with evaluating(module), torch.no_grad():
+            returned = module(x if parameter is None else x.to(parameter.dtype))
+        if not isinstance(returned, torch.Tensor):
+            raise PolicyError(
+                f"policy {type(module).__name__!r}: returns an object of type "
+                f"{type(returned).__name__}: must be one tensor of deterministic actions. Give a "
+                "function that returns them alone, such as "
+                "`lambda o: actor(torch.as_tensor(o))[0]` for a tuple, or "
+                "`lambda o: actor(torch.as_tensor(o)).mean` for a distribution."
+            )
+        return returned
+
+    return act
+
+
+def without_tensor(returned: Any) -> Any:
+    """What a policy returned; a tensor, on any device, with or without gradient, as an array."""
+    torch = _torch()
+    if torch is None or not isinstance(returned, torch.Tensor):
+        return returned
+    tensor = returned.detach().cpu()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
+
+
+def advice_on(error: Exception) -> str:
+    """A sentence on a function that failed because it expects a tensor; else empty."""
+    if _torch() is None or not isinstance(error, AttributeError | TypeError):
+        return ""
+    if "ndarray" not in str(error):
+        return ""
+    return " Observations are NumPy arrays: `torch.as_tensor(observations)` is the tensor of them."
+
+
+def device_of(module: Any) -> Any:
+    """The device of a module's parameters."""
+    parameter = next(module.parameters(), None)
+    return "cpu" if parameter is None else parameter.device
+
+
+@contextlib.contextmanager
+def evaluating(module: Any) -> Iterator[None]:
+    """Evaluation mode; afterwards each part is in the mode that it had."""
+    before = [(part, part.training) for part in module.modules()]
+    module.eval()
+    try:
+        yield
+    finally:
+        for part, training in before:
+            part.training = training
+
+
+def _torch() -> Any:
+    """PyTorch, if it is imported."""
+    return sys.modules.get("torch")
