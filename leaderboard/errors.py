@@ -78,7 +78,16 @@ class BoardError(SMEError):
 
 
 class NotPublishable(BoardError):
-    """The reference rows are missing or do not score 0 and 1, so no score is shown."""
+    """The reference rows are missing or do not score 0 and 1, so no score is shown.
+
+    Args:
+      message: which row, and what is wrong with it.
+      waiting: whether the row only waits to be scored.
+    """
+
+    def __init__(self, message: str, *, waiting: bool = False) -> None:
+        super().__init__(message)
+        self.waiting = waiting
 
 
 class TamperedError(SMEError):

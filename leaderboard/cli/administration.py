@@ -51,7 +51,7 @@ def init(
         ),
     ] = False,
 ) -> None:
-    """Create a board with its key and two reference rows, which wait to be scored.
+    """Create a board with its key and two reference rows, which `serve` or `score` scores.
 
     The reference rows are the optimal policy and the constant ½. They pass through the same
     pipeline as every submission; if they score other than 0 and 1, the board shows no scores.
@@ -61,8 +61,6 @@ def init(
       sme-leaderboard init board --suite core
 
       sme-leaderboard init board --practice
-
-      sme-leaderboard score board
     """
     from leaderboard import intake
     from leaderboard.documents.board import RUNS_TO_RANK
@@ -82,6 +80,8 @@ def init(
         suite=file.suite,
         protocol_name=protocol_name,
         protocol=resolve_protocol(protocol),
+        suite_description=file.description,
+        suite_tags=file.tags,
         runs_to_rank=runs_to_rank,
     ) as store:
         intake.submit_references(store)
@@ -96,7 +96,12 @@ def init(
         f"instance of the suite ({instances}), at least {runs_to_rank} in each class ({classes}).",
         soft_wrap=True,
     )
-    out().print(f"Next, score the reference rows: sme-leaderboard score {folder}")
+    out().print(
+        "Next, serve the board, which also scores its reference rows: "
+        f"sme-leaderboard serve {folder}\n"
+        f"Or score them without a server: sme-leaderboard score {folder}",
+        soft_wrap=True,
+    )
 
 
 def score(
@@ -166,20 +171,25 @@ def serve(
     workers: Annotated[
         int, typer.Option("--workers", "-w", min=0, max=256, help="Number of scorer processes.")
     ] = 1,
+    url: Annotated[
+        str, typer.Option(help="The board's public address, which its pages show to submitters.")
+    ] = "",
 ) -> None:
-    """Serve the board: its pages, and an API that accepts submissions.
+    """Serve the board: its pages, and an API that accepts submissions, and score them.
 
     By default only this machine can reach it. Put an HTTPS proxy in front of it for others.
 
     Examples:
 
       sme-leaderboard serve board --port 8000 --workers 2
+
+      sme-leaderboard serve board --url https://board.example
     """
     from leaderboard.documents.board import Folder
     from leaderboard.web.serve import serve as serve_board
 
     Folder(board).read()  # a wrong folder fails before anything listens
-    serve_board(board, host=host, port=port, workers=workers)
+    serve_board(board, host=host, port=port, workers=workers, url=url)
 
 
 def reindex(board: BoardFolder = Path("board")) -> None:

@@ -124,7 +124,8 @@ def show(
     id: Annotated[
         str,
         typer.Argument(
-            metavar="ID", help="The submission's id; its first digits suffice for a folder."
+            metavar="ID",
+            help="The submission's id: in full for a URL; its first digits suffice for a folder.",
         ),
     ],
     json: Json = False,
@@ -137,6 +138,8 @@ def show(
     Examples:
 
       sme-leaderboard show board 3f2a
+
+      sme-leaderboard show https://board.example sha256:…
     """
     view = _public_view(board, id)
     if json:

@@ -310,7 +310,8 @@ def withdraw(
     id: Annotated[
         str,
         typer.Argument(
-            metavar="ID", help="The submission's id; its first digits suffice for a folder."
+            metavar="ID",
+            help="The submission's id: in full for a URL; its first digits suffice for a folder.",
         ),
     ],
     reason: Annotated[str, typer.Option(help="Reason, shown on its page.")] = "",
@@ -318,9 +319,13 @@ def withdraw(
 ) -> None:
     """Withdraw your submission. Its page stays and shows the withdrawal.
 
+    A URL needs the full id, as `submit` prints it; for a folder, its first digits suffice.
+
     Examples:
 
       sme-leaderboard withdraw board 3f2a --reason "a bug in the wrapper"
+
+      sme-leaderboard withdraw https://board.example sha256:… --reason "a bug in the wrapper"
     """
     from leaderboard.store import Store
     from leaderboard.web import client

@@ -15,9 +15,9 @@ The log is authoritative. A board has one suite and one protocol.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, SigningKey
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
@@ -67,6 +67,8 @@ class BoardDocument(Document):
     Attributes:
       title: in the header of its pages.
       suite_name: the suite's versioned name, such as `smoke-v1`.
+      suite_description, suite_tags: of the suite's file; left out of the JSON if empty, so that
+        boards without them keep their digests.
       protocol_name: the protocol's, such as `paper-v1`.
       key: the public key of the log's signatures.
       runs_to_rank: runs that a ranked entry needs in each class; below 10 the board is for
@@ -79,12 +81,22 @@ class BoardDocument(Document):
     track: Track = "open"
     suite_name: Name
     suite: Suite
+    suite_description: Annotated[str, Field(max_length=2000)] = ""
+    suite_tags: Annotated[tuple[Name, ...], Field(strict=False, max_length=64)] = ()
     protocol_name: Name
     protocol: EvaluationProtocol
     key: PublicKey
     runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = RUNS_TO_RANK
     draws: Annotated[Integer, Field(ge=100, le=10**6)] = 10_000
     limits: Limits = Limits()
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        for field in ("suite_description", "suite_tags"):
+            if not plain[field]:
+                del plain[field]
+        return plain
 
     @property
     def practice(self) -> bool:
@@ -103,7 +115,13 @@ class BoardDocument(Document):
         named = {"name": name, "version": int(version)} if name and version.isdecimal() else {}
         named = named or {"name": self.suite_name}
         return SuiteFile.from_dict(
-            {**named, "digest": self.suite.digest, "suite": self.suite.to_dict()}
+            {
+                **named,
+                "description": self.suite_description,
+                "tags": self.suite_tags,
+                "digest": self.suite.digest,
+                "suite": self.suite.to_dict(),
+            }
         )
 
     @property

@@ -112,11 +112,14 @@ def refuse_unpublishable(entries: list[EntryRow]) -> None:
             advice = (
                 "Create the board again with `sme-leaderboard init`: a rejection is final"
                 if status == "rejected"
+                else "Wait for the running `serve`, or run `sme-leaderboard score` on the board"
+                if status == "waiting"
                 else "Run `sme-leaderboard score` on the board"
             )
             raise NotPublishable(
                 f"reference row {name!r}: {status}: must be scored before the board publishes any "
-                f"number. {advice}."
+                f"number. {advice}.",
+                waiting=status == "waiting",
             )
         for scores in scored:
             for field, value, expected in _known_scores(scores, regret):

@@ -58,6 +58,7 @@ def create_app(
     score_workers: int = 0,
     upload_seconds: float = limits.UPLOAD_SECONDS,
     pages_kept: int = PAGES_KEPT,
+    url: str = "",
 ) -> FastAPI:
     """The ASGI application of a board.
 
@@ -66,12 +67,14 @@ def create_app(
       score_workers: number of scorer processes that run as long as the application does.
       upload_seconds: the longest that an upload may take.
       pages_kept: number of rendered pages to keep until the log grows; 0 renders every request.
+      url: the board's public address, shown on its pages; empty if it is not known. It is never
+        taken from a request, whose Host header anyone can choose.
 
     Raises:
       BoardError: the folder holds no board.
     """
     store = Store.open(os.fspath(path))
-    routes = _Routes(store, upload_seconds, pages_kept)
+    routes = _Routes(store, upload_seconds, _PageCache(store, pages_kept, url))
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -91,6 +94,7 @@ def create_app(
             SMEError: errors.on_board_error,
         },
     )
+    app.state.scores = score_workers > 0  # see `errors.on_board_error`
     app.add_middleware(Guard)
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
@@ -112,13 +116,13 @@ class _Routes:
     Python, and so no two submissions can share the last free place of a quota.
     """
 
-    def __init__(self, store: Store, upload_seconds: float, pages_kept: int) -> None:
+    def __init__(self, store: Store, upload_seconds: float, pages: _PageCache) -> None:
         self._store = store
         self._upload_seconds = upload_seconds
         self._admissions = CapacityLimiter(1)
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
-        self._pages = _PageCache(store, pages_kept)
+        self._pages = pages
 
     async def health(self) -> Response:
         return JSONResponse({"status": "ok"})
@@ -250,16 +254,18 @@ class _PageCache:
     page that is not cached wait for one rendering of it.
     """
 
-    def __init__(self, store: Store, kept: int) -> None:
+    def __init__(self, store: Store, kept: int, url: str) -> None:
         self._store = store
         self._kept = kept
+        # A copy without its key accepts no submissions.
+        self._address = url if store.folder.key.is_file() else None
         self._head: Head | None = None
 
     def get(self, render: _Render, name: str) -> _CachedFile:
         """The file of this name, rendered if it is not cached."""
         head = self._store.head
         if head != self._head:
-            rendered = functools.partial(_rendered, Pages(self._store))
+            rendered = functools.partial(_rendered, Pages(self._store, self._address))
             self._head, self._file = head, functools.lru_cache(self._kept)(rendered)
         return self._file(render, name)
 

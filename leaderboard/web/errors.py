@@ -63,25 +63,61 @@ async def on_http_error(request: Request, error: Exception) -> Response:
 
 async def on_board_error(request: Request, error: Exception) -> Response:
     """The answer where the board publishes nothing; `Guard` logs every other fault and hides it."""
-    if isinstance(error, NotPublishable):
+    if not isinstance(error, NotPublishable):
+        raise error
+    if not (error.waiting and request.app.state.scores):
         return error_answer(request, "not_publishable", str(error))
-    raise error
+    headers = {"Retry-After": str(_RELOAD_SECONDS)}
+    if not _wants_page(request):
+        return error_answer(request, "not_publishable", str(error), headers)
+    page = _SCORING_PAGE.format(seconds=_RELOAD_SECONDS, root=_root(request))
+    return Response(page, STATUSES["not_publishable"], headers=headers, media_type="text/html")
 
 
 def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
     """An error as JSON, or as a page if a browser asks for one."""
     status = STATUSES.get(code, 400 if code in HTTP_CODES else 422)
-    wants_page = "text/html" in request.headers.get("Accept", "")
-    if wants_page and not request.url.path.startswith("/api/"):
+    if _wants_page(request):
         page = _ERROR_PAGE.format(
             status=status,
             code=html.escape(code),
             message=html.escape(message),
-            root="../" * (request.url.path.count("/") - 1) or "./",
+            root=_root(request),
         )
         return Response(page, status, headers=headers, media_type="text/html")
     return JSONResponse({"code": code, "message": message}, status, headers=headers)
 
+
+def _wants_page(request: Request) -> bool:
+    is_api = request.url.path.startswith("/api/")
+    return not is_api and "text/html" in request.headers.get("Accept", "")
+
+
+def _root(request: Request) -> str:
+    """The relative address of the board from the page that was asked for."""
+    return "../" * (request.url.path.count("/") - 1) or "./"
+
+
+_RELOAD_SECONDS = 5
+
+_SCORING_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="refresh" content="{seconds}">
+<title>Scoring the first entries</title>
+<link rel="stylesheet" href="{root}static/board.css">
+</head>
+<body>
+<main id="main" class="frame">
+<h1>Scoring the first entries</h1>
+<p>This board is new. It is scoring its two reference rows, the optimal policy and the constant one,
+and shows scores as soon as both are correct. This page reloads every {seconds} seconds.</p>
+</main>
+</body>
+</html>
+"""
 
 _ERROR_PAGE = """<!DOCTYPE html>
 <html lang="en">

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 from collections.abc import Callable
 
 from leaderboard.errors import BoardError
+from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
 
 _CONNECTIONS = 1000
+# Its characters need no quotes in the commands that the pages show.
+_PUBLIC_URL = re.compile(r"https?://([\w.-]+|\[[\da-fA-F:]+\])(:\d{1,5})?(/[\w.~-]+)*/?", re.ASCII)
 
 
 def serve(
@@ -20,6 +24,7 @@ def serve(
     port: int = 8000,
     workers: int = 1,
     announce: Callable[[str], None] = print,
+    url: str = "",
 ) -> None:
     """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
 
@@ -31,18 +36,26 @@ def serve(
       port: 0 for any free port.
       workers: number of scorer processes; 0 for none.
       announce: called with the board's URL once it listens.
+      url: the board's public address, such as that of its proxy, which its pages show; empty if it
+        is not known.
 
     Raises:
       BoardError: the folder holds no board, or the address cannot be used.
+      OptionError: the public address is invalid.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
+    if url and not _PUBLIC_URL.fullmatch(url):
+        raise OptionError(
+            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
+            "others reach the board."
+        )
     require_packages("serving a board", {"fastapi": "FastAPI", "uvicorn": "uvicorn"}, "leaderboard")
     import uvicorn
 
     from leaderboard.web.app import create_app
 
     config = uvicorn.Config(
-        create_app(path, score_workers=workers),
+        create_app(path, score_workers=workers, url=url.rstrip("/")),
         http="h11",
         ws="none",
         log_level="warning",

@@ -8,6 +8,7 @@ import json
 import sqlite3
 from pathlib import Path
 
+import httpx
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -281,6 +282,45 @@ def test_check_scores_as_the_board_that_is_given() -> None:
         assert at_home["protocol"] == store.document.protocol.digest
     message = fails(2, "check", "bundle", "board", "--protocol", "small-v1.json")
     assert "BOARD has both" in message
+
+
+def test_init_mentions_that_a_server_scores_the_reference_rows() -> None:
+    created = good("init", "board", "--suite", "tiny-v1.json")
+    assert "sme-leaderboard serve board" in created
+    assert "sme-leaderboard score board" in created
+
+
+@pytest.mark.parametrize("command", ["withdraw", "show"])
+def test_help_says_that_a_url_needs_the_full_id(command: str) -> None:
+    shown = " ".join(good(command, "--help").replace("│", " ").split())
+    assert "in full for a URL" in shown
+    assert f"sme-leaderboard {command} https://board.example sha256:" in shown
+
+
+def test_a_board_keeps_the_description_and_tags_of_its_suite() -> None:
+    suite = tiny_suite()
+    file = SuiteFile(
+        name="tiny",
+        version=1,
+        description="Our lab's suite.",
+        tags=("ours",),
+        digest=suite.digest,
+        suite=suite,
+    )
+    file.write("described.json")
+    good("init", "board", "--suite", "described.json")
+    with serving(Path("board")) as url:
+        served = httpx.get(f"{url}/suite.json").json()
+    assert SuiteFile.from_dict(served) == file
+    good("init", "again", "--suite", "board")
+    assert json.loads(Path("again/board.json").read_text())["suite_tags"] == ["ours"]
+
+
+def test_a_board_without_a_description_has_no_field_for_it() -> None:
+    make_board()
+    assert not [
+        name for name in json.loads(Path("board/board.json").read_text()) if "suite_d" in name
+    ]
 
 
 def test_everything_a_submitter_needs_is_at_the_boards_address() -> None:

@@ -58,10 +58,13 @@ class Pages:
 
     Args:
       store: an open store; it is only read.
+      address: the URL at which the board accepts submissions; empty if it is served at an unknown
+        URL; None for a copy that accepts none.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, address: str | None = None) -> None:
         self.store = store
+        self._address = address
         self.document = store.document
         self._latest: tuple[str, tuple[SignedSubmission, Result | None]] | None = None
 
@@ -83,6 +86,7 @@ class Pages:
           NotPublishable: see `entries`; every other page raises it too.
         """
         tab = next(tab for tab in TABS if tab.key == metric)
+        classes = self.document.suite.classes
         rows = ranking.ranking(self.entries, metric)
         scores = [row.entry.scores for row in rows if row.entry.scores]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
@@ -95,7 +99,7 @@ class Pages:
             title=tab.label,
             metric=tab,
             head=self.store.head,
-            instances=sum(len(member.seeds) for member in self.document.suite.classes),
+            instances=sum(len(member.seeds) for member in classes),
             entrants=len(entrants),
             references=[row for row in rows if row.entry.reference],
             ranked=[row for row in submitted if row.ranks],
@@ -104,6 +108,8 @@ class Pages:
             families=sorted({row.entry.family for row in submitted}),
             knowledges=sorted({row.entry.knowledge for row in submitted}),
             reasons=ranking.REASONS,
+            address=self._address,
+            seeds=max(max(len(one.seeds), self.document.runs_to_rank) for one in classes),
             bars=charts.Bars([getattr(one, metric) for one in scores], tab.references),
             sparks=dict(
                 zip((row.entry.id for row in rows), charts.sparklines(regrets), strict=True)

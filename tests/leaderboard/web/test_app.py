@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import json
@@ -21,8 +22,10 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
+from leaderboard.web import app
 from leaderboard.web.errors import HTTP_CODES, STATUSES
 from leaderboard.web.serve import serve
+from sme_registry.errors import OptionError
 from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
 from tests.leaderboard.serving import serving, serving_process
 from tests.leaderboard.web.site import boards
@@ -193,6 +196,70 @@ def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
     assert page.headers["Content-Type"].startswith("text/html")
     assert "&#x27;optimal&#x27;" in page.text
     assert HTTP.get(f"{url}/static/board.css").status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/log", "/submissions/x"])
+def test_a_server_that_scores_the_references_shows_a_page_that_reloads(
+    store: Store, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """Without scorers, no page promises that the wait will end."""
+    intake.submit_references(store)
+    monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
+    with serving(store.folder.path, score_workers=1) as url:
+        page = HTTP.get(url + path, headers=BROWSER)
+        answer = HTTP.get(url + path, headers=JSON)
+    assert page.status_code == 503
+    assert int(page.headers["Retry-After"]) > 0
+    assert page.headers["Content-Type"].startswith("text/html")
+    assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
+    assert "<h1>Scoring the first entries</h1>" in page.text
+    assert '<meta http-equiv="refresh" content="5">' in page.text
+    assert "sme-leaderboard score" not in page.text
+    assert refusal(answer) == (503, "not_publishable")
+    assert answer.headers["Retry-After"] == page.headers["Retry-After"]
+    with serving(store.folder.path) as url:
+        page = HTTP.get(url + path, headers=BROWSER)
+    assert "sme-leaderboard score" in page.text
+    assert "refresh" not in page.text
+
+
+def test_a_reference_that_is_missing_promises_no_reload(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
+    with serving(store.folder.path, score_workers=1) as url:
+        assert "refresh" not in HTTP.get(url, headers=BROWSER).text
+
+
+def test_the_pages_say_how_to_submit_at_the_configured_address(tmp_path: Path) -> None:
+    """Never at the address that a request's Host header claims."""
+    forged = {**BROWSER, "Host": "evil.example"}
+    with boards.create(tmp_path / "board", classes=1) as store:
+        with serving(store.folder.path, url="https://board.example/sme") as url:
+            known = HTTP.get(url, headers=forged).text
+        with serving(store.folder.path) as url:
+            unknown = HTTP.get(url, headers=forged).text
+            assert 'href="index.html#submit"' in HTTP.get(f"{url}/method").text
+        store.folder.key.unlink()
+        with serving(store.folder.path, url="https://board.example") as url:
+            copy = HTTP.get(url, headers=forged).text
+    assert "curl -O https://board.example/sme/suite.json" in known
+    assert "sme-leaderboard submit ppo https://board.example/sme\n" in known
+    assert "ADDRESS" not in known
+    assert "curl -O ADDRESS/suite.json" in unknown
+    assert "ADDRESS below stands for the address of this board" in unknown
+    assert "accepts no submissions" in copy
+    assert "curl" not in copy
+    assert "evil" not in known + unknown + copy
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["board.example", "ftp://x", "https://x/$(id)", 'https://x"', "https://x/a b", "https://"],
+)
+def test_a_public_address_is_a_plain_url(store: Store, url: str) -> None:
+    with pytest.raises(OptionError, match="url="):
+        serve(store.folder.path, port=0, workers=0, url=url)
 
 
 def test_a_browser_gets_a_page_for_an_unknown_address(

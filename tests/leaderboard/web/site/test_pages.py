@@ -172,6 +172,22 @@ def test_the_board_states_its_digests_and_what_it_proves(pages, board):
     assert "Ranked only where" not in pages["index.html"].words
 
 
+def test_a_static_board_accepts_no_submissions_and_says_where_to_send_them(pages):
+    for name in ("index.html", "ood_regret.html", "ood_decay.html"):
+        words = pages[name].words
+        assert "This copy of the board accepts no submissions." in words
+        assert "sme-leaderboard submit ppo ADDRESS" in words
+        assert "--seeds 10" in words
+        assert "A rank needs 30 trained policies" in words
+    for name, page in pages.items():
+        assert any(a["href"].endswith("index.html#submit") for a in page.all("a")), name
+
+
+def test_an_address_is_shown_as_text(board):
+    page = Page(Pages(board[0], "https://x/<script>").board())
+    assert "submit ppo https://x/<script>" in page.words
+
+
 def test_the_method_page_defines_failures_and_intervals(pages):
     words = pages["method.html"].words
     assert "OOD decay and regret slope are 1, and the similarity loss is 100 points" in words
@@ -358,7 +374,7 @@ def test_progress_counts_every_file(board, tmp_path):
     assert steps == [(n, files) for n in range(1, files + 1)]
 
 
-def test_a_server_reads_the_same_bytes_as_the_folder_holds(board, site):
+def test_a_page_by_its_path_has_the_same_bytes_as_in_the_folder(board, site):
     pages = Pages(board[0])
     for path in site.rglob("*"):
         if path.is_file():
