@@ -38,6 +38,9 @@ def compare(
     Runs are compared in pairs: those on the same instance with the same seed. An interval that
     excludes 0 and rests on at least 5 pairs is marked: * if A is worse, † if A is better.
 
+    Each .tex file is a complete table with its own caption and label: \\input it outside of any
+    table environment.
+
     Examples:
 
       sme study compare runs/smoke PPO TD3
@@ -47,6 +50,7 @@ def compare(
       sme study compare runs/smoke PPO TD3 --json
     """
     from sme_registry.studies.report import compare as comparison
+    from sme_registry.studies.report.exports import difference_caveats
 
     metrics = tuple(metric or comparison.DEFAULT_METRICS)
     differences = comparison.compare(folder, first, second, metrics)
@@ -60,5 +64,7 @@ def compare(
         columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
         rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
         out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
+    for sentence in difference_caveats(differences):
+        out().print(escape(sentence), soft_wrap=True)
     if files:
         out().print(f"{escape(str(out_folder))}  {len(files)} files", soft_wrap=True)

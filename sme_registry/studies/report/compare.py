@@ -42,9 +42,10 @@ def compare(
     Returns:
       One row for each metric and class, and one for "all classes": first_level and second_level,
       IQM over the paired runs; difference, the IQM of the paired differences, with the ends low
-      and high of its 95 % bootstrap interval (NaN for a single pair); pairs; enough_pairs; and the
-      verdict on the first algorithm: better, worse or open. `sme_registry.statistics` has the
-      formulas.
+      and high of its 95 % bootstrap interval (NaN for a single pair); pairs; instances, the
+      different ones among the pairs; enough_pairs; and the verdict on the first algorithm: better,
+      worse, open, or indication: the interval excludes 0 but rests on fewer than 5 pairs.
+      `sme_registry.statistics` has the formulas.
 
     Raises:
       UnknownNameError: the study has no finished run of such an algorithm, or no such metric.
@@ -86,7 +87,8 @@ def write_comparison(
       first, second, metrics: see `compare`.
 
     Returns:
-      The files: differences.csv and .json, a .tex for each metric, and the figures `differences`
+      The files: differences.csv and .json; a .tex for each metric, which is a complete table with
+      its own caption and label; and the figures `differences`
       and `learning-curves-by-class`.
 
     Raises:

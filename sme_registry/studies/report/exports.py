@@ -40,11 +40,14 @@ class TextTable:
     note: str
     frame: pd.DataFrame
     names: int = 1
+    label: str = ""  # of LaTeX; by default the name
 
     def latex(self) -> str:
         """As a LaTeX `table` that fits a column of two; ASCII only."""
         caption = f"{self.title}. {self.note}"
-        return latex_table(self.frame, names=self.names, caption=caption, label=self.name)
+        return latex_table(
+            self.frame, names=self.names, caption=caption, label=self.label or self.name
+        )
 
 
 def csv_tables(analysis: Analysis) -> dict[str, str]:
@@ -150,21 +153,44 @@ def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False
     With `levels`, of a single pair, the levels of both algorithms are columns as well.
     """
     rows = rows.assign(pair=rows["first"] + " − " + rows["second"])
+    pairs = list(dict.fromkeys(rows.pair))
+    between = pairs[0] if len(pairs) == 1 else f"{''.join(rows['first'][:1])} minus each other"
+    name = f"differences-{metric.key.replace('_', '-')}"
     frame = _wide(
         rows, {"class_name": "class"}, "pair",
         lambda row: _change(row, row.difference, metric.digits + 1),
     )  # fmt: skip
-    for place, name in enumerate(("first", "second")) if levels else ():
-        texts = [fixed(value, metric.digits + 1) for value in rows[f"{name}_level"]]
-        frame.insert(1 + place, rows[name].iloc[0], texts)
-    return TextTable(
-        f"differences-{metric.key.replace('_', '-')}",
-        f"Difference of {metric.label} between algorithms",
+    for place, side in enumerate(("first", "second")) if levels else ():
+        texts = [fixed(value, metric.digits + 1) for value in rows[f"{side}_level"]]
+        frame.insert(1 + place, rows[side].iloc[0], texts)
+    note = (
         "IQM over pairs of runs on the same instance with the same seed, with its 95 % bootstrap "
         "interval. *: the first algorithm is worse, †: better, by an interval that excludes 0 and "
-        "rests on enough pairs.",
-        frame,
+        f"rests on at least {ENOUGH_RUNS} pairs."
     )
+    return TextTable(
+        name,
+        f"Difference of {metric.label}, {between}",
+        " ".join([note, *difference_caveats(rows)]),
+        frame,
+        label=f"{name}-{_slug(pairs[0])}" if levels else "",
+    )
+
+
+def difference_caveats(rows: pd.DataFrame) -> list[str]:
+    """A sentence for each reason why intervals of paired differences say less than 95 %."""
+    caveats = []
+    if not rows.enough_pairs.all():
+        caveats.append(
+            f"With fewer than {ENOUGH_RUNS} pairs on a class, an interval covers the true "
+            "difference in far fewer than 95 % of cases: it is an indication only."
+        )
+    if (rows.pairs > rows.instances).any():
+        caveats.append(
+            "Several pairs share an instance: such runs are not independent draws of the task, so "
+            "the interval is too narrow for other instances."
+        )
+    return caveats
 
 
 def _contrasts(analysis: Analysis, metric: Metric) -> TextTable:
@@ -187,7 +213,7 @@ def _contrasts(analysis: Analysis, metric: Metric) -> TextTable:
 def _regions(analysis: Analysis, algorithm: str) -> TextTable:
     rows = analysis.regions[analysis.regions.algorithm == algorithm]
     return TextTable(
-        "regions-" + "".join(letter if letter.isalnum() else "-" for letter in algorithm),
+        f"regions-{_slug(algorithm)}",
         f"Similarity r̃ of {algorithm} by region",
         "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 for the optimum, 1 "
         "for the constant ½.",
@@ -260,6 +286,11 @@ def _wide(
         columns=[*index.values(), *names],
     )
     return wide.fillna(ABSENT)
+
+
+def _slug(name: str) -> str:
+    """A name with `-` for everything but letters and digits."""
+    return "".join(letter if letter.isalnum() else "-" for letter in name.replace(" − ", "-"))
 
 
 def _level(row: Any, metric: Metric) -> str:

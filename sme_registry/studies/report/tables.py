@@ -21,8 +21,9 @@ Columns of each table, those that name the row first; class_name and algorithm a
                       low, high; pairs; enough_pairs; verdict: worse, better or open
     differences       first, second, metric: first_level, second_level: IQM over the pairs;
                       difference: IQM over pairs of  x_i(first) − x_i(second),  and for `ALL`
-                      classes its mean over classes; low, high; pairs; enough_pairs; verdict of the
-                      first algorithm: worse, better or open
+                      classes its mean over classes; low, high; pairs; instances: different ones
+                      among the pairs; enough_pairs; verdict of the first algorithm: worse or better
+                      if the interval excludes 0, indication if it does with too few pairs, or open
     aggregates        group, metric, statistic: classes, runs, fewest_runs (of a class); value: mean
                       over classes; low, high
     profiles          group, metric, threshold: fewest_runs; share: of runs whose value is above the
@@ -212,13 +213,15 @@ def differences(
     """
     rows = []
     for (first, second), metric in itertools.product(pairs, metrics):
-        classes = _paired(runs, first, second, metric.key)
+        paired = _paired(runs, first, second, metric.key)
+        classes = {name: both for name, (both, _) in paired.items()}
         bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
+        instances = {name: count for name, (_, count) in paired.items()}
         for name, both in classes.items():
             change = both[:, 0] - both[:, 1]
             ends = bootstrap.interval(change, name, metric.key)
-            rows.append(_difference(first, second, metric, name, statistics.iqm(both),
-                                    _iqm(change), ends, len(both), len(both)))  # fmt: skip
+            rows.append(_difference(first, second, metric, name, statistics.iqm(both), _iqm(change),
+                                    ends, len(both), instances[name], len(both)))  # fmt: skip
         if len(classes) > 1:
             change_of = {n: (both[:, 0] - both[:, 1])[:, None] for n, both in classes.items()}
             sizes = [len(both) for both in classes.values()]
@@ -228,20 +231,29 @@ def differences(
             ends = (low[0], high[0]) if min(sizes) > 1 else (math.nan, math.nan)
             rows.append(_difference(first, second, metric, ALL, statistics.aggregate(classes),
                                     float(statistics.aggregate(change_of)[0]), ends,
-                                    sum(sizes), min(sizes)))  # fmt: skip
+                                    sum(sizes), sum(instances.values()), min(sizes)))  # fmt: skip
     columns = (
-        "first_level second_level difference low high pairs:int64 enough_pairs:bool verdict:str"
+        "first_level second_level difference low high pairs:int64 instances:int64 "
+        "enough_pairs:bool verdict:str"
     )
     return frame(rows, f"first:str second:str metric:str class_name:str {columns}")
 
 
-def _paired(runs: pd.DataFrame, first: str, second: str, metric: str) -> dict[str, Array]:
-    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed."""
+def _paired(
+    runs: pd.DataFrame, first: str, second: str, metric: str
+) -> dict[str, tuple[Array, int]]:
+    """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed.
+
+    Next to them the number of different instances.
+    """
     on = ["class_name", "spec_digest", "seed"]
     left, right = (runs.loc[runs.algorithm == name, [*on, metric]] for name in (first, second))
     both = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
     return {
-        str(name): group[[f"{metric}_1", f"{metric}_2"]].to_numpy()
+        str(name): (
+            group[[f"{metric}_1", f"{metric}_2"]].to_numpy(),
+            int(group.spec_digest.nunique()),
+        )
         for name, group in both.groupby("class_name", sort=False)
     }
 
@@ -255,12 +267,15 @@ def _difference(
     difference: float,
     ends: tuple[float, float],
     pairs: int,
+    instances: int,
     fewest: int,
 ) -> tuple[Any, ...]:
     verdict = contrast_verdict(difference * metric.worse, *ends)
     enough = fewest >= ENOUGH_RUNS
+    if verdict != "open" and not enough:
+        verdict = "indication"
     place = (first, second, metric.key, class_name)
-    return (*place, *levels, difference, *ends, pairs, enough, verdict)
+    return (*place, *levels, difference, *ends, pairs, instances, enough, verdict)
 
 
 def contrast_verdict(worsening: float, low: float, high: float) -> str:

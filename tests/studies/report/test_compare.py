@@ -15,6 +15,7 @@ from sme_registry.cli import app
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.statistics import iqm
 from sme_registry.studies.report.classes import ALL
+from sme_registry.studies.report.compare import comparison_tables
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_the_difference_is_that_of_runs_with_one_instance_and_seed(frames) -> No
     regrets = runs[runs.class_name == "k-25"].pivot_table("wd_regret", "run", "algorithm")
     both = regrets[["Alpha", "Beta"]].dropna()
     found = row(table, "k-25")
-    assert (found.pairs, found.enough_pairs, found.verdict) == (3, False, "better")
+    assert (found.pairs, found.enough_pairs, found.verdict) == (3, False, "indication")
     assert found.difference == pytest.approx(float(iqm(both.Alpha - both.Beta)))
     assert found.first_level == pytest.approx(float(iqm(both.Alpha)))
     assert found.low < found.difference < found.high < 0
@@ -50,7 +51,7 @@ def test_the_difference_the_other_way_round_is_its_mirror_image(frames) -> None:
     one, other = (studies.compare(frames, *pair) for pair in (("Alpha", "Beta"), ("Beta", "Alpha")))
     assert np.allclose(one.difference, -other.difference)
     assert np.allclose(one.low, -other.high)
-    mirrored = {"better": "worse", "worse": "better", "open": "open"}
+    mirrored = {"better": "worse", "worse": "better", "open": "open", "indication": "indication"}
     assert list(other.verdict) == [mirrored[verdict] for verdict in one.verdict]
 
 
@@ -84,3 +85,18 @@ def test_the_command_writes_tables_and_figures(finished: Path, tmp_path: Path) -
     text = CliRunner().invoke(app, command[:-3]).stdout
     assert "Alpha − Beta" in text
     assert "(n = 3)" in text
+    few = "With fewer than 5 pairs on a class, an interval covers"
+    assert few in " ".join(text.split())
+    source = (tmp_path / "differences-wd-regret.tex").read_text()
+    assert "\\label{tab:differences-wd-regret-Alpha-Beta}" in source
+    assert few in " ".join(source.split())
+
+
+def test_pairs_that_share_an_instance_are_no_independent_draws_of_the_task(frames) -> None:
+    table = studies.compare(frames, "Alpha", "Beta")
+    assert (table.instances == table.pairs).all()
+    assert "share an instance" not in comparison_tables(table)[0].note
+    shared = frames.results.assign(spec_digest=frames.results.class_name)
+    table = studies.compare(studies.StudyFrames(shared, frames.curves), "Alpha", "Beta")
+    assert set(table[table.class_name != ALL].instances) == {1}
+    assert "share an instance" in comparison_tables(table)[0].note

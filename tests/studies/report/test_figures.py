@@ -73,3 +73,12 @@ def test_levels_of_one_state_dimension_are_comparable(analysis: Analysis) -> Non
     assert "not comparable" in panels.epsilon_remark(analysis)
     alike = dataclasses.replace(analysis, results=analysis.results[analysis.results.state_dim == 8])
     assert panels.epsilon_remark(alike) == ""
+
+
+def test_an_axis_with_a_single_class_has_no_figure(finished: Path) -> None:
+    ledger = Ledger(finished)
+    file = ledger.plan_file()
+    assert file is not None
+    keys = [p.cell.digest for p in file.plan.cells if p.class_name in ("default", "k-25")]
+    pictures = curves.draw_learning_curves(analyse(file, ledger.results(keys), draws=50), ["png"])
+    assert [picture.name for picture in pictures] == ["learning-curves-k"]

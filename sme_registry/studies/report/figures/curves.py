@@ -250,8 +250,9 @@ def line_with_band(axes: Any, curve: pd.DataFrame, look: Look, markevery: tuple[
 
 
 def _axis_groups(analysis: Analysis) -> Sequence[Group]:
-    """The groups of single axes; all classes where the plan has no axis."""
-    return [group for group in analysis.groups if group.axis] or analysis.groups
+    """Groups of single axes with several classes; all classes where there is none."""
+    contrasted = [group for group in analysis.groups if group.axis and len(group.classes) > 1]
+    return contrasted or analysis.groups[:1]
 
 
 def _class_labels(analysis: Analysis, group: Group, *, with_symbol: bool = False) -> list[str]:
