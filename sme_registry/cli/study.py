@@ -214,6 +214,11 @@ def _print_status(status: StudyStatus, json: bool) -> None:
         one = duration_range(*status.seconds_left)
         all_here = duration_range(*(bound / here for bound in status.seconds_left))
         out().print(f"Time left: {one} on one core, {all_here} on the {here} cores here")
+    if status.never_requested:
+        out().print(
+            f"{status.never_requested:,} more cells of the plan were left out by --only in every "
+            "run; their time is not included"
+        )
     if status.other_results:
         out().print(f"[dim]{status.other_results:,} results in the folder belong to other plans[/]")
     for cell in status.failed[:_FAILURES_SHOWN]:

@@ -9,9 +9,10 @@ are no leases to expire or to clean up.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +23,8 @@ from sme_registry.studies.engine.result import CellFailure, CellResult
 
 PLAN = "plan.json"
 CELLS, FAILED, LOCKS, MODELS, REPORT = "cells", "failed", "locks", "models", "report"
-_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT}
+REQUESTS = "requests"  # selections of cells that were asked for, a file each
+_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT, REQUESTS}
 
 _Entry = TypeVar("_Entry", CellResult, CellFailure)
 
@@ -74,6 +76,23 @@ class Ledger:
     def write_plan(self, file: StudyFile) -> None:
         """Write the plan; results of earlier plans stay."""
         file.write(self.folder / PLAN)
+
+    def write_request(self, file: StudyFile, only: Sequence[str]) -> None:
+        """Remember that these cells of a plan were asked for; no pattern means every cell."""
+        text = to_json({"plan": file.digest, "only": sorted(set(only))})
+        path = self.folder / REQUESTS / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+        if not path.exists():
+            write_atomically(path, text)
+
+    def requests(self, file: StudyFile) -> list[list[str]]:
+        """The patterns of each request for cells of a plan; an invalid file counts as absent."""
+        requests = []
+        for path in sorted((self.folder / REQUESTS).glob("*.json")):
+            with contextlib.suppress(SMEError, KeyError, TypeError):
+                document = read_json(path)
+                if document["plan"] == file.digest:
+                    requests.append([str(pattern) for pattern in document["only"]])
+        return requests
 
     def result(self, key: str) -> CellResult | None:
         """A cell's result; None if there is no valid one."""

@@ -1,6 +1,7 @@
 """`CellResult`: the result of one finished run of a study, one file each.
 
 STUDY/plan.json               the plan, as a `StudyFile`
+STUDY/requests/*.json         the selections of cells (`only`) that runs asked for
 STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place when complete
 STUDY/failed/<64 hex>.json    cells that failed, with the error; a successful retry removes it
 STUDY/locks/<64 hex>          locked by the operating system while a cell runs

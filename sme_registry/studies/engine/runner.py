@@ -93,6 +93,8 @@ def run_study(
     study = _StudyRun(
         plan_file, ledger, planned, runs_on, console or Console(stderr=True), retry_failed, progress
     )
+    if study.finished < len(planned):
+        ledger.write_request(plan_file, only)
     study.announce(earlier_plan, keep_models)
     try:
         study.run()

@@ -44,7 +44,8 @@ class StudyStatus:
     Attributes:
       folder: of the study.
       file: its plan.
-      cells: the selected cells of the plan, in its order.
+      cells: the selected cells of the plan, in its order. Without a selection those that were
+        asked for by any run, and those that have finished, failed or are running.
       seconds_left: of one core, for the unfinished cells; running ones count in full.
       other_results: results in the folder that belong to no cell of the plan.
     """
@@ -54,6 +55,7 @@ class StudyStatus:
     cells: tuple[CellStatus, ...]
     seconds_left: Span
     other_results: int
+    never_requested: int = 0  # cells of the plan that are not among them, without a selection
 
     def count(self, state: State) -> int:
         """How many cells are in this state."""
@@ -83,6 +85,7 @@ class StudyStatus:
             **{state: self.count(state) for state in STATES},
             "core_seconds_left": self.seconds_left._asdict(),
             "other_results": self.other_results,
+            "never_requested": self.never_requested,
             "groups": [
                 {"class": name, "algorithm": algorithm, **{s: counts[s] for s in STATES}}
                 for (name, algorithm), counts in self.counts.items()
@@ -141,6 +144,12 @@ def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudySt
         if state != "done" and ledger.is_running(key):
             state = "running"
         cells.append(CellStatus(planned, state, failures.get(key) if state == "failed" else None))
+    shown = cells
+    requests = [] if only else ledger.requests(file)
+    if requests:
+        requested = {id(planned) for patterns in requests for planned in selected(every, patterns)}
+        shown = [c for c in cells if c.state != "waiting" or id(c.planned) in requested]
+    never_requested, cells = len(cells) - len(shown), shown
     spans = [estimator.seconds(c.planned.cell) for c in cells if c.state in ("running", "waiting")]
     return StudyStatus(
         folder=ledger.folder,
@@ -148,4 +157,5 @@ def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudySt
         cells=tuple(cells),
         seconds_left=Span(sum(span.low for span in spans), sum(span.high for span in spans)),
         other_results=len(results.keys() - set(keys.values())),
+        never_requested=never_requested,
     )

@@ -269,9 +269,23 @@ def test_only_the_selected_cells_are_run_and_the_plan_stays_whole(study: Path) -
     file = small_file(seeds=2, algorithms=("optimal", "constant"))
     status, _ = quick(file, study, only=["algorithm=opt*"])
     assert {cell.planned.algorithm for cell in status.cells} == {"optimal"}
-    status = study_status(study)
-    assert (status.count("done"), status.count("waiting")) == (2, 2)
+    assert Ledger(study).plan_file() == file
     assert study_status(study, ["algorithm=constant"]).count("waiting") == 2
+
+
+def test_cells_that_no_run_asked_for_are_apart_and_need_no_time(study: Path) -> None:
+    file = small_file(seeds=2, algorithms=("optimal", "constant"))
+    quick(file, study, only=["algorithm=opt*"])
+    status = study_status(study)
+    assert (len(status.cells), status.count("done"), status.never_requested) == (2, 2, 2)
+    assert status.seconds_left.high == 0
+    quick(file, study)
+    status = study_status(study)
+    assert (len(status.cells), status.never_requested) == (4, 0)
+    edited = small_file(seeds=3, algorithms=("optimal", "constant"))
+    Ledger(study).write_plan(edited)
+    status = study_status(study)
+    assert (status.count("waiting"), status.never_requested) == (2, 0)
 
 
 def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(
