@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import pandas as pd
@@ -77,6 +77,7 @@ def analyse(
     finished: Mapping[str, CellResult],
     errors: Mapping[str, str] | None = None,
     *,
+    requested: Collection[str] | None = None,
     draws: int = statistics.DRAWS,
 ) -> Analysis:
     """Every table of a study.
@@ -85,6 +86,7 @@ def analyse(
       file: the plan.
       finished: results by the digests of their cells; cells outside the plan are ignored.
       errors: of failed runs, by the digests of their cells.
+      requested: digests of the cells that count as missing without a result; None for all.
       draws: bootstrap samples of each interval.
     """
     plan = file.plan
@@ -94,7 +96,7 @@ def analyse(
     present = [a for a in plan.algorithms if a.name in set(runs.algorithm)]
     names = tuple(algorithm.name for algorithm in present)
     compared = groups(classes, names, set(tables.by_place(runs)))
-    missing = tables.missing(plan, runs, errors or {})
+    missing = tables.missing(plan, runs, errors or {}, requested)
     offline_runs = offline_tables.offline_runs(results, plan.algorithms)
     bootstrap = tables.Bootstrap(file.digest, draws)
     return Analysis(
@@ -107,7 +109,7 @@ def analyse(
         results=results,
         curves=curves,
         runs=runs,
-        counts=tables.counts(plan, missing),
+        counts=tables.counts(plan, runs, missing),
         missing=missing,
         learning_curves=tables.learning_curves(curves, runs),
         regions=tables.regions(results),

@@ -70,6 +70,8 @@ def page(
         file=analysis.file,
         plan=analysis.file.plan,
         done=len(analysis.runs),
+        requested=_requested(analysis),
+        never_requested=len(analysis.file.plan.cells) - _requested(analysis),
         style=Markup((folder / "page.css").read_text(encoding="utf-8")),
         sections={
             key: heading
@@ -88,13 +90,18 @@ def page(
     )
 
 
+def _requested(analysis: Analysis) -> int:
+    """How many runs have finished or are missing; `--only` may have left out others."""
+    return len(analysis.runs) + len(analysis.missing)
+
+
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
     """What the numbers were made from: a name, a digest or other code, and a text."""
     file, plan = analysis.file, analysis.file.plan
     states = f"{plan.protocol.states_per_region:,} states per region"
     yield "plan", file.digest, file.versioned_name
     yield "protocol", plan.protocol.digest, states
-    runs = f"{len(analysis.runs):,} of {plural(len(plan.cells), 'run')}"
+    runs = f"{len(analysis.runs):,} of {plural(_requested(analysis), 'run')}"
     yield "runs", "", f"{runs} finished, in {duration(analysis.runs.seconds.sum())} of CPU time"
     episodes = plural(plan.evaluation_episodes, "episode")
     yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"

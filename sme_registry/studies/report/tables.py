@@ -37,7 +37,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,20 +106,32 @@ class Bootstrap:
         return float(low[0]), float(high[0])
 
 
-def missing(plan: StudyPlan, runs: pd.DataFrame, errors: Mapping[str, str]) -> pd.DataFrame:
-    """The runs that have not finished, in the plan's order; `errors` are by the cells' digests."""
+def missing(
+    plan: StudyPlan,
+    runs: pd.DataFrame,
+    errors: Mapping[str, str],
+    requested: Collection[str] | None = None,
+) -> pd.DataFrame:
+    """The requested runs that have not finished, in the plan's order; None for all runs.
+
+    Keys of `errors`, and `requested`, are the cells' digests.
+    """
     done = set(runs.key)
     rows = [
         (cell.class_name, cell.algorithm, cell.run, errors.get(cell.cell.digest, ""))
         for cell in plan.cells
         if cell.cell.digest not in done
+        and (requested is None or cell.cell.digest in requested or cell.cell.digest in errors)
     ]
     return frame(rows, f"{_PLACE} run:int64 error:str")
 
 
-def counts(plan: StudyPlan, missing: pd.DataFrame) -> pd.DataFrame:
+def counts(plan: StudyPlan, runs: pd.DataFrame, missing: pd.DataFrame) -> pd.DataFrame:
     """How many runs of each algorithm on each class have finished and failed."""
-    planned = frame([(c.class_name, c.algorithm) for c in ordered(plan)], _PLACE)
+    places = {*runs[[*PLACE, "run"]].itertuples(index=False, name=None)}
+    places |= {*missing[[*PLACE, "run"]].itertuples(index=False, name=None)}
+    cells = [(c.class_name, c.algorithm, c.run) for c in ordered(plan)]
+    planned = frame([cell[:2] for cell in cells if cell in places], _PLACE)
     table = planned.groupby(PLACE, sort=False).size().rename("planned").to_frame()
     absent = missing.groupby(PLACE).size().reindex(table.index, fill_value=0)
     failed = missing[missing.error != ""].groupby(PLACE).size()

@@ -307,3 +307,18 @@ def test_the_command_refuses_a_folder_without_a_study_or_without_results(
     planned = CliRunner().invoke(app, ["study", "report", str(tmp_path)])
     assert planned.exit_code == 2
     assert "none of its 75 runs has finished" in planned.output
+
+
+def test_cells_that_no_run_asked_for_are_not_missing(finished: Path, tmp_path: Path):
+    study = tmp_path / "study"
+    shutil.copytree(finished, study)
+    ledger = Ledger(study)
+    file = ledger.plan_file()
+    assert file is not None
+    ledger.write_request(file, ["class=default"])
+    for planned in file.plan.cells:
+        if planned.class_name != "default":
+            (study / "cells" / f"{planned.cell.digest[7:]}.json").unlink(missing_ok=True)
+    (path,) = [p for p in write_report(study, formats=["html"]) if p.name == "index.html"]
+    text = " ".join(Page(path.read_text()).text.split())
+    assert "15 of 16 runs have finished. The plan has 59 more" in text  # one has failed
