@@ -61,8 +61,8 @@ def _agents(figure: Figure, diagnosis: TeamDiagnosis) -> None:
     right.axhline(1.0, color=GREY, linewidth=0.9)
     for axes in (left, right):
         axes.set_xticks(x, [agent.name for agent in agents], rotation=30, ha="right", fontsize=8)
-        axes.set_ylim(0.0, max(1.05, axes.get_ylim()[1]))
         legend_above(axes)
+    right.set_ylim(0.0, max(1.05, right.get_ylim()[1]))  # 1 is the constant ½; shares fill theirs
 
 
 def _regrets(diagnosis: TeamDiagnosis) -> dict[str, list[float]]:
