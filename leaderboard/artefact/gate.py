@@ -28,7 +28,7 @@ from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import Rejection
 from sme_registry import SMESpec
 from sme_registry.evaluation import interface_of
-from sme_registry.export.operators import FEED_FORWARD
+from sme_registry.export import operators
 
 IR_VERSIONS = range(4, 14)  # before 4 every tensor had to be an input, too
 OPSETS = range(13, 24)
@@ -152,7 +152,7 @@ class _Inspection:
                 "must be ONNX's own, ''",
                 _STANDARD,
             )
-        if operator not in FEED_FORWARD:
+        if operator not in operators.FEED_FORWARD:
             _refuse(
                 "onnx_op",
                 f"op_type={operator!r}",

@@ -19,8 +19,7 @@ from leaderboard.cli.options import (
     find_suite,
 )
 from leaderboard.errors import BoardError
-from sme_registry.terminal import Progress, err, out, print_json
-from sme_registry.terminal.templates import plural
+from sme_registry.terminal import Progress, err, out, print_json, templates
 
 
 def init(
@@ -92,8 +91,9 @@ def init(
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     out().print(
-        f"A ranked entry needs {plural(runs, 'trained policy', 'trained policies')}: one on each "
-        f"instance of the suite ({instances}), at least {runs_to_rank} in each class ({classes}).",
+        f"A ranked entry needs {templates.plural(runs, 'trained policy', 'trained policies')}: one "
+        f"on each instance of the suite ({instances}), at least {runs_to_rank} in each class "
+        f"({classes}).",
         soft_wrap=True,
     )
     out().print(

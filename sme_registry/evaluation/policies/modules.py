@@ -16,8 +16,8 @@ from sme_registry.errors import PolicyError
 
 def is_module(policy: Any) -> bool:
     """Whether a policy is a `torch.nn.Module`."""
-    torch = _torch()
-    return torch is not None and isinstance(policy, torch.nn.Module)
+    nn = sys.modules.get("torch.nn")
+    return nn is not None and isinstance(policy, nn.Module)
 
 
 def module_predictor(module: Any) -> Callable[[Observation], Any]:
@@ -45,7 +45,8 @@ def module_predictor(module: Any) -> Callable[[Observation], Any]:
 def without_tensor(returned: Any) -> Any:
     """What a policy returned; a tensor, on any device, with or without gradient, as an array."""
     torch = _torch()
-    if torch is None or not isinstance(returned, torch.Tensor):
+    tensor_type: Any = getattr(torch, "Tensor", ())  # none while PyTorch is being imported
+    if not isinstance(returned, tensor_type):
         return returned
     tensor = returned.detach().cpu()
     return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
