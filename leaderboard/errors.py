@@ -3,6 +3,7 @@
     SMEError
     ├── Rejection            a submission or an artefact is rejected; has a stable `code`
     ├── BoardError           a folder holds no board, a key is missing, a file is not writable, …
+    │   ├── ScoringFault     the machine could not score; says nothing about the submission
     │   └── NotPublishable   the reference rows do not score 0 and 1, so no score is shown
     └── TamperedError        a board's files contradict its signed log; names the first such row
 
@@ -20,12 +21,14 @@ CODES = {
     "schema": "a field is invalid, missing or unknown",
     "too_large": "the submission or an artefact is larger than the limit",
     "bad_signature": "the signature is missing, or does not match the document and the key",
+    "wrong_board": "the signature is for another board, or for none",
     "stale_time": "the submission's time differs too much from the board's",
     "unknown_suite": "the suite, protocol or track is not the board's",
     "unknown_spec": "a run's spec digest is not an instance of the suite",
     "duplicate_run": "a run, or an artefact within one spec, is listed twice",
     "missing_run": "an instance of the suite has no run, or runs_started is below the runs listed",
     "unsafe_name": "a name or path has forbidden characters, or is reserved for the board",
+    "name_taken": "another key has used this name, or one that looks like it, on this board",
     "unknown_submission": "no submission on the board has this id",
     "withdrawn": "the submission was withdrawn by its submitter",
     "quota": "the key's, or the board's, quota is used up",
@@ -48,6 +51,8 @@ CODES = {
     "run_output": "the model's actions have a wrong shape or type",
     "run_not_finite": "an action is NaN or infinite",
     "run_batch_dependent": "an action depends on the other rows of its batch",
+    "run_rounding": "the actions depend on the rounding of the runtime's arithmetic",
+    "run_repeated": "two runs on one instance have the same policy, up to small differences",
     "run_time": "the model exceeds the limit on processor or wall time",
     "run_memory": "the model exceeds the limit on memory",
     "scoring_failed": "scoring failed several times for an unknown reason",
@@ -75,6 +80,13 @@ class Rejection(SMEError):
 
 class BoardError(SMEError):
     """A folder holds no board, a key is missing, or the board cannot be read or written."""
+
+
+class ScoringFault(BoardError):
+    """The machine could not score a submission: a lack of memory, a sandbox that does not start, …
+
+    The submission is not judged and keeps waiting.
+    """
 
 
 class NotPublishable(BoardError):

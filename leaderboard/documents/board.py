@@ -15,7 +15,7 @@ The log is authoritative. A board has one suite and one protocol.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -35,6 +35,9 @@ from sme_registry.spec import (
     Suite,
     SuiteFile,
 )
+
+RULES = 2
+"""The rules of new boards."""
 
 FILE = "board.json"
 KEY = "board.key"
@@ -62,15 +65,16 @@ class Limits(StrictModel):
 
 
 class BoardDocument(Document):
-    """`board.json`.
+    """`board.json`. Fields younger than version 1 are left out of the JSON at their defaults.
 
     Attributes:
       title: in the header of its pages.
       suite_name: the suite's versioned name, such as `smoke-v1`.
-      suite_description, suite_tags: of the suite's file; left out of the JSON if empty, so that
-        boards without them keep their digests.
+      suite_description, suite_tags: of the suite's file.
       protocol_name: the protocol's, such as `paper-v1`.
       key: the public key of the log's signatures.
+      rules: version of the rules of signatures, scores and intervals. Boards of version 1, whose
+        JSON has no such field, can be read and verified, and accept nothing.
       runs_to_rank: runs that a ranked entry needs in each class; below 10 the board is for
         practice, and says so.
       draws: number of bootstrap resamples.
@@ -86,16 +90,19 @@ class BoardDocument(Document):
     protocol_name: Name
     protocol: EvaluationProtocol
     key: PublicKey
+    rules: Literal[1, 2] = 1
     runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = RUNS_TO_RANK
     draws: Annotated[Integer, Field(ge=100, le=10**6)] = 10_000
     limits: Limits = Limits()
 
     @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
         for field in ("suite_description", "suite_tags"):
             if not plain[field]:
                 del plain[field]
+        if self.rules == 1:
+            del plain["rules"]
         return plain
 
     @property

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
-from leaderboard.documents.board import BoardDocument, Folder
+from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError, TamperedError
@@ -151,8 +151,14 @@ class Database:
         """The board's key.
 
         Raises:
-          BoardError: the key's file is missing or holds another board's key.
+          BoardError: the key's file is missing or holds another board's key, or the board follows
+            earlier rules.
         """
+        if self.document.rules != RULES:
+            raise BoardError(
+                f"{self.folder.path}: follows rules {self.document.rules}, and boards that accept "
+                f"submissions follow rules {RULES}. Create a new board with `sme-leaderboard init`."
+            )
         if self._key is None:
             if not self.folder.key.exists():
                 raise BoardError(

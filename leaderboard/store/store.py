@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leaderboard.documents.board import BoardDocument, Folder
+from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.checks import check_text, refuse_unsubmittable
 from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.documents.result import Result
@@ -74,6 +74,7 @@ class Store(Database):
                 "protocol_name": protocol_name,
                 "protocol": protocol,
                 "key": key.public,
+                "rules": RULES,
                 **fields,
             }
         )
