@@ -163,7 +163,7 @@ def _chosen(study: Path, algorithm: str | None) -> list[CellStatus]:
     from sme_registry.studies import study_status
 
     # Every cell of the plan counts, also one that no run asked for: leaving it out would select.
-    cells = study_status(study, only=("class=*",)).cells
+    cells = study_status(study, only=()).cells
     ran = [cell for cell in cells if cell.state != "waiting"]
     names = list(dict.fromkeys(cell.planned.algorithm for cell in ran or cells))
     wanted = names[0] if algorithm is None and len(names) == 1 else algorithm or ""

@@ -151,7 +151,7 @@ def status(
     def scale(file: StudyFile) -> StudyFile:
         return scaled_plan(file, steps, seeds, evaluations)
 
-    _print_status(study_status(folder, only or (), scale), json)
+    _print_status(study_status(folder, only or None, scale), json)
 
 
 @app.command("report")

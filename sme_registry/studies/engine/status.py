@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.spec import PlannedCell, StudyFile
 from sme_registry.studies.engine.estimate import Estimator, Span
 from sme_registry.studies.engine.ledger import Ledger
@@ -44,8 +45,8 @@ class StudyStatus:
     Attributes:
       folder: of the study.
       file: its plan.
-      cells: the selected cells of the plan, in its order. Without a selection those that were
-        asked for by any run, and those that have finished, failed or are running.
+      cells: the selected cells of the plan, in its order; see `study_status`. Those that any run
+        asked for include all that have finished, failed or are running.
       seconds_left: of one core, for the unfinished cells; running ones count in full.
       other_results: results in the folder that belong to no cell of the plan.
     """
@@ -55,7 +56,7 @@ class StudyStatus:
     cells: tuple[CellStatus, ...]
     seconds_left: Span
     other_results: int
-    never_requested: int = 0  # cells of the plan that are not among them, without a selection
+    never_requested: int = 0  # cells of the plan that no run asked for, where these are left out
 
     def count(self, state: State) -> int:
         """How many cells are in this state."""
@@ -105,16 +106,30 @@ class StudyStatus:
         }
 
 
+def requested(ledger: Ledger, file: StudyFile) -> set[str] | None:
+    """Digests of a plan's cells that any run asked for; None if that is unknown.
+
+    A request whose patterns do not fit the plan counts as absent.
+    """
+    digests: set[str] | None = None
+    for only in ledger.requests(file):
+        with contextlib.suppress(OptionError, UnknownNameError):
+            cells = selected(file.plan.cells, only)
+            digests = (digests or set()) | {planned.cell.digest for planned in cells}
+    return digests
+
+
 def study_status(
     folder: str | os.PathLike[str],
-    only: Sequence[str] = (),
+    only: Sequence[str] | None = None,
     scale: Callable[[StudyFile], StudyFile] = lambda file: file,
 ) -> StudyStatus:
     """The state of the study in a folder. Changes nothing, and may be called while it runs.
 
     Args:
       folder: of the study.
-      only: `class=GLOB`, `algorithm=GLOB`; see `scaling.selected`.
+      only: `class=GLOB`, `algorithm=GLOB`; see `scaling.selected`. Empty for every cell of the
+        plan; None for those that any run asked for.
       scale: applied to the folder's plan first, such as a `scaling.scaled` with other budgets.
 
     Raises:
@@ -131,24 +146,25 @@ def study_status(
     return plan_status(ledger, scale(file), only)
 
 
-def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str]) -> StudyStatus:
-    """The state of a plan's selected cells in a folder."""
+def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> StudyStatus:
+    """The state of a plan's selected cells in a folder; see `study_status`."""
     every = file.plan.cells
     keys = {id(planned): planned.cell.digest for planned in every}
     results, failures = ledger.results(), ledger.failures()
     estimator = Estimator(results.values())
     cells = []
-    for planned in selected(every, only):
+    for planned in selected(every, only or ()):
         key = keys[id(planned)]
         state: State = "done" if key in results else "failed" if key in failures else "waiting"
         if state != "done" and ledger.is_running(key):
             state = "running"
         cells.append(CellStatus(planned, state, failures.get(key) if state == "failed" else None))
-    shown = cells
-    requests = [] if only else ledger.requests(file)
-    if requests:
-        requested = {id(planned) for patterns in requests for planned in selected(every, patterns)}
-        shown = [c for c in cells if c.state != "waiting" or id(c.planned) in requested]
+    asked = requested(ledger, file) if only is None else None
+    shown = [
+        cell
+        for cell in cells
+        if asked is None or cell.state != "waiting" or keys[id(cell.planned)] in asked
+    ]
     never_requested, cells = len(cells) - len(shown), shown
     spans = [estimator.seconds(c.planned.cell) for c in cells if c.state in ("running", "waiting")]
     return StudyStatus(

@@ -17,9 +17,8 @@ from pathlib import Path
 
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_unwritable, to_json, write_atomically
-from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.ledger import REPORT, Ledger
-from sme_registry.studies.engine.scaling import selected
+from sme_registry.studies.engine.status import requested
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import csv_tables, text_tables
 from sme_registry.studies.report.figures import draw_figures
@@ -73,16 +72,9 @@ def write_report(
     refuse_unwritable(target / "index.html")
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
-    analysis = analyse(file, results, failures, requested=_requested(ledger, file))
+    analysis = analyse(file, results, failures, requested=requested(ledger, file))
     contents = _contents(analysis, models, formats)
     return [write_atomically(target / name, content) for name, content in contents.items()]
-
-
-def _requested(ledger: Ledger, file: StudyFile) -> set[str] | None:
-    """Digests of the cells that any run asked for; None if that is unknown."""
-    requests = ledger.requests(file)
-    cells = [planned for only in requests for planned in selected(file.plan.cells, only)]
-    return {planned.cell.digest for planned in cells} if requests else None
 
 
 def _contents(

@@ -288,6 +288,15 @@ def test_cells_that_no_run_asked_for_are_apart_and_need_no_time(study: Path) -> 
     assert (status.count("waiting"), status.never_requested) == (2, 0)
 
 
+@pytest.mark.parametrize("only", ["abc", ["abc"], ["class=nothing*"], [""]])
+def test_a_request_that_does_not_fit_the_plan_counts_as_absent(study: Path, only: Any) -> None:
+    file = small_file(seeds=2, algorithms=("optimal", "constant"))
+    quick(file, study, only=["algorithm=opt*"])
+    (study / "requests" / "0.json").write_text(json.dumps({"plan": file.digest, "only": only}))
+    assert study_status(study).never_requested == 2
+    assert study_status(study, only=()).count("waiting") == 2
+
+
 def test_on_a_full_disk_it_stops_with_a_typed_error_and_loses_nothing(
     study: Path, tmp_path: Path
 ) -> None:
