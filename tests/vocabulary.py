@@ -170,6 +170,7 @@ QUANTITIES = {
     "submitted": "number of runs submitted",
     "runs_started": "number of runs started, by class",
     "runs_to_rank": "fewest runs in each class for an entry to be ranked",
+    "rules": "version of a board's rules of signatures, scores and intervals",
     "draws": "number of bootstrap samples",
     "sequence": "position in a log",
     "size": "bytes of an artefact",
