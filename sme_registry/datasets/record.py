@@ -8,8 +8,9 @@ from pydantic import Field
 
 from sme_registry.datasets.recipe import DatasetRecipe
 from sme_registry.datasets.scores import ReferenceScores
-from sme_registry.errors import DigestMismatchError, SpecError
+from sme_registry.errors import SpecError
 from sme_registry.spec import Digest, Integer, StrictModel
+from sme_registry.spec.document import refuse_other_digest
 from sme_registry.spec.sme_spec import Seed
 
 KEY = "sme"
@@ -60,12 +61,10 @@ class DatasetRecord(StrictModel):
             ("spec_digest", record.recipe.spec),
             ("protocol_digest", record.recipe.protocol),
         ):
-            recorded = getattr(record, field)
-            if recorded != document.digest:
-                raise DigestMismatchError(
-                    f"{source}: {KEY}.{field}={recorded!r}: the stored "
-                    f"{field.removesuffix('_digest')} has {document.digest!r}. One of them was "
-                    "changed after the data set was generated. Download the data set again, or "
-                    "generate it again."
-                )
+            refuse_other_digest(
+                getattr(record, field),
+                document,
+                f"{source}: {KEY}.{field}",
+                "Download the data set again, or generate it again.",
+            )
         return record

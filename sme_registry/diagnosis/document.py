@@ -17,9 +17,10 @@ from typing import Literal, Self
 
 from pydantic import JsonValue
 
-from sme_registry.errors import DigestMismatchError, UnknownNameError, did_you_mean
+from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
+from sme_registry.spec.document import refuse_other_digest
 
 __all__ = [
     "POLICY",
@@ -298,9 +299,10 @@ class Diagnosis(StrictModel):
           DigestMismatchError: `spec_digest` is not the digest of `spec`.
         """
         diagnosis = cls.from_dict(read_json(path), str(path))
-        if diagnosis.spec.digest != diagnosis.spec_digest:
-            raise DigestMismatchError(
-                f"{path}: spec_digest={diagnosis.spec_digest!r:.90} does not match the digest of "
-                f"spec, {diagnosis.spec.digest!r}. One of them was edited. Diagnose the run again."
-            )
+        refuse_other_digest(
+            diagnosis.spec_digest,
+            diagnosis.spec,
+            f"{path}: spec_digest",
+            "Diagnose the run again.",
+        )
         return diagnosis

@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.errors import DigestMismatchError
 from sme_registry.io import read_json, require_packages, to_json, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel
+from sme_registry.spec.document import Integer, Real, StrictModel, refuse_other_digest
 
 if TYPE_CHECKING:
     import pandas
@@ -157,13 +156,12 @@ class EvaluationReport(StrictModel):
         """
         report = cls.from_dict(read_json(path), str(path))
         for what in ("spec", "protocol"):
-            actual, stated = getattr(report, what).digest, getattr(report, f"{what}_digest")
-            if actual != stated:
-                raise DigestMismatchError(
-                    f"{path}: {what}_digest={stated!r:.90}: the digest of its {what} is "
-                    f"{actual!r}. One of them was edited after the evaluation: get the report "
-                    "from its source again, or repeat the evaluation."
-                )
+            refuse_other_digest(
+                getattr(report, f"{what}_digest"),
+                getattr(report, what),
+                f"{path}: {what}_digest",
+                "Get the report from its source again, or repeat the evaluation.",
+            )
         return report
 
     def write(self, path: str | os.PathLike[str]) -> Path:

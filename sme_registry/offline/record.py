@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from sme_registry.errors import DigestMismatchError
 from sme_registry.io import read_json
 from sme_registry.spec import Integer, Real, SMESpec, StrictModel, TupleOf
+from sme_registry.spec.document import refuse_other_digest
 
 
 class Evaluation(StrictModel):
@@ -73,9 +73,7 @@ class OfflineRecord(StrictModel):
           DigestMismatchError: `spec_digest` does not match the spec.
         """
         record = cls.from_dict(read_json(path), str(path))
-        if record.spec.digest != record.spec_digest:
-            raise DigestMismatchError(
-                f"{os.fspath(path)}: spec_digest={record.spec_digest!r}: its spec has "
-                f"{record.spec.digest!r}. One of them was changed: train again."
-            )
+        refuse_other_digest(
+            record.spec_digest, record.spec, f"{os.fspath(path)}: spec_digest", "Train again."
+        )
         return record

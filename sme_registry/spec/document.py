@@ -20,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from sme_registry.errors import DigestMismatchError
 from sme_registry.spec.validation_errors import spec_error
 
 
@@ -145,6 +146,22 @@ class StrictModel(BaseModel):
     def to_dict(self) -> dict[str, Any]:
         """Every field as plain JSON data."""
         return self.model_dump(mode="json")
+
+
+def refuse_other_digest(stated: str, document: Document, where: str, remedy: str) -> None:
+    """Raise `DigestMismatchError` if a document has another digest than a file states.
+
+    Args:
+      stated: the digest in the file.
+      document: the document that the same file contains.
+      where: the file and the field with the digest.
+      remedy: what to do.
+    """
+    if stated != document.digest:
+        raise DigestMismatchError(
+            f"{where}={stated!r:.90}: its document has the digest {document.digest!r}. One of them "
+            f"was changed later. {remedy}"
+        )
 
 
 class Document(StrictModel):
