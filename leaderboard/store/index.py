@@ -101,6 +101,11 @@ class EntryRow:
     reference: bool
     scores: Scores | None
 
+    @property
+    def steps_per_run(self) -> int:
+        """Mean environment steps of the listed runs, rounded."""
+        return round(self.steps / max(1, self.runs))
+
 
 _COLUMNS = tuple(field.name for field in fields(EntryRow))
 _ROW = ", ".join(_COLUMNS)

@@ -92,7 +92,7 @@ class Bars:
         ticks = self._scale.ticks
         parts = [
             f'<text x="{self._at(tick)}" y="30">{_short(tick)}</text>'
-            for tick in ticks[:: 1 + len(ticks) // 7]
+            for tick in ticks[:: 1 + len(ticks) // 4]
         ]
         names: dict[float, list[str]] = {}
         for name, value in self._references.items():

@@ -92,7 +92,6 @@ class Pages:
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
         submitted = [row for row in rows if not row.entry.reference]
         entrants = [entry for entry in self.entries if not entry.reference]
-        not_scored = [entry for entry in reversed(entrants) if entry.status != "scored"]
         return self._render(
             "board.html",
             here="index.html",
@@ -104,7 +103,8 @@ class Pages:
             references=[row for row in rows if row.entry.reference],
             ranked=[row for row in submitted if row.ranks],
             listed=[row for row in submitted if not row.ranks],
-            not_scored=not_scored,
+            waiting=[entry for entry in entrants if entry.status == "waiting"],
+            closed=[e for e in reversed(entrants) if e.status in ("rejected", "withdrawn")],
             families=sorted({row.entry.family for row in submitted}),
             knowledges=sorted({row.entry.knowledge for row in submitted}),
             reasons=ranking.REASONS,
@@ -339,8 +339,10 @@ def _environment() -> Environment:
         auto_reload=False,
     )
     environment.filters |= {
+        "day": lambda time: time[:10],
         "hex": hex_of,
         "https_only": https_only,
+        "minute": lambda time: f"{time[:10]} {time[11:16]}",
         "number": charts.number,
         "short": lambda digest, digits=12: hex_of(digest)[:digits],
         "steps": steps_text,

@@ -220,6 +220,30 @@ def test_the_board_is_filtered_and_sorted(served, opened):
     expect(head).to_have_attribute("aria-sort", "descending")
 
 
+@pytest.mark.parametrize("width", ["tablet", "phone"])
+def test_a_narrow_board_is_sorted_by_a_list_and_a_button(served, width, opened):
+    page = opened(served + "index.html", width)
+    names = page.locator("tbody[data-rows] tr:not([hidden]) .name > a")
+    *ranked, listed = names.all_inner_texts()
+    fields = page.get_by_role("combobox", name="Sort by")
+    expect(fields).to_be_visible()
+    assert fields.locator("option").all_inner_texts() == [
+        *("Rank", "Method", "Marks", "Family", "Runs", "Steps per run", "Received", "Code", "N₀")
+    ]
+    fields.select_option("Method")
+    expect(names).to_have_text([*sorted(ranked, key=str.lower), listed])
+    fields.select_option("N₀")
+    page.get_by_role("button", name="Ascending").click()
+    expect(names).to_have_text([*reversed(ranked), listed])
+    expect(page.get_by_role("button", name="Descending")).to_be_visible()
+
+
+def test_a_wide_board_is_sorted_by_its_headers_only(served, opened):
+    page = opened(served + "index.html")
+    expect(page.get_by_role("button", name="Received")).to_be_visible()
+    expect(page.get_by_role("combobox", name="Sort by")).to_be_hidden()
+
+
 def test_without_script_the_board_is_whole_and_the_comparison_says_what_is_missing(origin, opened):
     page = opened(origin + "index.html", java_script_enabled=False)
     expect(page.get_by_role("row", name=re.compile("SAC 2.7.1"))).to_be_visible()

@@ -45,27 +45,7 @@ function enhanceBoard(table) {
   for (const field of filters) field.addEventListener("input", filter);
   tools.hidden = false;
 
-  const heads = [...table.tHead.rows[0].cells];
-  const order = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
-  heads.forEach((head, column) => {
-    if (!head.dataset.sort) return;
-    const button = make("button", { type: "button" }, head.textContent);
-    head.replaceChildren(button);
-    button.addEventListener("click", () => {
-      const down = head.getAttribute("aria-sort") === "ascending";
-      for (const other of heads) other.removeAttribute("aria-sort");
-      head.setAttribute("aria-sort", down ? "descending" : "ascending");
-      const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent;
-      const compare =
-        head.dataset.sort === "number"
-          ? (a, b) => Number(key(a)) - Number(key(b))
-          : (a, b) => order.compare(key(a), key(b));
-      for (const body of bodies) {
-        const sorted = rows.filter((row) => row.parentNode === body).sort(compare);
-        body.append(...(down ? sorted.reverse() : sorted));
-      }
-    });
-  });
+  enhanceSorting(table, tools, bodies);
 
   const boxes = [...table.querySelectorAll("input[name=id]")];
   const note = document.querySelector("[data-chosen]");
@@ -77,6 +57,40 @@ function enhanceBoard(table) {
   table.addEventListener("change", count);
   window.addEventListener("pageshow", count); // going back restores the selection without an event
   count();
+}
+
+// Headers sort a wide table. A narrow one has no headers, so the same sorting has a list and a button.
+function enhanceSorting(table, tools, bodies) {
+  const heads = [...table.tHead.rows[0].cells];
+  const list = tools.querySelector("[data-sort-by]");
+  const direction = tools.querySelector("[data-sort-order]");
+  const order = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
+  const arrived = bodies.map((body) => [...body.querySelectorAll("tr[data-family]")]);
+
+  const sort = (column, down) => {
+    for (const head of heads) head.removeAttribute("aria-sort");
+    heads[column].setAttribute("aria-sort", down ? "descending" : "ascending");
+    list.value = String(column);
+    direction.textContent = down ? "Descending" : "Ascending";
+    const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent;
+    const compare =
+      heads[column].dataset.sort === "number"
+        ? (a, b) => Number(key(a)) - Number(key(b))
+        : (a, b) => order.compare(key(a), key(b));
+    bodies.forEach((body, index) => {
+      body.append(...[...arrived[index]].sort((a, b) => (down ? compare(b, a) : compare(a, b))));
+    });
+  };
+
+  heads.forEach((head, column) => {
+    if (!head.dataset.sort) return;
+    const button = make("button", { type: "button" }, head.textContent);
+    list.append(make("option", { value: column }, head.textContent));
+    head.replaceChildren(button);
+    button.addEventListener("click", () => sort(column, head.getAttribute("aria-sort") === "ascending"));
+  });
+  list.addEventListener("change", () => sort(Number(list.value), false));
+  direction.addEventListener("click", () => sort(Number(list.value), direction.textContent === "Ascending"));
 }
 
 // The comparison

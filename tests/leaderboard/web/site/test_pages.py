@@ -226,8 +226,11 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
     ]
     assert shown[-1] == ("–", "PPO small")
     assert "fewer than 10 runs in a class" in rows[-1][2]
-    assert "oracle-like: code requested" in rows[2][2]
+    assert 'href="method.html#oracle-like"' in rows[2][2]
+    assert ">requested</td>" in rows[2][2]
     assert 'href="https://example.org/sac?a=1&amp;b=2"' in rows[3][2]
+    assert 'data-label="Steps per run" data-value="1000000">1 M</td>' in rows[3][2]
+    assert re.search(r'<time datetime="(\d{4}-\d\d-\d\d)T[^"]*">\1</time>', rows[3][2])
     assert all('class="bar"' in row and 'class="spark"' in row for _, _, row in rows)
 
 
@@ -241,10 +244,11 @@ def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
 
 def test_submissions_that_are_not_scored_are_listed_below_with_their_status(pages):
     words = pages["index.html"].words
-    below = words[words.index("Waiting, rejected and withdrawn") :]
-    assert re.search(r"Broken 0\.1.*rejected onnx_op", below)
-    assert re.search(r"PPO 2\.7\.2.*waiting", below)
-    assert re.search(r"Gone 1\.0.*withdrawn", below)
+    waiting, closed = words.split("Waiting to be scored")[1].split("Rejected and withdrawn")
+    assert re.search(r"Runs 1 ?PPO 2\.7\.2 ?by R\. Okafor ?\d{4}-\d\d-\d\d \d\d:\d\d", waiting)
+    assert re.search(r"Broken 0\.1.*rejected onnx_op", closed)
+    assert re.search(r"Gone 1\.0.*withdrawn", closed)
+    assert "1 waiting" in words.split("Waiting to be scored")[0]
 
 
 @pytest.mark.parametrize("kind", ["sac", "rejected", "waiting", "gone"])
