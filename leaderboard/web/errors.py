@@ -65,13 +65,9 @@ async def on_board_error(request: Request, error: Exception) -> Response:
     """The answer where the board publishes nothing; `Guard` logs every other fault and hides it."""
     if not isinstance(error, NotPublishable):
         raise error
-    if not (error.waiting and request.app.state.scores):
-        return error_answer(request, "not_publishable", str(error))
-    headers = {"Retry-After": str(_RELOAD_SECONDS)}
-    if not _wants_page(request):
-        return error_answer(request, "not_publishable", str(error), headers)
-    page = _SCORING_PAGE.format(seconds=_RELOAD_SECONDS, root=_root(request))
-    return Response(page, STATUSES["not_publishable"], headers=headers, media_type="text/html")
+    waits = error.waiting and request.app.state.scores
+    headers = {"Retry-After": str(_RETRY_SECONDS)} if waits else None
+    return error_answer(request, "not_publishable", str(error), headers)
 
 
 def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
@@ -98,26 +94,7 @@ def _root(request: Request) -> str:
     return "../" * (request.url.path.count("/") - 1) or "./"
 
 
-_RELOAD_SECONDS = 5
-
-_SCORING_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="refresh" content="{seconds}">
-<title>Scoring the first entries</title>
-<link rel="stylesheet" href="{root}static/board.css">
-</head>
-<body>
-<main id="main" class="frame">
-<h1>Scoring the first entries</h1>
-<p>This board is new. It is scoring its two reference rows, the optimal policy and the constant one,
-and shows scores as soon as both are correct. This page reloads every {seconds} seconds.</p>
-</main>
-</body>
-</html>
-"""
+_RETRY_SECONDS = 5
 
 _ERROR_PAGE = """<!DOCTYPE html>
 <html lang="en">

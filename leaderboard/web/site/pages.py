@@ -26,11 +26,11 @@ from leaderboard import exports
 from leaderboard.documents.board import BoardDocument, hex_of
 from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
-from leaderboard.errors import CODES
+from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
 from leaderboard.store import EntryRow, Store
-from leaderboard.web.site import charts
-from leaderboard.web.site.rows import SHORT, TABS, agent_rows, https_only, run_rows, steps_text
+from leaderboard.web.site import charts, rows
+from leaderboard.web.site.rows import SHORT, TABS
 from sme_registry.io import to_json
 from sme_registry.spec import StrictModel
 
@@ -50,6 +50,7 @@ _DEFINITIONS: dict[str, Callable[[BoardDocument], StrictModel]] = {
     "suite.json": lambda board: board.suite_file,
     "definition.json": lambda board: board,
 }
+_NEED_SCORES = (*(tab.page for tab in TABS), "compare.html")
 _EXPORTS = {"json": exports.to_json, "csv": exports.to_csv, "tex": exports.to_latex}
 
 
@@ -75,9 +76,17 @@ class Pages:
         Raises:
           NotPublishable: the reference rows are missing or differ from 0 and 1.
         """
-        entries = self.store.entries()
-        ranking.refuse_unpublishable(entries)
-        return entries
+        ranking.refuse_unpublishable(self._listed)
+        return self._listed
+
+    @cached_property
+    def preparing(self) -> bool:
+        """Whether the board is served, and its reference rows wait: no scores yet, but no fault."""
+        try:
+            self.entries  # noqa: B018  raises if the board may not publish
+        except NotPublishable as error:
+            return error.waiting and self._address is not None
+        return False
 
     def board(self, metric: Metric = "wd_regret") -> str:
         """The board by a metric.
@@ -86,35 +95,48 @@ class Pages:
           NotPublishable: see `entries`; every other page raises it too.
         """
         tab = next(tab for tab in TABS if tab.key == metric)
-        classes = self.document.suite.classes
-        rows = ranking.ranking(self.entries, metric)
-        scores = [row.entry.scores for row in rows if row.entry.scores]
+        ranked = ranking.ranking(self.entries, metric)
+        scores = [row.entry.scores for row in ranked if row.entry.scores]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
-        submitted = [row for row in rows if not row.entry.reference]
-        entrants = [entry for entry in self.entries if not entry.reference]
+        submitted = [row for row in ranked if not row.entry.reference]
         return self._render(
             "board.html",
             here="index.html",
             title=tab.label,
             metric=tab,
-            head=self.store.head,
-            instances=sum(len(member.seeds) for member in classes),
-            entrants=len(entrants),
-            references=[row for row in rows if row.entry.reference],
+            references=[row for row in ranked if row.entry.reference],
             ranked=[row for row in submitted if row.ranks],
             listed=[row for row in submitted if not row.ranks],
-            waiting=[entry for entry in entrants if entry.status == "waiting"],
-            closed=[e for e in reversed(entrants) if e.status in ("rejected", "withdrawn")],
             families=sorted({row.entry.family for row in submitted}),
             knowledges=sorted({row.entry.knowledge for row in submitted}),
             reasons=ranking.REASONS,
-            address=self._address,
-            seeds=max(max(len(one.seeds), self.document.runs_to_rank) for one in classes),
+            **self._overview,
             bars=charts.Bars([getattr(one, metric) for one in scores], tab.references),
             sparks=dict(
-                zip((row.entry.id for row in rows), charts.sparklines(regrets), strict=True)
+                zip((row.entry.id for row in ranked), charts.sparklines(regrets), strict=True)
             ),
         )
+
+    def preparation(self) -> str:
+        """The page of a board whose reference rows wait, which reloads itself."""
+        return self._render(
+            "preparing.html", here="index.html", title="Preparing", **self._overview
+        )
+
+    @cached_property
+    def _overview(self) -> dict[str, Any]:
+        """What a board shows besides its scores: the suite, what waits, and how to submit."""
+        classes = self.document.suite.classes
+        entrants = [entry for entry in self._listed if not entry.reference]
+        return {
+            "head": self.store.head,
+            "instances": sum(len(member.seeds) for member in classes),
+            "entrants": len(entrants),
+            "waiting": [entry for entry in entrants if entry.status == "waiting"],
+            "closed": [e for e in reversed(entrants) if e.status in ("rejected", "withdrawn")],
+            "address": self._address,
+            "seeds": max(max(len(one.seeds), self.document.runs_to_rank) for one in classes),
+        }
 
     def submission(self, id: str) -> str:
         """The page of a submission: waiting, scored, rejected or withdrawn.
@@ -124,6 +146,8 @@ class Pages:
         """
         entry = self._by_id[id]
         signed, result = self._documents(id)
+        withheld = self.preparing and result is not None and result.scores is not None
+        result = None if withheld else result
         withdrawal = self.store.withdrawal(id)
         submission = signed.submission
         edges = self.document.protocol.edges
@@ -142,14 +166,15 @@ class Pages:
             hex=hex_of(id),
             s=submission,
             result=result,
+            withheld=withheld,
             entry=entry,
             withdrawal=withdrawal and withdrawal.withdrawal,
             codes=CODES,
             chart=chart,
             classes=classes,
-            agents=[] if result is None else agent_rows(result),
+            agents=[] if result is None else rows.agent_rows(result),
             regions=charts.region_labels(edges),
-            runs=run_rows(submission, result, self._class_of),
+            runs=rows.run_rows(submission, result, self._class_of),
         )
 
     def compare(self) -> str:
@@ -226,6 +251,8 @@ class Pages:
             return _static().get(name)
         if path in _DEFINITIONS:  # without scores, and needed to train for the board
             return to_json(_DEFINITIONS[path](self.document).to_dict()).encode()
+        if self.preparing and (path.endswith(".html") or folder == "submissions"):
+            return self._prepared(folder, name)
         self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
@@ -262,6 +289,15 @@ class Pages:
             **{tab.page: partial(self.board, tab.key) for tab in reversed(TABS)},
         }
 
+    def _prepared(self, folder: str, name: str) -> bytes | None:
+        """A file without scores, while the reference rows wait."""
+        if folder == "submissions":
+            return self._document(folder, name)
+        if folder or name not in self._top:
+            return None
+        render = self.preparation if name in _NEED_SCORES else self._top[name]
+        return render().encode()
+
     def _export(self, metric: Metric, kind: str) -> str:
         rows = ranking.ranking(self.entries, metric)
         # The date is the log's, not the clock's, so that the same board gives equal bytes.
@@ -291,7 +327,12 @@ class Pages:
 
     @cached_property
     def _by_id(self) -> dict[str, EntryRow]:
-        return {entry.id: entry for entry in self.entries}
+        return {entry.id: entry for entry in self._listed}
+
+    @cached_property
+    def _listed(self) -> list[EntryRow]:
+        """Every entry, also of a board that may not publish its scores."""
+        return self.store.entries()
 
     @cached_property
     def _scored(self) -> list[Any]:
@@ -339,13 +380,13 @@ def _environment() -> Environment:
         auto_reload=False,
     )
     environment.filters |= {
-        "day": lambda time: time[:10],
+        "day": rows.day,
         "hex": hex_of,
-        "https_only": https_only,
-        "minute": lambda time: f"{time[:10]} {time[11:16]}",
+        "https_only": rows.https_only,
+        "minute": rows.minute,
         "number": charts.number,
         "short": lambda digest, digits=12: hex_of(digest)[:digits],
-        "steps": steps_text,
+        "steps": rows.steps_text,
     }
     return environment
 

@@ -87,6 +87,16 @@ def https_only(link: str | None) -> str | None:
     return link if link is not None and link.startswith("https://") else None
 
 
+def day(time: str) -> str:
+    """The date of a time of the log: `2026-11-21`."""
+    return time[:10]
+
+
+def minute(time: str) -> str:
+    """Date and time of a time of the log, in UTC: `2026-11-21 09:30`."""
+    return f"{time[:10]} {time[11:16]}"
+
+
 def steps_text(steps: int) -> str:
     """Environment steps with a unit: `500 k`, `1.2 M`."""
     for size, unit in ((10**9, "G"), (10**6, "M"), (10**3, "k")):

@@ -186,7 +186,7 @@ def test_an_unchanged_board_is_not_sent_twice(tmp_path: Path) -> None:
     assert "New" in grown.text
 
 
-def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
+def test_a_board_without_references_shows_nothing(url: str) -> None:
     for path in ("/", "/ood_regret", "/log", "/api/board"):
         answer = HTTP.get(url + path, headers=JSON)
         assert refusal(answer) == (503, "not_publishable")
@@ -198,29 +198,50 @@ def test_a_board_whose_references_wait_shows_nothing(url: str) -> None:
     assert HTTP.get(f"{url}/static/board.css").status_code == 200
 
 
-@pytest.mark.parametrize("path", ["/", "/log", "/submissions/x"])
-def test_a_server_that_scores_the_references_shows_a_page_that_reloads(
-    store: Store, monkeypatch: pytest.MonkeyPatch, path: str
+def test_a_new_board_says_that_it_prepares_and_how_to_submit(store: Store) -> None:
+    intake.submit_references(store)
+    key = SigningKey.generate()
+    waiting = boards.submit(store, key, "Early", None)
+    with serving(store.folder.path) as url:
+        for path in ("/", "/ood_regret", "/compare"):
+            page = HTTP.get(url + path, headers=BROWSER)
+            assert page.status_code == 200
+            assert '<meta http-equiv="refresh" content="5">' in page.text
+            assert "<strong>Preparing.</strong>" in page.text
+            assert 'id="submit"' in page.text
+            assert ">Early<" in page.text
+        entry = HTTP.get(f"{url}/submissions/{hex_of(waiting)}.html")
+        assert "Waiting to be scored" in entry.text
+        for path in ("/method", "/log", "/log-0", "/suite.json", "/definition.json"):
+            assert HTTP.get(url + path).status_code == 200
+            assert "Preparing" not in HTTP.get(url + path).text
+        for path in ("/api/board", "/board.csv", "/board-data.js"):
+            assert refusal(HTTP.get(url + path)) == (503, "not_publishable")
+        assert HTTP.get(f"{url}/submissions/x").status_code == 404
+
+
+def test_while_a_board_prepares_an_entry_that_was_scored_first_shows_no_scores(
+    store: Store,
 ) -> None:
-    """Without scorers, no page promises that the wait will end."""
+    """Several scorers may finish an entry before the reference rows."""
+    id = boards.submit(store, SigningKey.generate(), "Early", [0.123] * 6, spread=0.0)
+    intake.submit_references(store)
+    with serving(store.folder.path) as url:
+        page = HTTP.get(f"{url}/submissions/{hex_of(id)}.html").text
+    assert "the scores are withheld" in page
+    assert "0.123" not in page
+
+
+def test_data_of_a_new_board_are_announced_only_by_a_server_that_scores(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
     intake.submit_references(store)
     monkeypatch.setattr(app, "background_scorers", lambda *_: contextlib.nullcontext())
-    with serving(store.folder.path, score_workers=1) as url:
-        page = HTTP.get(url + path, headers=BROWSER)
-        answer = HTTP.get(url + path, headers=JSON)
-    assert page.status_code == 503
-    assert int(page.headers["Retry-After"]) > 0
-    assert page.headers["Content-Type"].startswith("text/html")
-    assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
-    assert "<h1>Scoring the first entries</h1>" in page.text
-    assert '<meta http-equiv="refresh" content="5">' in page.text
-    assert "sme-leaderboard score" not in page.text
-    assert refusal(answer) == (503, "not_publishable")
-    assert answer.headers["Retry-After"] == page.headers["Retry-After"]
-    with serving(store.folder.path) as url:
-        page = HTTP.get(url + path, headers=BROWSER)
-    assert "sme-leaderboard score" in page.text
-    assert "refresh" not in page.text
+    for workers in (0, 1):
+        with serving(store.folder.path, score_workers=workers) as url:
+            answer = HTTP.get(f"{url}/api/board", headers=JSON)
+        assert refusal(answer) == (503, "not_publishable")
+        assert ("Retry-After" in answer.headers) == (workers == 1)
 
 
 def test_a_reference_that_is_missing_promises_no_reload(
