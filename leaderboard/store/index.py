@@ -1,8 +1,8 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
-The tables `head`, `entry` and `object` are a function of the log alone, so a rebuilt index equals
-one that grew. `lease` and `upload` are temporary state: the claims of scorers, and the artefacts
-that no submission names yet.
+The tables `head`, `entry`, `object` and `artefact` are a function of the log alone, so a rebuilt
+index equals one that grew. `lease` and `upload` are temporary state: the claims of scorers, and the
+artefacts that no submission names yet.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ from leaderboard.store.log import EMPTY, Head, LogEntry
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]
 
-DERIVED = {"head": "zero", "entry": "id", "object": "digest"}  # tables and their keys
+DERIVED = {  # tables and their keys
+    "head": "zero",
+    "entry": "id",
+    "object": "digest",
+    "artefact": "digest || submission",
+}
 
 SCHEMA = """
 CREATE TABLE head (
@@ -51,6 +56,9 @@ CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX object_of_key ON object (key, received);
+CREATE TABLE artefact (
+  digest TEXT NOT NULL, submission TEXT NOT NULL, PRIMARY KEY (digest, submission)
+) STRICT, WITHOUT ROWID;
 CREATE TABLE lease (
   submission TEXT PRIMARY KEY, worker TEXT, attempt INTEGER NOT NULL, lost INTEGER NOT NULL,
   boot TEXT NOT NULL, expires REAL NOT NULL
@@ -231,6 +239,10 @@ class Index:
                 )
                 self.connection.execute(
                     "DELETE FROM upload WHERE digest = ?", (run.artefact.sha256,)
+                )
+                self.connection.execute(
+                    "INSERT OR IGNORE INTO artefact VALUES (?, ?)",
+                    (run.artefact.sha256, entry.subject),
                 )
 
     def _result(self, entry: LogEntry) -> None:

@@ -270,6 +270,20 @@ class Store(Database):
             )
             return [received for (received,) in rows]
 
+    def is_public(self, digest: str) -> bool:
+        """Whether an artefact belongs to a reference row, or to a submission that was scored.
+
+        Others are not published: who could download a policy that waits to be scored could submit
+        it under another key, as if it were the first.
+        """
+        with self.reading() as index:
+            row = index.one(
+                "SELECT 1 FROM artefact JOIN entry ON id = submission "
+                "WHERE digest = ? AND (reference OR scores IS NOT NULL) LIMIT 1",
+                digest,
+            )
+        return row is not None
+
     def log(self, start: int = 0, count: int = 100) -> list[LogEntry]:
         """At most `count` log entries, from number `start` on.
 

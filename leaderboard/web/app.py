@@ -2,7 +2,7 @@
 
     GET  /…                              the pages, at the paths that `site` writes them to
     PUT  /api/objects/<hex>              upload an artefact; signed, see `intake.uploads`
-    GET  /api/objects/<hex>              its bytes, so that anyone can rescore it; HEAD: exists?
+    GET  /api/objects/<hex>              its bytes, once it is scored, so that anyone can rescore it
     POST /api/submissions                202 accepted, 200 already known
     GET  /api/submissions/<hex>          status and result; reference rows may withhold scores
     POST /api/withdrawals                200
@@ -40,6 +40,7 @@ from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
 from leaderboard.store import Head, Store, unknown_submission
 from leaderboard.web import errors, limits
+from leaderboard.web.downloads import Downloads
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
 from leaderboard.web.site import Pages, content_type
@@ -123,6 +124,7 @@ class _Routes:
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
         self._pages = pages
+        self._downloads = Downloads(store)
 
     async def health(self) -> Response:
         return JSONResponse({"status": "ok"})
@@ -153,17 +155,7 @@ class _Routes:
         return self._store.put_object(digest, iter(lambda: spool.read(_CHUNK), b""), by=key)
 
     async def get_object(self, request: Request, digits: str) -> Response:
-        digest = _digest(digits)
-        if not await to_thread.run_sync(self._store.objects.has, digest):
-            raise RequestError("not_found", f"object={digest}: is not on this board.")
-        headers = {
-            "Cache-Control": "public, max-age=31536000, immutable",
-            "Content-Disposition": f'attachment; filename="{digits}.onnx"',
-        }
-        data = b""
-        if request.method != "HEAD":
-            data = await to_thread.run_sync(self._store.objects.read, digest)
-        return Response(data, headers=headers, media_type="application/octet-stream")
+        return await self._downloads.answer(request, _digest(digits))
 
     async def post_submission(self, request: Request) -> Response:
         text = await limits.read_document(request, "submission")

@@ -1,14 +1,16 @@
-"""`Guard`: security headers on every answer, unsafe paths rejected, internal faults hidden."""
+"""`Guard`: security headers, answers in pieces, unsafe paths rejected, internal faults hidden."""
 
 from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Iterator
 
 from fastapi import Request
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from leaderboard.web.downloads import PIECE
 from leaderboard.web.errors import HTTP_CODES, error_answer
 
 _HEADERS = {
@@ -49,7 +51,8 @@ class Guard:
                 headers.setdefault("Cache-Control", "no-store")
                 if message["status"] >= 400 and scope["method"] not in ("GET", "HEAD"):
                     headers["Connection"] = "close"  # more of the body may be on its way
-            await send(message)
+            for piece in _pieces(message):
+                await send(piece)
 
         request = Request(scope)
         if not _is_safe(scope):
@@ -68,6 +71,15 @@ class Guard:
                 raise
             answer = error_answer(request, "internal", f"{HTTP_CODES['internal']}.")
             await answer(scope, receive, send_with_headers)
+
+
+def _pieces(message: Message) -> Iterator[Message]:
+    """A message of an answer in pieces: the server copies only what the client is about to read."""
+    body = message.get("body", b"")
+    while len(body) > PIECE:
+        yield {**message, "body": bytes(body[:PIECE]), "more_body": True}
+        body = memoryview(body)[PIECE:]
+    yield {**message, "body": bytes(body)} if body else message
 
 
 def _is_safe(scope: Scope) -> bool:

@@ -19,6 +19,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
@@ -26,7 +27,13 @@ from leaderboard.web import app
 from leaderboard.web.errors import HTTP_CODES, STATUSES
 from leaderboard.web.serve import serve
 from sme_registry.errors import OptionError
-from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
+from tests.leaderboard.conftest import (
+    linear_onnx,
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
 from tests.leaderboard.serving import serving, serving_process
 from tests.leaderboard.web.site import boards
 
@@ -428,18 +435,89 @@ def test_an_unsupported_method_is_rejected(published: tuple[str, dict[str, str]]
 # Uploads.
 
 
-def test_an_artefact_is_uploaded_once_and_downloaded_unchanged(
-    url: str, store: Store, key: SigningKey
-) -> None:
+def test_an_artefact_is_uploaded_once(url: str, store: Store, key: SigningKey) -> None:
     data = linear_onnx(1)
-    path = f"{url}/api/objects/{hex_of(sha256(data))}"
-    assert HTTP.head(path).status_code == 404
     assert put(url, key, data).status_code == 201
     assert put(url, key, data).status_code == 200
-    assert HTTP.head(path).status_code == 200
-    assert HTTP.get(path).content == data
     assert store.objects.read(sha256(data)) == data
     assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
+
+
+def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey) -> None:
+    """Until then, and if it is never scored, it might as well not exist."""
+    with boards.create(tmp_path / "board", classes=1) as store, serving(store.folder.path) as url:
+
+        def downloads(digest: str) -> set[tuple[int, str]]:
+            path = f"{url}/api/objects/{hex_of(digest)}"
+            head, get = HTTP.head(path, headers=JSON), HTTP.get(path, headers=JSON)
+            assert head.headers["Content-Length"] == get.headers["Content-Length"]
+            return {(head.status_code, ""), (get.status_code, get.text.replace(digest, "DIGEST"))}
+
+        unknown = downloads(sha256(b"unknown"))
+        assert {status for status, _ in unknown} == {404}
+
+        assert put(url, key, b"uploaded").status_code == 201
+        assert downloads(sha256(b"uploaded")) == unknown
+
+        waiting = uploaded(url, store, key, 1)
+        assert post(url, waiting.to_bytes()).status_code == 202
+        assert downloads(sha256(linear_onnx(1))) == unknown
+
+        claim = store.queue.claim("worker")
+        assert claim is not None
+        result = Result(
+            submission=waiting.id,
+            suite=store.document.suite.digest,
+            protocol=store.document.protocol.digest,
+            status="rejected",
+            code="run_time",
+            message="took too long",
+        )
+        assert store.queue.finish(claim, result)
+        assert downloads(sha256(linear_onnx(1))) == unknown
+
+        withdrawn = uploaded(url, store, key, 2)
+        assert post(url, withdrawn.to_bytes()).status_code == 202
+        store.withdraw(signed_withdrawal(withdrawn.id, key))
+        assert downloads(sha256(linear_onnx(2))) == unknown
+
+        scored = boards.submit(store, key, "PPO", [0.2] * 6)
+        policy = b"PPO 1.0 plane1 0"  # whose digest the submission names
+        store.put_object(sha256(policy), [policy], by=key.public)
+        assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
+        store.withdraw(signed_withdrawal(scored, key))
+        assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
+
+
+def test_the_policies_of_reference_rows_are_public(url: str, store: Store) -> None:
+    (optimal, _) = intake.submit_references(store)
+    (run,) = store.submission(optimal).submission.runs
+    assert run.artefact is not None
+    answer = HTTP.get(f"{url}/api/objects/{hex_of(run.artefact.sha256)}")
+    assert sha256(answer.content) == run.artefact.sha256
+
+
+def test_an_artefact_is_verified_again_only_if_its_file_changes(
+    url: str, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (optimal, _) = intake.submit_references(store)
+    (run,) = store.submission(optimal).submission.runs
+    assert run.artefact is not None
+    path, file = f"{url}/api/objects/{hex_of(run.artefact.sha256)}", store.folder.object
+    computed = []
+
+    def counted(*arguments: Any) -> Any:
+        computed.append(arguments)
+        return file_digest(*arguments)
+
+    file_digest = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", counted)
+    assert [HTTP.get(path).status_code for _ in range(3)] == [200, 200, 200]
+    assert len(computed) == 1
+    file(run.artefact.sha256).chmod(0o644)
+    file(run.artefact.sha256).write_bytes(b"rotten")
+    assert refusal(HTTP.get(path)) == (500, "internal")
+    assert len(computed) == 2
 
 
 def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
@@ -821,12 +899,9 @@ def test_a_body_that_is_no_withdrawal_has_its_code(
 def test_an_internal_fault_is_logged_and_not_shown(
     url: str, store: Store, key: SigningKey, caplog: pytest.LogCaptureFixture
 ) -> None:
-    data = linear_onnx(5)
-    put(url, key, data)
-    path = store.folder.object(sha256(data))
-    path.chmod(0o644)
-    path.write_bytes(b"rotten")
-    answer = HTTP.get(f"{url}/api/objects/{hex_of(sha256(data))}")
+    signed = put_submission(store, key)
+    store.folder.submission(signed.id).write_bytes(b"rotten")
+    answer = HTTP.get(f"{url}/api/submissions/{hex_of(signed.id)}")
     assert refusal(answer) == (500, "internal")
     assert str(store.folder.path) not in answer.text
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
