@@ -66,12 +66,12 @@ def test_show_does_not_call_another_task_by_a_name_of_the_catalogue() -> None:
 def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: Path) -> None:
     good("new", "k2.json", "--k", "2", "--seed", "7")
     printed = good(
-        "suite", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3"
+        "suite", "new", "mine.json", "-t", "Default", "-t", "k2.json", "--instances", "3"
     ).stdout
     file = SuiteFile.read(tmp_path / "mine.json")
     assert file.digest in printed
     assert file.suite.instances[3:] == tuple(SMESpec(k=2, seed=seed) for seed in (7, 8, 9))
-    good("suite", "wider.json", "--suite", "mine.json", "-t", "Plane10")
+    good("suite", "new", "wider.json", "--suite", "mine.json", "-t", "Plane10")
     wider = SuiteFile.read(tmp_path / "wider.json").suite
     assert [member.name for member in wider.classes] == ["Default", "k2", "Plane10"]
     good("suite", "axis.json", "-t", "Default", "--sweep", "k=1,5")
@@ -87,6 +87,17 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: P
     assert not (tmp_path / "other.json").exists()
     assert "is the file of a suite, not of a task" in refused("train", "mine.json")
     assert "--suite FILE" in refused("train", SMESpec(k=2, seed=8).digest)
+
+
+def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other() -> None:
+    assert "--suite" in refused("train")
+    assert "TASK" in refused("train", "Default", "--suite", "smoke")
+    assert "--num-envs" in refused("train", "--suite", "smoke", "--num-envs", "2")
+    assert "--seeds" in refused("train", "Default", "--seeds", "2")
+    assert "sme suite new" in refused("train", "--suite", "smoke", "--set", "k=2")
+    assert "seeds" in refused("train", "--suite", "smoke", "--seeds", "0")
+    assert "'nothing'" in refused("train", "--suite", "nothing")
+    assert not list(Path().iterdir())
 
 
 def test_help_lists_every_command_and_the_version_is_the_packages() -> None:

@@ -6,7 +6,7 @@ Exit codes: 0 success; 1 a task refused by `certify`, or failed cells of a study
 
 from __future__ import annotations
 
-from sme_registry.cli import dataset, offline, study
+from sme_registry.cli import dataset, offline, study, suite
 from sme_registry.cli.certify import certify
 from sme_registry.cli.demo import demo
 from sme_registry.cli.diagnose import diagnose
@@ -14,7 +14,6 @@ from sme_registry.cli.evaluate import evaluate
 from sme_registry.cli.list import list_
 from sme_registry.cli.new import new
 from sme_registry.cli.show import show
-from sme_registry.cli.suite import suite
 from sme_registry.cli.train import train
 from sme_registry.cli.validate import validate
 from sme_registry.terminal import application
@@ -37,8 +36,9 @@ app = application(
     """,
 )
 app.command("list")(list_)
-for _command in (show, new, suite, validate, certify, evaluate, train, diagnose, demo):
+for _command in (show, new, validate, certify, evaluate, train, diagnose, demo):
     app.command()(_command)
+app.add_typer(suite.app, name="suite")
 app.add_typer(study.app, name="study")
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(offline.app, name="offline")

@@ -116,7 +116,7 @@ def run(
         only=only or (),
         console=err(),
     )
-    _print_status(status, json)
+    print_status(status, json)
     if status.failed:
         err().print(
             f"[bold red]{len(status.failed)} of {len(status.cells)} cells failed.[/] Add --retry "
@@ -151,7 +151,7 @@ def status(
     def scale(file: StudyFile) -> StudyFile:
         return scaled_plan(file, steps, seeds, evaluations)
 
-    _print_status(study_status(folder, only or None, scale), json)
+    print_status(study_status(folder, only or None, scale), json)
 
 
 @app.command("report")
@@ -190,7 +190,8 @@ def report(
         out().print(f"{escape(str(parent))}  {count} files", soft_wrap=True)
 
 
-def _print_status(status: StudyStatus, json: bool) -> None:
+def print_status(status: StudyStatus, json: bool) -> None:
+    """Print how many cells of a study are done, running, failed and waiting, or all as JSON."""
     if json:
         print_json(status.to_dict())
         return

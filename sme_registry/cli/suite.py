@@ -1,9 +1,9 @@
-"""`sme suite`: write a suite's file."""
+"""`sme suite new`: write a suite's file. `sme suite FILE` is short for it."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -12,12 +12,36 @@ from sme_registry.cli.arguments import Force
 from sme_registry.cli.files import check_document_path
 from sme_registry.cli.plan_options import ClassOptions, with_options
 from sme_registry.spec import Suite, SuiteFile
-from sme_registry.terminal import err, out
+from sme_registry.terminal import CommandGroup, err, out
 from sme_registry.terminal.templates import plural
 
 
+class _NewByDefault(CommandGroup):
+    """A group whose command `new` may be left out."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = args and args[0] in (*self.commands, *self.get_help_option_names(ctx))
+        parsed: list[str] = super().parse_args(ctx, args if named or not args else ["new", *args])
+        return parsed
+
+
+app = typer.Typer(
+    cls=_NewByDefault,
+    no_args_is_help=True,
+    help="""Suites of your own: classes of tasks, each with several instances.
+
+    Examples:
+
+      sme suite new mine.json -t Default -t HardSparse --instances 5
+
+      sme suite new more.json --suite smoke -t Complexity50
+    """,
+)
+
+
+@app.command("new")
 @with_options(ClassOptions)
-def suite(
+def new(
     path: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)],
     options: ClassOptions,
     name: Annotated[str | None, typer.Option(help="By default the file's name.")] = None,
@@ -28,14 +52,15 @@ def suite(
 
     A class is one setting under several seeds, so that a method is judged on a kind of task and not
     on one draw. Studies, leaderboards and --suite accept the file like the name of a suite.
+    `sme suite FILE` is short for `sme suite new FILE`.
 
     Examples:
 
-      sme suite mine.json -t Default -t HardSparse -t k2.json --instances 5
+      sme suite new mine.json -t Default -t HardSparse -t k2.json --instances 5
 
-      sme suite intervals.json -t Default --sweep k=1,5,25 --instances 3
+      sme suite new intervals.json -t Default --sweep k=1,5,25 --instances 3
 
-      sme suite more.json --suite smoke -t Complexity50
+      sme suite new more.json --suite smoke -t Complexity50
     """
     check_document_path(path, force=force)
     members = Suite(classes=options.classes())
@@ -46,5 +71,5 @@ def suite(
     classes = plural(len(members.classes), "class", "classes")
     tasks = f"{classes}, {plural(len(members.instances), 'instance')}"
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
-    hint = f"{tasks}. To run an algorithm on them: sme study new plan.json --suite {path} -a PPO"
+    hint = f"{tasks}. To train an algorithm on them: sme train --suite {path} -a PPO"
     err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)

@@ -8,22 +8,32 @@ from typing import Annotated, Any, cast
 import typer
 
 from sme_registry import load
-from sme_registry.cli.arguments import (
-    Force,
-    Json,
-    Out,
-    Protocol,
-    TaskName,
-    changes,
-)
+from sme_registry.cli.arguments import Force, Json, Out, Protocol, changes
 from sme_registry.cli.files import print_training
+from sme_registry.cli.study_plan import Jobs
+from sme_registry.cli.train_suite import refuse_fields, refuse_without_suite, train_suite
 from sme_registry.errors import OptionError
-from sme_registry.spec import SMESpec
+from sme_registry.spec import EnvFile, SMESpec, SuiteFile, catalogue
 from sme_registry.terminal import err
 
 
 def train(
-    task: TaskName,
+    context: typer.Context,
+    task: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="TASK",
+            help="The task: a name, a path or a digest.",
+            autocompletion=catalogue.completion(EnvFile),
+        ),
+    ] = None,
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Instead of a TASK: train on every instance of a suite, by its name or path.",
+            autocompletion=catalogue.completion(SuiteFile),
+        ),
+    ] = None,
     algorithm: Annotated[
         str | None,
         typer.Option(
@@ -37,6 +47,14 @@ def train(
         int, typer.Option("--steps", "-n", help="Environment steps; for a team, of the team.")
     ] = 20_000,
     seed: Annotated[int, typer.Option(help="Seed of the algorithm and of the start states.")] = 0,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            help="With --suite: runs on each class, in turn on its instances. Default 10, or more "
+            "for equally many on each instance."
+        ),
+    ] = None,
+    jobs: Jobs = None,
     out_folder: Out = None,
     action_range: Annotated[
         str, typer.Option(help="Action space: symmetric, [-1, 1], or unit, [0, 1].")
@@ -95,6 +113,10 @@ def train(
     as regret/agent_0. A step is one step of the whole team, so a shared policy sees as many
     transitions per step as there are agents, and TensorBoard's axis counts those transitions.
 
+    --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
+    runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
+    `report` read it, and `sme-leaderboard new --runs` makes a submission of it.
+
     --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
     hyperparameters and step count. The result differs from an uninterrupted run: random streams get
     new seeds, and unfinished episodes start again.
@@ -112,10 +134,32 @@ def train(
       sme train Team4 --steps 40000
 
       sme train Team4 --independent --steps 40000
+
+      sme train --suite mine.json -a PPO --out runs/mine
     """
     from sme_registry import training
 
     overrides, settings = _split(changes(set_), hyperparameters)
+    if suite is not None:
+        refuse_fields(overrides)
+        train_suite(
+            context,
+            suite,
+            algorithm=algorithm,
+            steps=steps,
+            seeds=seeds,
+            folder=out_folder,
+            action_range=action_range,
+            independent=independent,
+            protocol=protocol,
+            hyperparameters=settings,
+            jobs=jobs,
+            json=json,
+        )
+        return
+    refuse_without_suite(context)
+    if task is None:
+        raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
     spec = load(task).derive(**overrides)
     algorithm = training.full_name(algorithm or training.default_algorithm(spec))
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)

@@ -1,0 +1,133 @@
+"""`sme train --suite`: train one algorithm on every instance of a suite, as a study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.markup import escape
+
+from sme_registry.cli.arguments import find_file
+from sme_registry.errors import OptionError
+from sme_registry.io import integer_in
+from sme_registry.spec import StudyFile, Suite, SuiteFile
+from sme_registry.terminal import err
+
+RUNS = 10
+"""Runs on each class by default: those that a leaderboard requires for a rank."""
+
+_EVALUATIONS = 10  # of a run, for the learning curves of `sme study report`
+_NOT_WITH_SUITE = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force")
+
+
+def train_suite(
+    context: typer.Context,
+    suite: str,
+    *,
+    algorithm: str | None,
+    steps: int,
+    seeds: int | None,
+    folder: Path | None,
+    action_range: str,
+    independent: bool,
+    protocol: str,
+    hyperparameters: dict[str, Any],
+    jobs: int | None,
+    json: bool,
+) -> None:
+    """Train on every instance of a suite and keep the models; the same call continues.
+
+    Args:
+      context: of the command, to refuse its options for a single task.
+      suite: name or path of the suite.
+      algorithm: as in `sme train`; None for the default of the suite's first task.
+      steps: of each run.
+      seeds: runs on each class; None for `RUNS`, rounded up so that all instances of a class have
+        equally many.
+      folder: of the study; None for runs/SUITE-ALGORITHM.
+      action_range: "symmetric" or "unit".
+      independent: one model for each agent of a team.
+      protocol: name or path of the protocol of the evaluation after each run.
+      hyperparameters: where they differ from the algorithm's defaults.
+      jobs: runs at once; None for one per core.
+      json: print JSON.
+
+    Raises:
+      OptionError: an option is for a single task, or invalid.
+      Exit: a run failed; the exit code is 1.
+    """
+    from sme_registry import training
+    from sme_registry.cli.study import print_status
+    from sme_registry.evaluation import resolve_protocol
+    from sme_registry.spec.study import INDEPENDENT, StudyPlan
+    from sme_registry.studies.engine.runner import run_study
+
+    _refuse_options(context, _NOT_WITH_SUITE, "is for a single task. Leave it out, or --suite")
+    file = find_file(SuiteFile, suite)
+    uses = training.full_name(algorithm or training.default_algorithm(file.suite.instances[0]))
+    name = training.short_name(uses)
+    if folder is None:
+        folder = Path("runs") / f"{file.name}-{'independent-' * independent}{name}"
+    plan = StudyPlan.from_dict(
+        {
+            "classes": [member.to_dict() for member in file.suite.classes],
+            "algorithms": [
+                {
+                    "name": name,
+                    "uses": f"{INDEPENDENT}{uses}" if independent else uses,
+                    "hyperparameters": hyperparameters,
+                    "action_range": action_range,
+                }
+            ],
+            "seeds": equal_runs(file.suite) if seeds is None else integer_in("seeds", seeds, 1),
+            "steps": steps,
+            "evaluations": _EVALUATIONS,
+            "protocol": resolve_protocol(protocol).to_dict(),
+        },
+        "options",
+    )
+    study = StudyFile(name=file.name, digest=plan.digest, plan=plan)
+    status = run_study(study, folder, jobs=jobs, keep_models=True, console=err())
+    print_status(status, json)
+    if status.failed:
+        raise typer.Exit(1)
+    if not json:
+        hint = f"To submit them: sme-leaderboard new BUNDLE --suite {suite} --runs {folder}"
+        err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)
+
+
+def equal_runs(suite: Suite) -> int:
+    """At least `RUNS` on each class, and equally many on each instance of the largest class."""
+    return max(-(-RUNS // len(one.seeds)) * len(one.seeds) for one in suite.classes)
+
+
+def refuse_without_suite(context: typer.Context) -> None:
+    """Check that no option is given that only --suite has.
+
+    Raises:
+      OptionError: there is one.
+    """
+    _refuse_options(context, ("seeds", "jobs"), "is for --suite. Add --suite, or leave it out")
+
+
+def refuse_fields(fields: dict[str, Any]) -> None:
+    """Check that no option changes a field of the suite's tasks.
+
+    Raises:
+      OptionError: one does.
+    """
+    for name in fields:
+        raise OptionError(
+            f"--set {name}: is a field of the task, and the suite sets it. Write another suite "
+            f"with `sme suite new`, for example from `sme new task.json --set {name}=…`."
+        )
+
+
+def _refuse_options(context: typer.Context, names: tuple[str, ...], problem: str) -> None:
+    for name in names:
+        origin = context.get_parameter_source(name)
+        # By name: newer versions of Typer include their own Click.
+        if origin is not None and origin.name == "COMMANDLINE":
+            option = "TASK" if name == "task" else f"--{name.replace('_', '-')}"
+            raise OptionError(f"{option}: {problem}.")
