@@ -47,6 +47,7 @@ MINUTES_AHEAD = 10
 # ASCII only: a similar letter of another script would let one method imitate another.
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
+_LOOK_ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "5": "s"})
 # Control characters, format characters (some reverse the direction of text), surrogates,
 # line separators and paragraph separators.
 _UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -138,6 +139,17 @@ def check_text(field: str, text: str) -> None:
                 f"{field}: contains {letter!a}: must contain no control characters except line "
                 "breaks. Remove it.",
             )
+
+
+def skeleton(name: str) -> str:
+    """What is left of a name without the differences that readers overlook.
+
+    Case, spaces and punctuation do not matter, and letters and digits that look alike are one
+    letter, such as O and 0; l, I and 1; or m and rn. The result is for comparison only.
+    """
+    folded = unicodedata.normalize("NFKC", name).casefold()
+    letters = "".join(letter for letter in folded if letter.isalnum())
+    return letters.translate(_LOOK_ALIKE).replace("rn", "m").replace("vv", "w")
 
 
 def _folded(name: str) -> str:

@@ -3,9 +3,17 @@
     first = 1 + ranked entries whose interval lies wholly below
     last  = N − ranked entries whose interval lies wholly above
 
-Entries are ranked if they are scored with enough runs. By OOD decay, they must also have learned
-with certainty: the constant policy loses nothing outside, because it has learned nothing. The
-reference rows are listed among the others without a rank.
+Entries are ranked if they are scored with enough runs, are no copy of earlier entries of other
+keys, and are the latest of their key with their method's name and version, and with their
+policies. The reference rows are listed among the others without a rank.
+
+A decay below 0 is no merit, and one can be bought by acting worse inside the cube. Entries are
+therefore ranked by OOD decay only if they have learned with certainty, and by
+
+    max(0, D, D of every ranked entry that is at least as good in every region)
+
+so that no entry stands above one that beats it everywhere. Ties are in order of the mean
+normalised regret over all regions.
 """
 
 from __future__ import annotations
@@ -17,21 +25,32 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from leaderboard.documents.result import Metric, Scores
+from leaderboard.documents.checks import skeleton
+from leaderboard.documents.result import Estimate, Metric, Scores
 from leaderboard.errors import NotPublishable
 from leaderboard.store import EntryRow
 
-NotRanked = Literal["", "reference", "too_few_runs", "not_learned"]
+NotRanked = Literal["", "reference", "too_few_runs", "copy", "superseded", "not_learned"]
 
 REFERENCES = {"optimal": 0.0, "constant": 1.0}  # N_m of each reference row, by its method's name
 TOLERANCE = 1e-6
 LEARNED = 0.5  # the largest upper bound of N₀ of an entry ranked by OOD decay
+AS_GOOD = 0.02
+"""By how much N_m may be above another entry's and still count as at least as good.
+
+Scores are estimates on states that differ between policies: of two policies that act alike, each
+is better in some region by chance, by less than this on boards of 2,000 states in each region.
+"""
 
 REASONS: dict[str, str] = {
     "reference": "reference row",
-    "too_few_runs": "too few runs in a class",
+    "too_few_runs": "too few runs on an instance or in a class",
+    "copy": "at least half of its policies behave like those of earlier entries of other keys",
+    "superseded": "a later entry of its key has its method and version, or its policies",
     "not_learned": f"WD regret not certainly below {LEARNED:g}",
 }
+_Numbers = npt.NDArray[np.float64]
+_BLOCK = 2**18  # pairs of entries compared at once, few enough for a processor cache
 
 
 @dataclass(frozen=True)
@@ -42,12 +61,14 @@ class RankedRow:
       entry: the entry; its scores are never null here.
       first, last: the best and the worst rank that the intervals allow; None if not ranked.
       reason: why it is not ranked, a key of `REASONS`; empty if it is.
+      value: what it is ordered by: its score, or for the decay what the head of this module says.
     """
 
     entry: EntryRow
     first: int | None
     last: int | None
     reason: NotRanked
+    value: Estimate
 
     @property
     def ranks(self) -> str:
@@ -60,23 +81,92 @@ class RankedRow:
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
     """Every scored entry that is not withdrawn, ordered by its score, the best first.
 
-    Lower is better in every metric; equal scores are in order of submission.
+    Lower is better in every metric; equal scores are in order of submission, equal decays in that
+    of the mean regret over all regions.
     """
+    history = superseded(entries)
     scored = [
-        (getattr(entry.scores, metric), entry, _reason(entry, entry.scores, metric))
-        for entry in entries
+        (entry, entry.scores, _reason(entry, entry.scores, metric, history))
+        for entry in sorted(entries, key=lambda entry: entry.sequence)
         if entry.status == "scored" and entry.scores is not None
     ]
-    scored.sort(key=lambda row: (row[0].value, row[1].sequence))
-    ranked = [estimate for estimate, _, reason in scored if not reason]
-    ends = np.array([each.ends for each in ranked]).reshape(-1, 2)
-    first, last = rank_ranges(ends[:, 0], ends[:, 1])
-    ranges = zip(first.tolist(), last.tolist(), strict=True)
+    ends = np.array(
+        [(getattr(scores, metric).value, *getattr(scores, metric).ends) for _, scores, _ in scored]
+    ).reshape(-1, 3)
+    ranked = np.array([not reason for *_, reason in scored], dtype=bool)
+    level = np.zeros(len(scored))
+    if metric == "ood_decay":
+        regions = _regret([scores for _, scores, _ in scored])
+        ends = np.maximum(ends, 0.0)
+        ends[ranked] = not_above_the_better(ends[ranked], regions[ranked])
+        level = regions.mean(axis=1)
+    first, last = np.zeros((2, len(scored)), dtype=np.int64)
+    first[ranked], last[ranked] = rank_ranges(ends[ranked, 1], ends[ranked, 2])
     rows = []
-    for _, entry, reason in scored:
-        best, worst = (None, None) if reason else next(ranges)
-        rows.append(RankedRow(entry, best, worst, reason))
+    for i in np.lexsort((level, ends[:, 0])):
+        entry, scores, reason = scored[i]
+        best, worst = (None, None) if reason else (int(first[i]), int(last[i]))
+        value, low, high = ends[i].tolist()
+        if getattr(scores, metric).interval is None:
+            low = high = None
+        rows.append(
+            RankedRow(entry, best, worst, reason, Estimate(value=value, low=low, high=high))
+        )
     return rows
+
+
+def superseded(entries: list[EntryRow]) -> set[str]:
+    """Ids of the entries that are history: their key has a later one like them.
+
+    Like them is one with the same method name and version, up to look-alike spelling, or with the
+    same policies. Only an entry that can be ranked supersedes others.
+    """
+    latest: set[tuple[str, ...]] = set()
+    history = set()
+    for entry in sorted(entries, key=lambda entry: -entry.sequence):
+        if entry.status != "scored" or _own_reason(entry):
+            continue
+        alike = {
+            (entry.key, "method", skeleton(entry.method), *map(skeleton, entry.version.split("."))),
+            (entry.key, "policies", entry.origin),
+        }
+        if alike & latest:
+            history.add(entry.id)
+        else:
+            latest |= alike
+    return history
+
+
+def not_above_the_better(decay: _Numbers, regret: _Numbers) -> _Numbers:
+    """Decays lifted to those of the entries that are at least as good in every region.
+
+    Args:
+      decay: `[N, K]` value and interval ends of N entries, at least 0.
+      regret: `[N, M + 1]` N_m of each region; another entry's is at least as good if it is below
+        or at most `AS_GOOD` above.
+
+    Returns:
+      `[N, K]`: of each column the largest number among the entry's own and those of the entries
+      that are at least as good in every region. In O(N² M), 0.3 s for 5,000 entries.
+    """
+    lifted = decay.copy()
+    orders = np.argsort(-decay, axis=0, kind="stable")  # the largest first
+    rows = max(1, _BLOCK // max(1, len(decay)))
+    for start in range(0, len(decay), rows):
+        block = slice(start, start + rows)
+        better = np.ones((len(decay[block]), len(decay)), dtype=bool)
+        for N in regret.T:
+            better &= N[None, :] <= N[block, None] + AS_GOOD
+        for column, order in enumerate(orders.T):
+            largest = better[:, order].argmax(axis=1)  # each entry is as good as itself
+            lifted[block, column] = decay[order[largest], column]
+    return lifted
+
+
+def _regret(scores: list[Scores]) -> _Numbers:
+    """`[N, M + 1]` N_m of each entry and region, WD first."""
+    rows = [[each.value for each in one.normalised_regret] for one in scores]
+    return np.array(rows).reshape(len(rows), -1)
 
 
 def rank_ranges(
@@ -144,11 +234,21 @@ def _known_scores(scores: Scores, regret: float) -> Iterator[tuple[str, float, f
     yield "regret_slope", scores.regret_slope.value, 0.0
 
 
-def _reason(entry: EntryRow, scores: Scores, metric: Metric) -> NotRanked:
+def _own_reason(entry: EntryRow) -> NotRanked:
+    """Why a scored entry has no rank by any metric, whatever later entries there are."""
     if entry.reference:
         return "reference"
     if not entry.enough_runs:
         return "too_few_runs"
+    return "copy" if entry.is_copy else ""
+
+
+def _reason(entry: EntryRow, scores: Scores, metric: Metric, history: set[str]) -> NotRanked:
+    reason = _own_reason(entry)
+    if reason:
+        return reason
+    if entry.id in history:
+        return "superseded"
     if metric == "ood_decay" and scores.wd_regret.ends[1] > LEARNED:
         return "not_learned"
     return ""

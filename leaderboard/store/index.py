@@ -46,7 +46,7 @@ CREATE TABLE entry (
   status TEXT NOT NULL DEFAULT 'waiting', code TEXT NOT NULL DEFAULT '',
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
-  runs INTEGER NOT NULL, steps INTEGER NOT NULL,
+  runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL,
   enough_runs INTEGER NOT NULL DEFAULT 0, oracle_like INTEGER NOT NULL DEFAULT 0,
   reference INTEGER NOT NULL, scores TEXT
 ) STRICT, WITHOUT ROWID;
@@ -75,6 +75,20 @@ class IndexUnusable(Exception):
 
 
 @dataclass(frozen=True)
+class Likeness:
+    """An earlier submission whose policies some runs of a submission behave like.
+
+    Attributes:
+      id, key: of the earlier submission; of several, a run counts for the earliest.
+      runs: number of such runs.
+    """
+
+    id: str
+    key: str
+    runs: int
+
+
+@dataclass(frozen=True)
 class EntryRow:
     """One submission, as pages and ranking need it.
 
@@ -88,6 +102,9 @@ class EntryRow:
       steps: environment steps of all runs.
       reference: whether it is one of the board's own rows, "optimal" and "constant".
       scores: None if it was not scored.
+      policies: number of runs with a policy.
+      alike: earlier submissions with policies like this one's, the board's own rows excluded; empty
+        before scoring and on boards of rules 1.
     """
 
     id: str
@@ -108,6 +125,30 @@ class EntryRow:
     oracle_like: bool
     reference: bool
     scores: Scores | None
+    policies: int = 0
+    alike: tuple[Likeness, ...] = ()
+
+    @property
+    def copy_of(self) -> tuple[Likeness, ...]:
+        """Earlier submissions of other keys, the one with the most runs first."""
+        others = (each for each in self.alike if each.key != self.key)
+        return tuple(sorted(others, key=lambda each: -each.runs))
+
+    @property
+    def copied_runs(self) -> int:
+        """Number of runs that behave like runs of earlier submissions of other keys."""
+        return sum(each.runs for each in self.copy_of)
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether at least half of its policies are copied, and so it has no rank."""
+        return self.copied_runs > 0 and 2 * self.copied_runs >= self.policies
+
+    @property
+    def origin(self) -> str:
+        """The id of the submission that first had at least half of its policies; mostly its own."""
+        first = max(self.alike, key=lambda each: each.runs, default=None)
+        return self.id if first is None or 2 * first.runs < self.policies else first.id
 
     @property
     def steps_per_run(self) -> int:
@@ -115,7 +156,7 @@ class EntryRow:
         return round(self.steps / max(1, self.runs))
 
 
-_COLUMNS = tuple(field.name for field in fields(EntryRow))
+_COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
 _ROW = ", ".join(_COLUMNS)
 
 
@@ -225,6 +266,7 @@ class Index:
             "key": submitter.key,
             "code_link": submission.code,
             "runs": len(submission.runs),
+            "policies": sum(run.artefact is not None for run in submission.runs),
             "steps": sum(run.steps for run in submission.runs),
             "reference": submitter.key == self.document.key and method.family == "reference",
         }

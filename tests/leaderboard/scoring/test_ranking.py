@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from leaderboard.documents.board import BoardDocument
@@ -18,8 +19,9 @@ from leaderboard.exports import to_csv, to_json, to_latex
 from leaderboard.scoring.ranking import (
     ranking,
     refuse_unpublishable,
+    superseded,
 )
-from leaderboard.store import EntryRow
+from leaderboard.store import EntryRow, Likeness
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
 
@@ -150,6 +152,142 @@ def test_entries_that_may_not_have_learned_have_no_rank_by_ood_decay() -> None:
     assert [row.first for row in ranking([unsure, sure], "wd_regret")] == [1, 1]
 
 
+# By decay, sabotage inside the cube wins nothing
+
+
+def by_decay(*entries: EntryRow) -> list[tuple[int, int | None, int | None]]:
+    rows = ranking(list(entries), "ood_decay")
+    return [(row.entry.sequence, row.first, row.last) for row in rows]
+
+
+def test_a_policy_made_worse_inside_the_cube_stays_below_the_original() -> None:
+    original = entry(3, scores(0.1, 0.3, 0.01))
+    sabotaged = entry(4, scores(0.44, 0.3, 0.01))  # decay −0.14
+
+    assert by_decay(original, sabotaged) == [(3, 1, 2), (4, 1, 2)]
+    row = ranking([original, sabotaged], "ood_decay")[1]
+    assert (row.value.value, row.value.low) == pytest.approx((0.2, 0.19))
+    assert sabotaged.scores is not None
+    assert sabotaged.scores.ood_decay.value == pytest.approx(-0.14)  # as scored
+
+
+def test_a_sabotaged_policy_does_not_win_by_luck_in_the_states_of_some_regions() -> None:
+    original = entry(3, scores(0.1, 0.3, 0.01))
+    sabotaged = entry(4, scores(0.44, 0.299, 0.01))
+
+    assert by_decay(original, sabotaged) == [(3, 1, 2), (4, 1, 2)]
+
+
+def test_a_decay_below_zero_is_worth_no_more_than_none() -> None:
+    negative, flat = entry(3, scores(0.3, 0.2, 0.01)), entry(4, scores(0.15, 0.15, 0.01))
+    optimal = entry(5, scores(0.0, 0.0, 0.0))
+
+    assert by_decay(negative, flat, optimal) == [(5, 1, 3), (4, 1, 3), (3, 1, 3)]
+
+
+def test_an_entry_without_a_rank_holds_nobody_down() -> None:
+    better = entry(3, scores(0.1, 0.3, 0.01), enough_runs=False)
+    worse, other = entry(4, scores(0.4, 0.35, 0.01)), entry(5, scores(0.1, 0.2, 0.01))
+
+    assert by_decay(better, worse) == [(4, 1, 1), (3, None, None)]
+    assert by_decay(better, worse, other) == [(5, 1, 2), (4, 1, 2), (3, None, None)]
+
+
+def test_an_honest_entry_that_is_better_outside_keeps_its_decay() -> None:
+    steep = entry(3, scores(0.1, 0.4, 0.01))
+    flat = entry(4, scores(0.2, 0.3, 0.01))  # better in every outer region
+
+    assert by_decay(steep, flat) == [(4, 1, 1), (3, 2, 2)]
+
+
+def test_no_entry_stands_above_one_that_is_better_in_every_region() -> None:
+    rng = random.Random(1)
+    entries = [entry(i, scores(rng.random() / 3, rng.random(), 0.01)) for i in range(3, 200)]
+
+    rows = ranking(entries, "ood_decay")
+
+    regrets = np.array([[e.value for e in row.entry.scores.normalised_regret] for row in rows])
+    for i, row in enumerate(rows):
+        better = (regrets <= regrets[i]).all(axis=1) & (regrets < regrets[i]).any(axis=1)
+        assert better[i:].sum() == 0
+        for j in np.flatnonzero(better):
+            assert (rows[j].first, rows[j].last) <= (row.first, row.last)
+
+
+# One row of a key's method, and none for copies
+
+
+def test_the_latest_entry_of_a_key_with_the_same_method_and_version_is_ranked() -> None:
+    first = entry(3, scores(0.1, 0.2), method="PPO", version="1")
+    again = entry(4, scores(0.2, 0.3), method="pp0", version="1")
+    other_version = entry(5, scores(0.3, 0.3), method="PPO", version="2")
+    other_key = entry(6, scores(0.4, 0.3), method="PPO", version="1", key="1" * 64)
+    entries = [first, again, other_version, other_key]
+
+    assert reasons(*entries) == {3: "superseded", 4: "", 5: "", 6: ""}
+    withdrawn = replace(again, status="withdrawn")
+    assert reasons(first, withdrawn, other_version, other_key) == {3: "", 5: "", 6: ""}
+    few = replace(again, enough_runs=False)
+    assert reasons(first, few) == {3: "", 4: "too_few_runs"}
+    assert first.id not in superseded([other_version, first])
+
+
+@pytest.mark.parametrize(("one", "other"), [("1.0", "10"), ("1", "2"), ("1.2", "1.3")])
+def test_versions_that_differ_are_versions(one: str, other: str) -> None:
+    entries = [
+        entry(i, scores(0.1, 0.2), method="A", version=v) for i, v in enumerate((one, other))
+    ]
+
+    assert set(reasons(*entries).values()) == {""}
+
+
+def test_twenty_versions_of_the_same_policies_are_one_row() -> None:
+    first = entry(3, scores(0.1, 0.2), policies=10)
+    others = [
+        entry(i, scores(0.1, 0.2), policies=10, alike=(Likeness(first.id, first.key, 10),))
+        for i in range(4, 23)
+    ]
+
+    found = reasons(first, *others)
+
+    assert found == {**dict.fromkeys(range(3, 22), "superseded"), 22: ""}
+
+
+def test_a_copy_of_another_key_has_no_rank_and_pushes_nobody_down() -> None:
+    original = entry(3, scores(0.2, 0.3), policies=10)
+    own = entry(5, scores(0.4, 0.5), key="2" * 64, policies=10)
+
+    def thief(copied: int) -> EntryRow:
+        alike = (Likeness(original.id, original.key, copied),)
+        return entry(4, scores(0.1, 0.2), key="1" * 64, policies=10, alike=alike)
+
+    assert reasons(original, thief(5), own) == {3: "", 4: "copy", 5: ""}
+    assert reasons(original, thief(4), own) == {3: "", 4: "", 5: ""}
+    assert thief(4).copied_runs == 4
+    rows = {row.entry.sequence: row for row in ranking([original, thief(10), own], "wd_regret")}
+    assert (rows[3].first, rows[5].first) == (1, 2)
+
+
+def test_runs_taken_from_several_entries_count_together() -> None:
+    entries = [entry(i, scores(0.2, 0.3), key=str(i) * 64, policies=10) for i in (3, 4)]
+    alike = tuple(Likeness(each.id, each.key, 3) for each in entries)
+    mixed = entry(5, scores(0.1, 0.2), key="5" * 64, policies=10, alike=alike)
+
+    assert reasons(*entries, mixed)[5] == "copy"
+
+
+def test_a_copy_supersedes_no_entry_of_its_key() -> None:
+    stolen = (Likeness("sha256:" + "e" * 64, "9" * 64, 10),)
+    own = entry(3, scores(0.2, 0.3), method="A")
+    copy = entry(4, scores(0.1, 0.2), method="A", policies=10, alike=stolen)
+
+    assert reasons(own, copy) == {3: "", 4: "copy"}
+
+
+def reasons(*entries: EntryRow) -> dict[int, str]:
+    return {row.entry.sequence: row.reason for row in ranking(list(entries), "wd_regret")}
+
+
 def test_only_scored_entries_are_listed() -> None:
     entries = [
         entry(3, status="waiting"),
@@ -160,21 +298,22 @@ def test_only_scored_entries_are_listed() -> None:
     assert ranking(entries, "wd_regret") == []
 
 
+@pytest.mark.parametrize("metric", ["wd_regret", "ood_decay"])
 def test_a_thousand_entries_are_ranked_in_less_than_50_ms(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], metric: Any
 ) -> None:
     rng = random.Random(0)
-    entries = [entry(index, scores(rng.random(), rng.random())) for index in range(1000)]
+    entries = [entry(index, scores(rng.random() / 3, rng.random())) for index in range(1000)]
 
     def seconds() -> float:
         start = time.process_time()
-        assert len(ranking(entries, "wd_regret")) == 1000
+        assert len(ranking(entries, metric)) == 1000
         return time.process_time() - start
 
     best = min(seconds() for _ in range(5))
 
     with capsys.disabled():
-        print(f"\nranking 1,000 entries: {1000 * best:.1f} ms")
+        print(f"\nranking 1,000 entries by {metric}: {1000 * best:.1f} ms")
     assert best < 0.05
 
 
