@@ -114,6 +114,8 @@ def score(
 
     Several of these commands may run at once, and each may be killed at any point. Every policy
     runs in its own sandboxed process, without your files and with limits on time and memory.
+    Submissions that cannot be scored because of a fault of the machine keep waiting and are listed
+    at the end, with exit code 1.
 
     Examples:
 
@@ -131,14 +133,25 @@ def score(
         return
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
         run_scorers(board, workers, progress=progress.update_of)
-    with Store.open(board, read_only=True) as store:
-        counts = Counter(entry.status for entry in store.entries() if entry.id not in before)
+    with Store.open(board) as store:
+        entries = store.entries()
+    counts = Counter(entry.status for entry in entries if entry.id not in before)
     parts = [
         f"{counts[status]} {status}"
         for status in ("scored", "rejected", "waiting", "withdrawn")
         if counts[status]
     ]
     out().print(f"{', '.join(parts)}." + (f" Done before: {len(before)}." if before else ""))
+    faulty = [entry for entry in entries if entry.status == "waiting" and entry.faults]
+    for entry in faulty:
+        times = templates.plural(entry.faults, "attempt")
+        err().print(
+            f"{entry.id} ({entry.method}) keeps waiting after {times}: {entry.fault}",
+            soft_wrap=True,
+            markup=False,
+        )
+    if faulty:
+        raise typer.Exit(1)
 
 
 def site(

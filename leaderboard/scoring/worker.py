@@ -1,7 +1,7 @@
 """Scorers: processes that claim waiting submissions, score them and write the results.
 
 A scorer may be killed at any point: another one claims its submission again, and if it was only
-slow, its late result is rejected.
+slow, its late result is rejected. A fault of the machine postpones the submission; others go on.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.documents.result import Result
+from leaderboard.errors import BoardError
 from leaderboard.scoring.score import Progress, score_submission
 from leaderboard.store import LEASE_SECONDS, Claim, Store
 from sme_registry.errors import MissingDependencyError, SMEError
@@ -36,7 +37,10 @@ from sme_registry.terminal.interrupts import (
 
 _POLL_SECONDS = 0.2
 _STOP_SECONDS = 10.0
-_FUTILE_DEATHS = 5  # of processes, for each worker, with no submission finished in between
+_FUTILE_DEATHS = 5  # of processes, for each worker, that claimed nothing
+_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0  # seconds, where every further process would fail
+# How long a scorer keeps a result that cannot be written: a command reports it, a server waits.
+_UNWRITTEN_SECONDS, _UNWRITTEN_SECONDS_SERVED = 30.0, 3600.0
 _log = logging.getLogger(__name__)
 
 
@@ -53,8 +57,12 @@ def run_scorer(
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
     lease_seconds: float = LEASE_SECONDS,
+    retry: bool = True,
 ) -> int:
     """Score in this process, one submission after another.
+
+    A submission that cannot be scored because of a fault (no memory, an altered file, a sandbox
+    that does not start) waits, with the fault in its `EntryRow`.
 
     Args:
       path: the board's folder.
@@ -63,22 +71,29 @@ def run_scorer(
       progress: called while a submission is scored, with the states done and the states in all.
       stop: called between two submissions; True ends the scorer.
       lease_seconds: how long a claim outlives its scorer.
+      retry: whether submissions that earlier faults have postponed are tried at once.
 
     Returns:
       The number of results written.
 
     Raises:
-      BoardError: the board is not writable, an artefact is missing, or a reference row cannot be
-        scored.
-      TamperedError: a file of the board differs from the logged one.
+      BoardError: the board cannot be written to; a result is kept for a while before that.
+      MissingDependencyError: onnxruntime is not installed.
+      TamperedError: the log was altered.
     """
     worker = worker_name() if worker is None else worker
+    patience = _UNWRITTEN_SECONDS if until_empty else _UNWRITTEN_SECONDS_SERVED
+    stop = stop or (lambda: False)
     written = 0
     with Store.open(path) as store:
-        while not (stop and stop()):
+        if retry:
+            store.queue.retry()
+        while not stop():
             claim = store.queue.claim(worker, seconds=lease_seconds)
             if claim is not None:
-                written += _score(store, claim, progress)
+                with _heartbeats(store, claim):
+                    result = _score(store, claim, progress)
+                    written += result is not None and _finish(store, claim, result, patience, stop)
             elif until_empty:
                 break
             else:
@@ -86,30 +101,44 @@ def run_scorer(
     return written
 
 
-def _score(store: Store, claim: Claim, progress: Progress | None) -> bool:
-    """Score a claimed submission; return whether the claim was still current."""
+def _score(store: Store, claim: Claim, progress: Progress | None) -> Result | None:
+    """Score a claimed submission; None after a fault, which postpones it."""
     try:
-        with _heartbeats(store, claim):
-            submission = store.submission(claim.id).submission
-            result = score_submission(store.document, submission, store.objects.read, progress)
-    except (TamperedError, MissingDependencyError, KeyboardInterrupt):
-        store.queue.release(claim)  # not the submission's fault
-        raise
-    except BoardError:
-        # The machine's fault, or the effect of the policy on it: the claim counts as lost.
-        store.queue.abandon(claim.worker)
+        submission = store.submission(claim.id).submission
+        return score_submission(store.document, submission, store.objects.read, progress)
+    except (MissingDependencyError, KeyboardInterrupt):
+        store.queue.release(claim)
         raise
     except Exception as error:
-        _log.exception("%s: attempt %d failed", claim.id, claim.attempt)
-        store.queue.abandon(claim.worker)
-        entry = store.entry(claim.id)
-        if entry is not None and entry.reference:  # never rejected
-            raise BoardError(
-                f"reference row {entry.method!r}: cannot be scored on this machine: "
-                f"{type(error).__name__}: {error}. It keeps waiting: fix the fault and score again."
-            ) from error
-        return False
-    return store.queue.finish(claim, result)
+        _log.warning("%s: attempt %d: %r", claim.id, claim.attempt, error, exc_info=True)
+        text = str(error) if isinstance(error, SMEError) else f"{type(error).__name__}: {error}"
+        store.queue.fault(claim, text)
+        return None
+
+
+def _finish(
+    store: Store, claim: Claim, result: Result, patience: float, stop: Callable[[], bool]
+) -> bool:
+    """Write a result, and keep trying for so many seconds, for example while the disk is full.
+
+    Returns:
+      Whether the claim was still current.
+
+    Raises:
+      BoardError: it cannot be written; the claim is returned without a fault.
+    """
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            return store.queue.finish(claim, result)
+        except (BoardError, KeyboardInterrupt) as error:
+            is_last = time.monotonic() >= deadline or stop()
+            if isinstance(error, KeyboardInterrupt) or is_last:
+                with contextlib.suppress(BoardError):
+                    store.queue.release(claim)
+                raise
+            _log.warning("%s: its result waits: %s", claim.id, error)
+        time.sleep(_POLL_SECONDS)
 
 
 @contextlib.contextmanager
@@ -119,7 +148,7 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
 
     def beat() -> None:
         while not done.wait(claim.seconds / 4):
-            with contextlib.suppress(BoardError):  # a full disk may have room the next time
+            with contextlib.suppress(SMEError):  # a full disk may have room the next time
                 if not store.queue.heartbeat(claim):
                     return
 
@@ -136,7 +165,8 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
 def background_scorers(path: str | Path, workers: int) -> Iterator[None]:
     """Run scorer processes while the block runs, watched by a thread; 0 workers run none.
 
-    An error that ends the scoring is logged.
+    Nothing but the end of the block ends the scoring: after an error it starts again, first after
+    a second, then after growing pauses of up to five minutes.
     """
     if not workers:
         yield
@@ -144,10 +174,17 @@ def background_scorers(path: str | Path, workers: int) -> Iterator[None]:
     stop = threading.Event()
 
     def score() -> None:
-        try:
-            run_scorers(path, workers, until_empty=False, stop=stop.is_set)
-        except SMEError as error:
-            _log.error("scoring has stopped: %s", error)
+        pause = _FIRST_PAUSE
+        while not stop.is_set():
+            begun = time.monotonic()
+            try:
+                run_scorers(path, workers, until_empty=False, stop=stop.is_set)
+            except Exception as error:
+                if time.monotonic() - begun > _LONGEST_PAUSE:
+                    pause = _FIRST_PAUSE
+                _log.exception("scoring starts again in %.0f s: %s", pause, error)
+                stop.wait(pause)
+                pause = min(2.0 * pause, _LONGEST_PAUSE)
 
     thread = threading.Thread(target=score, name="scorers", daemon=True)
     thread.start()
@@ -170,12 +207,15 @@ def run_scorers(
 ) -> int:
     """Score in several processes at once; one that dies is replaced and its submission rescored.
 
-    Ctrl-C stops all of them and releases their claims.
+    Submissions that earlier faults have postponed are tried at once. One that cannot be scored
+    keeps waiting, with the fault in its `EntryRow`. Ctrl-C stops all processes and releases their
+    claims.
 
     Args:
       path: the board's folder.
       workers: the largest number of processes.
-      until_empty: return when nothing waits, even for another process; otherwise wait for more.
+      until_empty: return when nothing can be scored any more, even by another process; otherwise
+        wait for more, and replace processes that die as long as it takes, after growing pauses.
       progress: called with the submissions done since the start, and these plus those that wait.
       stop: called a few times a second; True ends the scoring.
       started: called with the process id of each new process.
@@ -186,19 +226,21 @@ def run_scorers(
 
     Raises:
       OptionError: `workers` is below 1.
-      BoardError: the board is not writable, or the processes die one after another and finish
-        nothing.
-      TamperedError: a file of the board differs from the logged one.
+      BoardError: the board cannot be written to, or (`until_empty`) the processes die one after
+        another and claim nothing.
+      MissingDependencyError: onnxruntime is not installed.
+      TamperedError: the log was altered.
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with Store.open(path) as store:
         scorers = _Scorers(path, store, workers, until_empty, lease_seconds)
         before, done = store.queue.done(), 0
+        store.queue.retry()
         try:
-            while (waiting := store.queue.waiting()) or not until_empty:
+            while not until_empty or scorers.are_needed():
                 if stop and stop():
                     break
-                for pid in scorers.fill(waiting):
+                for pid in scorers.fill():
                     if started is not None:
                         started(pid)
                 scorers.watch()
@@ -227,17 +269,28 @@ class _Scorers:
         self._path, self._store, self._workers = path, store, workers
         self._until_empty, self._lease_seconds = until_empty, lease_seconds
         self._running: dict[str, _Scorer] = {}
-        self._futile_deaths, self._finished = 0, self._count_finished()
+        self._futile_deaths, self._done = 0, store.queue.done()
+        self._paused_until, self._stopping = 0.0, False
 
-    def fill(self, waiting: int) -> Iterator[int]:
+    def are_needed(self) -> bool:
+        """Whether a submission can be claimed, or is claimed, by a process of any command."""
+        queue = self._store.queue
+        return bool(queue.claimable() or queue.claimed())
+
+    def fill(self) -> Iterator[int]:
         """Start processes up to the number of workers, or of submissions that can be claimed.
 
         Yields:
           The process id of each.
         """
-        while len(self._running) < self._workers and (
-            not self._until_empty
-            or (len(self._running) < waiting and self._store.queue.claimable())
+        queue = self._store.queue
+        while (
+            len(self._running) < self._workers
+            and time.monotonic() >= self._paused_until
+            and (
+                not self._until_empty
+                or (len(self._running) < queue.waiting() and queue.claimable())
+            )
         ):
             name = worker_name()
             with defer_interrupts(), block_interrupts():  # until the process is in `_running`
@@ -261,23 +314,30 @@ class _Scorers:
         """Wait a moment, and remove the processes that have ended.
 
         Raises:
-          BoardError, TamperedError: every further process would fail as these have.
+          SMEError: (`until_empty`) every further process would fail as these have.
         """
         sentinels = [scorer.process.sentinel for scorer in self._running.values()]
         connection.wait(sentinels, _POLL_SECONDS)
         deaths, error = self._remove_ended()
-        if isinstance(error, (TamperedError, MissingDependencyError)):
+        if error is not None and self._until_empty:
             raise error
-        previously, self._finished = self._finished, self._count_finished()
-        self._futile_deaths = 0 if self._finished > previously else self._futile_deaths + deaths
-        if self._futile_deaths >= _FUTILE_DEATHS * self._workers:
-            raise error or BoardError(
-                f"{self._path}: {self._futile_deaths} scorers died and finished nothing. "
+        previously, self._done = self._done, self._store.queue.done()
+        self._futile_deaths = 0 if self._done > previously else self._futile_deaths + deaths
+        excess = self._futile_deaths - _FUTILE_DEATHS * self._workers
+        if not deaths or excess < 0:
+            return
+        if self._until_empty:
+            raise BoardError(
+                f"{self._path}: {self._futile_deaths} scorers died and claimed nothing. "
                 "Check the system's log for the cause, such as a lack of memory."
             )
+        pause = min(_FIRST_PAUSE * 2.0 ** min(excess, 20), _LONGEST_PAUSE)
+        _log.error("%d scorers died; the next starts in %.0f s", self._futile_deaths, pause)
+        self._paused_until = time.monotonic() + pause
 
     def stop(self) -> None:
         """Interrupt all processes, and release their claims."""
+        self._stopping = True
         processes = [scorer.process for scorer in self._running.values()]
         for process in processes:
             if process.pid is not None:
@@ -290,15 +350,11 @@ class _Scorers:
                 process.join()
         self._remove_ended()
 
-    def _count_finished(self) -> int:
-        """Submissions done, without those rejected because scorers died."""
-        return self._store.queue.done() - self._store.queue.failed()
-
     def _remove_ended(self) -> tuple[int, SMEError | None]:
-        """Release the claims of ended processes at once.
+        """End the claims of ended processes at once.
 
         Returns:
-          The number that died or sent an error, and the last error.
+          The number that died, or sent an error, without a claim; and the last error.
         """
         deaths, last_error = 0, None
         for name, scorer in list(self._running.items()):
@@ -309,11 +365,13 @@ class _Scorers:
             with contextlib.suppress(EOFError), scorer.errors:
                 if scorer.errors.poll():
                     error = scorer.errors.recv()
-            if error is not None or scorer.process.exitcode != 0:
+            code = scorer.process.exitcode
+            fault = f"its scorer ended with status {code}" if code and not self._stopping else None
+            # Also if it exited normally: Ctrl-C may arrive just after it has claimed a submission.
+            had_claim = self._store.queue.abandon(name, fault)
+            if error is not None or (code != 0 and not had_claim):
                 deaths += 1
                 last_error = error or last_error
-            # Also if it exited normally: Ctrl-C may arrive just after it has claimed a submission.
-            self._store.queue.abandon(name)
             scorer.process.close()
             del self._running[name]
         return deaths, last_error
@@ -338,6 +396,7 @@ def _scorer_process(
             until_empty=until_empty,
             stop=lambda: parent is not None and not parent.is_alive(),
             lease_seconds=lease_seconds,
+            retry=False,
         )
     except KeyboardInterrupt:
         pass

@@ -10,11 +10,10 @@ from leaderboard.store.garbage import Garbage, collect_garbage
 from leaderboard.store.index import EntryRow, Index, IndexUnusable, Likeness
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
-from leaderboard.store.queue import ATTEMPTS, LEASE_SECONDS, Claim, Queue
+from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
 from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [
-    "ATTEMPTS",
     "EMPTY",
     "LEASE_SECONDS",
     "Claim",

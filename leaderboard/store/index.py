@@ -1,8 +1,9 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
 The tables `head`, `entry`, `object` and `artefact` are a function of the log alone, so a rebuilt
-index equals one that grew. `lease` and `upload` are temporary state: the claims of scorers, and the
-artefacts that no submission names yet.
+index equals one that grew. `lease`, `turn` and `upload` are temporary state: the claims of scorers
+and the faults that ended them, the scoring time of each key, and artefacts that no submission
+names yet.
 """
 
 from __future__ import annotations
@@ -60,9 +61,11 @@ CREATE TABLE artefact (
   digest TEXT NOT NULL, submission TEXT NOT NULL, PRIMARY KEY (digest, submission)
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE lease (
-  submission TEXT PRIMARY KEY, worker TEXT, attempt INTEGER NOT NULL, lost INTEGER NOT NULL,
-  boot TEXT NOT NULL, expires REAL NOT NULL
+  submission TEXT PRIMARY KEY, worker TEXT NOT NULL, attempt INTEGER NOT NULL,
+  held INTEGER NOT NULL, faults INTEGER NOT NULL, fault TEXT NOT NULL,
+  boot TEXT NOT NULL, since REAL NOT NULL, expires REAL NOT NULL
 ) STRICT, WITHOUT ROWID;
+CREATE TABLE turn (key TEXT PRIMARY KEY, time REAL NOT NULL) STRICT, WITHOUT ROWID;
 CREATE TABLE upload (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -105,6 +108,9 @@ class EntryRow:
       policies: number of runs with a policy.
       alike: earlier submissions with policies like this one's, the board's own rows excluded; empty
         before scoring and on boards of rules 1.
+      faults: how often a fault has ended its scoring while it waits, for example a killed scorer
+        or a full disk; 0 in a read-only store, which does not know.
+      fault: the last of them; empty if there is none.
     """
 
     id: str
@@ -127,6 +133,8 @@ class EntryRow:
     scores: Scores | None
     policies: int = 0
     alike: tuple[Likeness, ...] = ()
+    faults: int = 0
+    fault: str = ""
 
     @property
     def copy_of(self) -> tuple[Likeness, ...]:
@@ -157,7 +165,9 @@ class EntryRow:
 
 
 _COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
-_ROW = ", ".join(_COLUMNS)
+_OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
+_ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
+_ROWS = f"SELECT {_ROW} FROM entry LEFT JOIN lease ON submission = id"
 
 
 class Index:
@@ -333,14 +343,11 @@ class Index:
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
-        return [
-            _entry_row(row)
-            for row in self.connection.execute(f"SELECT {_ROW} FROM entry ORDER BY sequence")
-        ]
+        return [_entry_row(row) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")]
 
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
-        row = self.one(f"SELECT {_ROW} FROM entry WHERE id = ?", id)
+        row = self.one(f"{_ROWS} WHERE id = ?", id)
         return None if row is None else _entry_row(row)
 
     def derived_rows(self) -> Iterator[tuple[str, str, tuple[Any, ...]]]:

@@ -1,4 +1,19 @@
-"""`Queue`: the submissions that wait to be scored, and the scorers that have claimed them."""
+"""`Queue`: the submissions that wait to be scored, and the scorers that have claimed them.
+
+Whatever ends a claim without a result is a fault of the machine (a killed scorer, a full disk, a
+sandbox that does not start) and never a verdict on the submission. It waits and is tried again: at
+once after the first fault, then after 10 s, 20 s, 40 s … up to an hour. Meanwhile, others are
+scored.
+
+The reference rows are first. Then keys take turns by scoring time, so that nobody's submissions
+delay everyone else's (start-time fair queueing, Goyal, Vin and Cheng 1996):
+
+    start(key)  = max(time(key), start of the last claim)     the least is claimed next
+    time(key)   = start(key) + seconds of the claim           once the claim has ended
+
+A new key starts at the present, neither before nor behind the others. Who signs with many keys gets
+many turns: only the quotas limit that.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +27,32 @@ from leaderboard.store.database import Database
 from leaderboard.store.index import Index
 
 LEASE_SECONDS = 60.0
-ATTEMPTS = 5
+RETRY_SECONDS, LONGEST_RETRY_SECONDS = 10.0, 3600.0
+"""After the second fault of a submission, and after many."""
 
+MAX_FAULT = 500
+"""Characters of a fault's text that are kept."""
+
+_NO_NEWS = "its scorer stopped, or could not reach the board"
+_ENDED = "its scorer ended without a result"
+
+_CLAIMED = "held AND boot = ? AND expires > ?"
 _CLAIMABLE = (
-    "FROM entry LEFT JOIN lease ON submission = id "
-    "WHERE status = 'waiting' AND (submission IS NULL OR boot <> ? OR expires <= ?)"
+    "FROM entry LEFT JOIN lease ON submission = id WHERE status = 'waiting' "
+    "AND (submission IS NULL OR boot <> ? OR expires <= ?)"
 )
+_NOW = "coalesce((SELECT time FROM turn WHERE key = ''), 0.0)"  # the start of the last claim
+_NEXT = f"""
+WITH busy AS (
+  SELECT key, count(*) AS claims FROM lease JOIN entry ON id = submission WHERE held GROUP BY key
+)
+SELECT id, key, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, ''),
+  max(coalesce(turn.time, 0.0), {_NOW}) AS start
+FROM entry LEFT JOIN lease ON submission = id
+  LEFT JOIN turn USING (key) LEFT JOIN busy USING (key)
+WHERE status = 'waiting' AND (submission IS NULL OR boot <> ? OR expires <= ?)
+ORDER BY reference DESC, coalesce(claims, 0), start, sequence LIMIT 1
+"""
 
 
 @dataclass(frozen=True)
@@ -44,12 +79,10 @@ class Queue:
         self._database = database
 
     def claim(self, worker: str, *, seconds: float = LEASE_SECONDS) -> Claim | None:
-        """Claim the oldest submission that waits and is not claimed.
+        """Claim the next submission that waits, is not claimed, and is not postponed.
 
         A claim holds for `seconds` of the machine's uptime, whatever its clock is set to;
-        `heartbeat` renews it. A submission whose claims were lost five times is rejected with
-        `scoring_failed`. Reference rows are retried indefinitely: it is the machine that failed,
-        and without them the board shows no scores.
+        `heartbeat` renews it.
 
         Args:
           worker: the scorer's name, unique among those running.
@@ -62,25 +95,26 @@ class Queue:
           BoardError: the index cannot be written.
         """
         with self._database.transaction() as index:
-            while True:
-                row = index.one(
-                    "SELECT id, reference, coalesce(attempt, 0), "
-                    f"coalesce(lost, 0) + (worker IS NOT NULL) {_CLAIMABLE} "
-                    "ORDER BY sequence LIMIT 1",
-                    *_uptime(),
-                )
-                if row is None:
-                    return None
-                id, reference, attempts, lost = row
-                if lost >= ATTEMPTS and not reference:
-                    self._database.record("result", id, self._scoring_failed(id))
-                    continue
-                boot, at = _uptime()
-                index.connection.execute(
-                    "REPLACE INTO lease VALUES (?, ?, ?, ?, ?, ?)",
-                    (id, worker, attempts + 1, lost, boot, at + seconds),
-                )
-                return Claim(id, worker, attempts + 1, seconds)
+            boot, at = _uptime()
+            for (id,) in index.connection.execute(
+                f"SELECT submission FROM lease WHERE held AND NOT ({_CLAIMED})", (boot, at)
+            ).fetchall():
+                # It keeps its worker, who may be slow, and finish before anyone claims it again.
+                _end(index, id, (boot, at), fault=_NO_NEWS)
+            row = index.one(_NEXT, boot, at)
+            if row is None:
+                return None
+            id, key, attempts, faults, fault, start = row
+            index.connection.execute(
+                "REPLACE INTO lease VALUES (?, ?, ?, 1, ?, ?, ?, ?, ?)",
+                (id, worker, attempts + 1, faults, fault, boot, at, at + seconds),
+            )
+            # Of a key whose time is past, nothing need be remembered.
+            index.connection.execute("DELETE FROM turn WHERE time < ?", (start,))
+            index.connection.execute(
+                "REPLACE INTO turn VALUES ('', ?), (?, ?)", (start, key, start)
+            )
+            return Claim(id, worker, attempts + 1, seconds)
 
     def heartbeat(self, claim: Claim) -> bool:
         """Renew a claim.
@@ -93,23 +127,48 @@ class Queue:
             if not _is_current(index, claim):
                 return False
             index.connection.execute(
-                "UPDATE lease SET boot = ?, expires = ? WHERE submission = ?",
+                "UPDATE lease SET held = 1, boot = ?, expires = ? WHERE submission = ?",
                 (boot, at + claim.seconds, claim.id),
             )
         return True
 
     def release(self, claim: Claim) -> None:
-        """Return a claim for reasons outside the submission; it does not count as lost."""
+        """Return a claim that ended without a fault of the machine; it can be claimed at once."""
         with self._database.transaction() as index:
             if _is_current(index, claim):
-                index.connection.execute(
-                    "UPDATE lease SET worker = NULL, expires = 0 WHERE submission = ?", (claim.id,)
-                )
+                _end(index, claim.id, _uptime(), worker="")
 
-    def abandon(self, worker: str) -> None:
-        """Declare a scorer dead: its claim counts as lost and can be claimed at once."""
+    def fault(self, claim: Claim, text: str) -> None:
+        """Return a claim that ended in a fault of the machine; the submission is postponed.
+
+        Args:
+          claim: nothing happens if it is no longer current.
+          text: the fault, as readers of the board see it.
+        """
         with self._database.transaction() as index:
-            index.connection.execute("UPDATE lease SET expires = 0 WHERE worker = ?", (worker,))
+            if _is_current(index, claim):
+                _end(index, claim.id, _uptime(), worker="", fault=text)
+
+    def abandon(self, worker: str, fault: str | None = _ENDED) -> bool:
+        """Declare a scorer dead, and end its claim.
+
+        Args:
+          worker: the scorer's name.
+          fault: that ended it; None if it was none, and its submission is not postponed.
+
+        Returns:
+          Whether it had a claim.
+        """
+        with self._database.transaction() as index:
+            row = index.one("SELECT submission FROM lease WHERE worker = ?", worker)
+            if row is not None:
+                _end(index, row[0], _uptime(), worker="", fault=fault)
+        return row is not None
+
+    def retry(self) -> None:
+        """End the postponement of every submission, for example after a fault was repaired."""
+        with self._database.transaction() as index:
+            index.connection.execute("UPDATE lease SET expires = 0 WHERE NOT held")
 
     def finish(self, claim: Claim, result: Result) -> bool:
         """Write a result, unless the submission was claimed again since.
@@ -128,6 +187,7 @@ class Queue:
         with self._database.transaction() as index:
             if not _is_current(index, claim):
                 return False
+            _end(index, claim.id, _uptime())
             self._database.record("result", claim.id, result)
         return True
 
@@ -139,28 +199,69 @@ class Queue:
         """Number of submissions with a result or a withdrawal."""
         return self._count("FROM entry WHERE status <> 'waiting'")
 
-    def failed(self) -> int:
-        """Number of submissions rejected because all their claims were lost."""
-        return self._count("FROM entry WHERE code = 'scoring_failed'")
-
     def claimable(self) -> int:
-        """Number of waiting submissions that are not claimed."""
+        """Number of waiting submissions that are neither claimed nor postponed."""
         return self._count(_CLAIMABLE, *_uptime())
+
+    def claimed(self) -> int:
+        """Number of submissions that scorers work on."""
+        return self._count(f"FROM lease WHERE {_CLAIMED}", *_uptime())
 
     def _count(self, clauses: str, *values: Any) -> int:
         with self._database.reading() as index:
             return index.number(f"SELECT count(*) {clauses}", *values)
 
-    def _scoring_failed(self, id: str) -> Result:
-        return Result(
-            submission=id,
-            suite=self._database.document.suite.digest,
-            protocol=self._database.document.protocol.digest,
-            status="rejected",
-            code="scoring_failed",
-            message=f"the scorer failed {ATTEMPTS} times on this submission. "
-            "Run `sme-leaderboard check` on it, then contact the board's owner.",
-        )
+
+def retry_seconds(faults: int) -> float:
+    """How long a submission is postponed after its n-th fault."""
+    if faults <= 1:
+        return 0.0
+    return min(RETRY_SECONDS * 2.0 ** min(faults - 2, 20), LONGEST_RETRY_SECONDS)
+
+
+def _end(
+    index: Index,
+    id: str,
+    now: tuple[str, float],
+    *,
+    worker: str | None = None,
+    fault: str | None = None,
+) -> None:
+    """End a claim, and add its seconds to its key's time.
+
+    Args:
+      index: of the transaction.
+      id: the submission's.
+      now: as `_uptime` returns it.
+      worker: who may still finish it; None for the one who claimed it.
+      fault: of the machine; None if there was none, and the submission is not postponed.
+    """
+    boot, at = now
+    name, faults, since, expires, then = index.connection.execute(
+        "SELECT worker, faults, since, expires, boot FROM lease WHERE submission = ?", (id,)
+    ).fetchone()
+    ended = min(at, expires) if then == boot else expires
+    index.connection.execute(
+        f"INSERT INTO turn SELECT key, {_NOW} + ?1 FROM entry WHERE id = ?2 "
+        "ON CONFLICT DO UPDATE SET time = time + ?1",
+        (max(0.0, ended - since), id),
+    )
+    faults += fault is not None
+    index.connection.execute(
+        "UPDATE lease SET worker = ?, held = 0, faults = ?, fault = coalesce(?, fault), boot = ?, "
+        "since = ?, expires = ? WHERE submission = ?",
+        (
+            *(name if worker is None else worker, faults, fault and _line(fault), boot, ended),
+            0.0 if fault is None else at + retry_seconds(faults),
+            id,
+        ),
+    )
+
+
+def _line(text: str) -> str:
+    """A text as one line of printable characters, shortened."""
+    words = " ".join(text.split())
+    return "".join(each if each.isprintable() else "?" for each in words[:MAX_FAULT])
 
 
 def _is_current(index: Index, claim: Claim) -> bool:

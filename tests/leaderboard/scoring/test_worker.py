@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import logging
 import multiprocessing
 import os
@@ -13,14 +14,14 @@ from pathlib import Path
 import pytest
 
 from leaderboard import intake
-from leaderboard.errors import BoardError, TamperedError
+from leaderboard.errors import BoardError, ScoringFault, TamperedError
 from leaderboard.scoring import worker as scorer
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.score import score_submission
 from leaderboard.scoring.verify import verify
-from leaderboard.scoring.worker import run_scorer, run_scorers
-from leaderboard.store import ATTEMPTS, Store
-from sme_registry.errors import OptionError
+from leaderboard.scoring.worker import background_scorers, run_scorer, run_scorers
+from leaderboard.store import Queue, Store
+from sme_registry.errors import MissingDependencyError, OptionError
 from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board
 
 
@@ -64,37 +65,94 @@ def test_an_invalid_policy_is_rejected_with_its_code(store, key):
     assert store.entry(signed.id).code == "onnx_interface"
 
 
-def test_a_fault_of_the_scorer_costs_an_attempt_and_five_the_submission(
-    store, submit, monkeypatch, caplog
+@pytest.mark.parametrize(
+    "error",
+    [
+        ZeroDivisionError("by 0"),
+        MemoryError(),
+        ScoringFault("no memory"),
+        BoardError("is not on this disk"),
+        TamperedError("objects/x", "altered"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_fault_leaves_its_submission_waiting_and_others_are_scored(
+    store, submit, monkeypatch, caplog, error
 ):
     broken, whole = submit(1), submit(2)
     real = score_submission
+    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", 1000.0))
 
     def fails(document, submission, *arguments):
-        if submission.digest == broken.id:
-            raise ZeroDivisionError
-        return real(document, submission, *arguments)
+        return (
+            _raise(error)
+            if submission.digest == broken.id
+            else real(document, submission, *arguments)
+        )
 
-    monkeypatch.setattr(scorer, "score_submission", fails)
-    with caplog.at_level(logging.ERROR):
+    with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
+        patch.setattr(scorer, "score_submission", fails)
         assert run_scorer(store.folder.path) == 1
-    assert len(caplog.records) == ATTEMPTS
-    assert store.entry(broken.id).code == "scoring_failed"
+    assert len(caplog.records) == 2  # at once, and again
+    row = store.entry(broken.id)
+    assert (row.status, row.faults) == ("waiting", 2)
+    assert str(error) in row.fault
     assert store.entry(whole.id).status == "scored"
-
-
-def test_a_fault_of_the_board_stops_the_scorer_and_costs_nothing(store, submit, monkeypatch):
-    submit()
-    for _ in range(ATTEMPTS + 1):
+    for _ in range(4):
+        assert not store.queue.claimable()
         with monkeypatch.context() as patch:
-            path = store.folder.path
-            patch.setattr(
-                scorer, "score_submission", lambda *_: _raise(TamperedError("objects/x", "altered"))
-            )
-            with pytest.raises(TamperedError):
-                run_scorer(path)
-    assert run_scorer(path) == 1
+            patch.setattr(scorer, "score_submission", fails)
+            assert run_scorer(store.folder.path) == 0
+    assert store.entry(broken.id).faults == 6
+    assert run_scorer(store.folder.path) == 1
+    assert store.entry(broken.id).status == "scored"
+
+
+@pytest.mark.parametrize("part", ["submission", "object"])
+def test_an_altered_file_of_one_entry_stops_no_other(store, submit, part):
+    altered, whole = submit(1), submit(2)
+    if part == "submission":
+        path = store.folder.submission(altered.id)
+        path.write_bytes(path.read_bytes().replace(b"A tester", b"Somebody"))
+    else:
+        path = store.folder.object(altered.submission.runs[0].artefact.sha256)
+        path.write_bytes(bytes(path.stat().st_size))
+    assert run_scorer(store.folder.path) == 1
+    assert store.entry(whole.id).status == "scored"
+    row = store.entry(altered.id)
+    assert row.status == "waiting"
+    assert path.relative_to(store.folder.path).as_posix() in row.fault
+
+
+def test_a_result_waits_for_room_on_the_disk_and_is_computed_once(store, submit, monkeypatch):
+    submit()
+    real, refused, computed = Queue.finish, [], []
+
+    def full(queue, claim, result):
+        computed.append(result)
+        if len(refused) < 3:
+            refused.append(claim)
+            assert store.queue.claimed() == 1
+            raise BoardError("results: No space left on device")
+        return real(queue, claim, result)
+
+    monkeypatch.setattr(scorer, "_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(Queue, "finish", full)
+    assert run_scorer(store.folder.path) == 1
+    assert all(result is computed[0] for result in computed)
     assert store.entries()[0].status == "scored"
+
+
+def test_a_disk_that_stays_full_is_reported_and_no_fault_of_the_entry(store, submit, monkeypatch):
+    signed = submit()
+    with monkeypatch.context() as patch:
+        patch.setattr(scorer, "_UNWRITTEN_SECONDS", 0.0)
+        patch.setattr(Queue, "finish", lambda *_: _raise(BoardError("No space left on device")))
+        for _ in range(6):
+            with pytest.raises(BoardError, match="No space left"):
+                run_scorer(store.folder.path)
+    assert store.entry(signed.id).faults == 0
+    assert run_scorer(store.folder.path) == 1
 
 
 def _raise(error: Exception) -> None:
@@ -144,50 +202,111 @@ def test_zero_workers_are_refused(tmp_path):
         run_scorers(tmp_path, 0)
 
 
-def test_tampering_found_by_one_process_stops_all(store, board):
-    path = store.folder.submission(store.entries()[0].id)
-    path.write_bytes(path.read_bytes().replace(b"A tester", b"Somebody"))
+def test_an_altered_log_ends_the_scoring(store, board):
+    path = store.folder.log_entry(3)
+    path.write_bytes(path.read_bytes().replace(b"received", b"withdrew"))
+    store.close()
     with pytest.raises(TamperedError) as tampered:
         run_scorers(board, 1)
-    assert tampered.value.where == f"submissions/{path.name}"
+    assert tampered.value.where == "log/00000003.json"
     assert multiprocessing.active_children() == []
 
 
-def test_processes_that_keep_dying_end_the_scoring(store, board, monkeypatch):
+def test_processes_that_keep_dying_end_the_command(store, board, monkeypatch):
     monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
     with pytest.raises(BoardError, match="2 scorers died"):
         run_scorers(board, 1, started=lambda pid: os.kill(pid, signal.SIGKILL))
     assert store.queue.waiting() == 3
+    assert [row.faults for row in store.entries()] == [0, 0, 0]
 
 
-def test_scorers_killed_over_a_reference_row_leave_it_to_be_scored(store, monkeypatch):
-    references = intake.submit_references(store)
-    for attempt in range(ATTEMPTS):
-        store.queue.abandon(store.queue.claim(f"killed {attempt}").worker)
+def test_a_served_board_replaces_dying_processes_with_growing_pauses(store, board, monkeypatch):
+    """Every process dies before it claims anything, twice as often as ends a command."""
+    at, started, pauses = [0.0], [], []
     monkeypatch.setattr(scorer, "_FUTILE_DEATHS", 2)
+    monkeypatch.setattr(scorer, "_LONGEST_PAUSE", 4.0)
 
-    def kill_once_it_claims(pid):
-        while store.queue.claimable() == store.queue.waiting():
-            threading.Event().wait(0.01)
+    class Clock:
+        @staticmethod
+        def monotonic():
+            at[0] += 0.5
+            return at[0]
+
+    def kill(pid):
         os.kill(pid, signal.SIGKILL)
+        started.append(at[0])
 
-    with pytest.raises(BoardError, match="2 scorers died"):
-        run_scorers(store.folder.path, 1, started=kill_once_it_claims)
-    assert store.queue.waiting() == len(references)
-    assert run_scorers(store.folder.path, 1) == len(references)
-    refuse_unpublishable(store.entries())
+    with monkeypatch.context() as patch:
+        patch.setattr(scorer, "time", Clock)
+        run_scorers(board, 1, until_empty=False, started=kill, stop=lambda: len(started) == 7)
+    pauses = [later - earlier for earlier, later in itertools.pairwise(started)]
+    assert pauses[0] < 1.0
+    assert all(pause >= least for pause, least in zip(pauses[1:], [1, 2, 4, 4, 4], strict=True))
+    assert store.queue.waiting() == 3
 
 
-def test_a_fault_over_a_reference_row_ends_the_scorer_and_leaves_it(store, monkeypatch, caplog):
-    intake.submit_references(store)
+def test_a_served_board_scores_on_after_any_error(store, board, monkeypatch, caplog):
+    monkeypatch.setattr(scorer, "_FIRST_PAUSE", 0.0)
+    real, errors = run_scorers, [OSError("no process"), BoardError("full"), MemoryError()]
+    done = threading.Event()
+
+    def fails(*arguments, **named):
+        if errors:
+            raise errors.pop()
+        done.set()
+        real(*arguments, **named)
+
+    monkeypatch.setattr(scorer, "run_scorers", fails)
+    with caplog.at_level(logging.ERROR), background_scorers(board, 1):
+        assert done.wait(30)
+        while store.queue.waiting():
+            threading.Event().wait(0.05)
+    assert len([each for each in caplog.records if "starts again" in each.message]) == 3
+
+
+def test_scorers_killed_over_a_submission_leave_it_and_the_others_are_scored(store, submit):
+    poison, whole = submit(1), submit(2)
+
+    def kill_over_it(pid):
+        while store.queue.claimed() == 0 and len(started) < 2:
+            threading.Event().wait(0.01)
+        started.append(pid)
+        if len(started) <= 2:
+            os.kill(pid, signal.SIGKILL)
+
+    started = []
+    assert run_scorers(store.folder.path, 1, started=kill_over_it) == 1
+    rows = [store.entry(each.id) for each in (poison, whole)]
+    assert {row.status for row in rows} == {"waiting", "scored"}
+    (waiting,) = [row for row in rows if row.status == "waiting"]
+    assert waiting.faults == 2
+    assert "-9" in waiting.fault
+    assert run_scorers(store.folder.path, 1) == 1
+    assert {row.status for row in store.entries()} == {"scored"}
+
+
+def test_a_missing_onnxruntime_ends_the_scorer_and_is_no_fault(store, submit, monkeypatch):
+    submit()
+    error = MissingDependencyError("onnxruntime is not installed")
+    with monkeypatch.context() as patch:
+        patch.setattr(scorer, "score_submission", lambda *_: _raise(error))
+        with pytest.raises(MissingDependencyError):
+            run_scorer(store.folder.path)
+    assert store.entries()[0].faults == 0
+    assert run_scorer(store.folder.path) == 1
+
+
+def test_reference_rows_are_scored_once_the_fault_is_repaired(store, monkeypatch):
+    references = intake.submit_references(store)
     with monkeypatch.context() as patch:
         patch.setattr(scorer, "score_submission", lambda *_: _raise(ZeroDivisionError("by 0")))
-        with caplog.at_level(logging.ERROR):
-            for _ in range(ATTEMPTS + 1):
-                with pytest.raises(BoardError, match=r"'optimal'.*ZeroDivisionError: by 0"):
-                    run_scorer(store.folder.path)
-    assert len(caplog.records) == ATTEMPTS + 1
-    assert run_scorer(store.folder.path) == 2
+        for _ in range(6):
+            assert run_scorer(store.folder.path) == 0
+    rows = [store.entry(id) for id in references]
+    assert {row.status for row in rows} == {"waiting"}
+    assert {row.fault for row in rows} == {"ZeroDivisionError: by 0"}
+    assert run_scorer(store.folder.path) == len(references)
+    refuse_unpublishable(store.entries())
 
 
 SCRIPT = """

@@ -5,8 +5,10 @@ import time
 import pytest
 
 from leaderboard import intake
-from leaderboard.store import ATTEMPTS, Store
-from tests.leaderboard.conftest import signed_withdrawal
+from leaderboard.documents.keys import SigningKey
+from leaderboard.store import Store
+from leaderboard.store.queue import retry_seconds
+from tests.leaderboard.conftest import put_submission, signed_withdrawal
 from tests.leaderboard.store.synthetic import synthetic_result
 
 
@@ -86,45 +88,156 @@ def test_setting_the_clock_changes_no_claim(store, submit, monkeypatch, days):
     assert store.queue.finish(claim, synthetic_result(store, claim.id))
 
 
-def test_a_released_claim_does_not_count_as_lost(store, submit):
+def test_a_released_claim_is_no_fault(store, submit):
     submit()
-    for _ in range(ATTEMPTS + 2):
+    for _ in range(7):
         store.queue.release(store.queue.claim("worker"))
-    assert store.queue.claim("worker").attempt == ATTEMPTS + 3
+    assert store.queue.claim("worker").attempt == 8
+    assert store.entries()[0].faults == 0
 
 
-def test_a_submission_that_lost_every_attempt_is_rejected(store, submit):
-    lost, next_one = submit(0), submit(1)
-    for attempt in range(1, ATTEMPTS + 1):
-        claim = store.queue.claim(f"worker {attempt}")
-        assert (claim.id, claim.attempt) == (lost.id, attempt)
-        store.queue.abandon(claim.worker)
+@pytest.fixture
+def clock(monkeypatch):
+    """The machine's uptime, in seconds, as a list of one number."""
+    at = [1000.0]
+    monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", at[0]))
+    return at
+
+
+def test_faults_postpone_a_submission_ever_longer_and_never_reject_it(store, submit, clock):
+    faulty = submit(0)
+    waits = []
+    for number in range(1, 1200):
+        claim = store.queue.claim("worker")
+        assert claim.attempt == number
+        store.queue.fault(claim, f"fault\nno. {number}")
+        row = store.entry(faulty.id)
+        assert (row.status, row.faults, row.fault) == ("waiting", number, f"fault no. {number}")
+        waits.append(retry_seconds(number))
+        assert (store.queue.claimable(), store.queue.claimed()) == (int(number == 1), 0)
+        clock[0] += waits[-1]
+        if number == 30:
+            break
+    assert waits[:5] == [0, 10, 20, 40, 80]
+    assert waits[-1] == retry_seconds(10**6) == 3600
+    claim = store.queue.claim("worker")
+    assert store.queue.finish(claim, synthetic_result(store, claim.id))
+    assert (store.entry(faulty.id).faults, store.entry(faulty.id).fault) == (0, "")
+
+
+def test_others_are_scored_while_a_submission_is_postponed(store, submit, clock):
+    faulty, next_one = submit(0), submit(1)
+    for _ in range(2):
+        store.queue.fault(store.queue.claim("worker"), "no memory")
+    assert [store.entry(each.id).faults for each in (faulty, next_one)] == [2, 0]
     assert store.queue.claim("worker").id == next_one.id
-    assert store.entry(lost.id).status == "rejected"
-    assert store.entry(lost.id).code == "scoring_failed"
-    assert store.result(lost.id).code == "scoring_failed"
-    assert store.queue.failed() == 1
+    assert store.queue.claim("worker") is None
+    store.queue.retry()
+    assert store.queue.claim("worker").id == faulty.id
 
 
-def test_a_reference_row_is_retried_indefinitely(store, submit):
-    references = intake.submit_references(store)
+def test_scorers_that_die_unnoticed_postpone_their_submission(store, submit, clock):
+    faulty = submit()
+    for number in range(1, 8):
+        store.queue.claim(f"dead {number}", seconds=5)
+        clock[0] += 5.0
+        assert store.queue.claimed() == 0
+        store.queue.claim("next") if number > 1 else store.queue.abandon("dead 1")
+        assert store.entry(faulty.id).faults == number
+        clock[0] += retry_seconds(number)
+    assert store.queue.claim("worker").attempt == 8
+
+
+def test_a_slow_scorer_may_still_finish_after_its_claim_ended_in_a_fault(store, submit, clock):
+    submit()
+    store.queue.fault(store.queue.claim("one"), "no memory")
+    slow = store.queue.claim("slow", seconds=5)
+    clock[0] += 6.0
+    assert store.queue.claim("other") is None
+    assert store.queue.heartbeat(slow)
+    clock[0] += 4.0
+    assert store.queue.claimed() == 1
+    assert store.queue.finish(slow, synthetic_result(store, slow.id))
+
+
+def test_an_abandoned_claim_cannot_be_finished_or_renewed(store, submit):
+    submit()
+    claim = store.queue.claim("dead")
+    assert store.queue.abandon("dead")
+    assert not store.queue.abandon("dead")
+    assert not store.queue.heartbeat(claim)
+    assert not store.queue.finish(claim, synthetic_result(store, claim.id))
+
+
+def test_reference_rows_are_first_and_wait_like_others_after_a_fault(store, submit, clock):
     other = submit()
-    for attempt in range(1, ATTEMPTS + 3):
-        claim = store.queue.claim(f"worker {attempt}")
-        assert (claim.id, claim.attempt) == (references[0], attempt)
-        store.queue.abandon(claim.worker)
-    assert store.queue.failed() == 0
-    for id in (*references, other.id):
-        claim = store.queue.claim("whole")
-        assert claim.id == id
-        assert store.queue.finish(claim, synthetic_result(store, id))
+    references = intake.submit_references(store)
+    claims = [store.queue.claim(f"worker {number}") for number in range(3)]
+    assert [claim.id for claim in claims] == [*references, other.id]
+    for _ in range(9):
+        store.queue.fault(claims[0], "killed")
+        clock[0] += 3600
+        claims[0] = store.queue.claim("worker")
+        assert claims[0].id == references[0]
+    for claim in claims[1:]:
+        store.queue.release(claim)
+    for claim in [claims[0], store.queue.claim("worker")]:
+        assert store.queue.finish(claim, synthetic_result(store, claim.id))
+    assert store.queue.claim("worker").id == other.id
 
 
-def test_a_reference_row_rejected_by_an_earlier_version_stays_rejected(store):
+def test_keys_take_turns_by_scoring_time(store, submit, clock):
+    """One key has many slow submissions and was first; others wait for about one of them."""
+    slow = [submit(number).id for number in range(6)]
+    quick_key = SigningKey.generate()
+    for number in range(6):
+        put_submission(store, quick_key, 10 + number)
+    order = []
+    while (claim := store.queue.claim("worker", seconds=1000)) is not None:
+        clock[0] += 300.0 if claim.id in slow else 100.0
+        assert store.queue.finish(claim, synthetic_result(store, claim.id))
+        order.append("slow" if claim.id in slow else "quick")
+    assert order == ["slow", *["quick"] * 3, "slow", *["quick"] * 3, *["slow"] * 4]
+
+
+def test_faults_use_up_their_keys_time(store, submit, clock):
+    submit(0)
+    other = put_submission(store, SigningKey.generate(), 1)
+    claim = store.queue.claim("worker")
+    clock[0] += 30.0
+    store.queue.fault(claim, "no memory")
+    assert store.queue.claimable() == 2
+    assert store.queue.claim("worker").id == other.id
+
+
+def test_a_new_key_is_neither_before_nor_behind_those_that_wait(store, submit, clock):
+    keys = [SigningKey.generate() for _ in range(2)]
+    ids = {}
+    for number in range(8):
+        ids[put_submission(store, keys[0], number).id] = 0
+    order = []
+    for number in range(12):
+        if number == 3:  # of time long past, nothing is due to the newcomer
+            ids |= {put_submission(store, keys[1], 20 + each).id: 1 for each in range(4)}
+        claim = store.queue.claim("worker", seconds=1000)
+        clock[0] += 100.0
+        assert store.queue.finish(claim, synthetic_result(store, claim.id))
+        order.append(ids[claim.id])
+    assert order == [0, 0, 0, 1, 0, 1, 0, 1, 0, 1, 0, 0]
+
+
+def test_two_scorers_work_for_two_keys(store, submit):
+    first, second = submit(0).id, submit(1).id
+    other = put_submission(store, SigningKey.generate(), 2).id
+    claims = [store.queue.claim(f"worker {number}").id for number in range(3)]
+    assert claims == [first, other, second]
+
+
+def test_a_row_rejected_by_an_earlier_version_stays_rejected(store):
     """As scorers did before: such a board is still read, and its log followed."""
     first, second = intake.submit_references(store)
     claim = store.queue.claim("worker")
-    assert store.queue.finish(claim, store.queue._scoring_failed(first))
+    assert store.queue.finish(claim, synthetic_result(store, first, code="scoring_failed"))
     store.reindex()
     assert store.entry(first).code == "scoring_failed"
     assert store.queue.claim("worker").id == second
