@@ -2,24 +2,30 @@
 
 The parent starts it by its path; it imports nothing of this package. It sets the limits after it
 has loaded the libraries and before it reads a byte of the model. From then on it cannot open or
-grow a file or start a process, and its memory is limited. Messages, little-endian:
+grow a file or start a process, and its memory is limited. Messages and answers have a head of
+uint8 and uint32, little-endian:
 
-    in     uint32 length, the model;  then for each batch  uint32 rows, float32 [rows, S + 2]
-    out    uint8 status, uint32 length, payload            one answer to the start, one to the
-                                                           model, one to each batch
+    in     command, number, content     a model's bytes (number: their length), or
+                                        a batch, float32 [number, S + 2]
+    out    status, length, payload      one answer to the start and to each message
 
-The payload of an `OK` answer to a batch is float32 [rows, A], and empty otherwise. Every other
-status has a short text. Arguments: memory in bytes and processor time in seconds, both in addition
-to what the libraries use; S + 2; A; then the folders of the libraries.
+The policy and its twin for rounding (`twin.py`) may both be loaded. The payload of an `OK` answer
+is a `Start`, nothing for a model, float32 [number, A] for a batch. Every other status has a short
+text. Arguments: memory in bytes and processor time in seconds, both in addition to what the
+libraries use; S + 2; A; then the folders of the libraries.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import sys
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+HEAD = struct.Struct("<BI")
+START = struct.Struct("<Q32s")  # the memory limit in bytes, in addition to the libraries; version
+LOAD, LOAD_TWIN, RUN, RUN_TWIN = range(4)
 OK, REFUSED, FAILED, OUTPUT, MEMORY = range(5)
 MAX_TEXT = 500
 
@@ -39,42 +45,52 @@ def main() -> None:
     import numpy as np
     import onnxruntime
 
-    _set_limits(memory, seconds)
-    _answer(answers, OK)
+    def run(session: Any, rows: int) -> tuple[int, bytes]:
+        batch = np.frombuffer(messages.read(rows * observation_dim * 4), np.float32)
+        name = session.get_inputs()[0].name
+        a = session.run(None, {name: batch.reshape(rows, observation_dim)})[0]
+        if getattr(a, "dtype", None) != np.float32 or a.shape != (rows, action_dim):
+            output = f"{getattr(a, 'dtype', type(a).__name__)} {list(np.shape(a)[:8])}"
+            return OUTPUT, output.encode()
+        return OK, a.tobytes()
 
+    granted = _set_limits(memory, seconds)
+    _answer(answers, OK, START.pack(granted, onnxruntime.__version__.encode()))
+    options = _options(onnxruntime)
+    sessions: dict[int, Any] = {}
+    while (head := messages.read(HEAD.size)) and len(head) == HEAD.size:
+        command, number = HEAD.unpack(head)
+        try:
+            if command in (RUN, RUN_TWIN):
+                answer = run(sessions[command], number)
+            else:
+                sessions[command + RUN] = onnxruntime.InferenceSession(
+                    messages.read(number), options, providers=["CPUExecutionProvider"]
+                )
+                answer = OK, b""
+        except Exception as error:
+            answer = _error_answer(error, FAILED if command in (RUN, RUN_TWIN) else REFUSED)
+        _answer(answers, *answer)
+
+
+def _options(onnxruntime: Any) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
     # Run the model as submitted: the result of an optimiser depends on its version.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    try:
-        session = onnxruntime.InferenceSession(
-            messages.read(_length(messages) or 0), options, providers=["CPUExecutionProvider"]
-        )
-        name = session.get_inputs()[0].name
-    except Exception as error:
-        _answer(answers, *_error_answer(error, REFUSED))
-        return
-    _answer(answers, OK)
-
-    while (rows := _length(messages)) is not None:
-        try:
-            batch = np.frombuffer(messages.read(rows * observation_dim * 4), np.float32)
-            a = session.run(None, {name: batch.reshape(rows, observation_dim)})[0]
-            if getattr(a, "dtype", None) != np.float32 or a.shape != (rows, action_dim):
-                output = f"{getattr(a, 'dtype', type(a).__name__)} {list(np.shape(a)[:8])}"
-                answer = OUTPUT, output.encode()
-            else:
-                answer = OK, a.tobytes()
-        except Exception as error:
-            answer = _error_answer(error, FAILED)
-        _answer(answers, *answer)
+    # Otherwise the bytes themselves choose: onnxruntime's own format starts with another mark.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    return options
 
 
-def _set_limits(memory: int, seconds: int) -> None:
+def _set_limits(memory: int, seconds: int) -> int:
+    """Set the limits; return the memory limit, which the parent's own limit may lower."""
     import ctypes
     import resource
 
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as adjustment:
+        adjustment.write("1000")  # a machine short of memory ends this process, not the scorer
     used = resource.getrusage(resource.RUSAGE_SELF)
     spent = int(used.ru_utime + used.ru_stime) + 1
     # The soft limit ends the process with SIGXCPU, which tells the parent why.
@@ -84,9 +100,12 @@ def _set_limits(memory: int, seconds: int) -> None:
     prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     with open("/proc/self/statm") as statm:
         mapped = int(statm.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + memory, mapped + memory))
+    inherited = resource.getrlimit(resource.RLIMIT_AS)
+    limit = min([mapped + memory, *(each for each in inherited if each != resource.RLIM_INFINITY)])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     for kind in ("CORE", "FSIZE", "NPROC", "NOFILE"):
         resource.setrlimit(getattr(resource, f"RLIMIT_{kind}"), (0, 0))
+    return max(limit - mapped, 0)
 
 
 def _error_answer(error: Exception, status: int) -> tuple[int, bytes]:
@@ -101,14 +120,8 @@ def _error_answer(error: Exception, status: int) -> tuple[int, bytes]:
 
 
 def _answer(stream: BinaryIO, status: int, payload: bytes = b"") -> None:
-    stream.write(struct.pack("<BI", status, len(payload)) + payload)
+    stream.write(HEAD.pack(status, len(payload)) + payload)
     stream.flush()
-
-
-def _length(stream: BinaryIO) -> int | None:
-    """The first number of a message, or None at the end of the input."""
-    head = stream.read(4)
-    return struct.unpack("<I", head)[0] if len(head) == 4 else None
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 """`Sandbox`: an untrusted model as a function of observations, run in a confined process.
 
-    bytes → gate → child process (bwrap if it works, resource limits, onnxruntime) → actions
+    bytes → gate → child process (bwrap, resource limits, onnxruntime) → actions
 
 The child (`child.py`) gets no environment and no open file, and no network under bwrap. Its
-processor time, memory and wall time are limited, and it cannot open files or start processes.
-If it dies, hangs or sends garbage, the parent raises a `Rejection` with a stable code. The parent
-never holds more than one batch. Linux only: other systems lack the limits.
+processor time, memory and wall time are limited, and it cannot open files or start processes. If
+it crashes, exceeds a limit or sends garbage, the parent raises a `Rejection` with a stable code. If
+the machine is the cause (no processor time, less memory than the limit, a process killed from
+outside), it raises a `ScoringFault`, which judges nobody. The parent never holds more than one
+batch. Linux only: other systems lack the limits.
 
 `B` batch, `S` state_dim, `A` action_dim.
 """
@@ -13,19 +15,16 @@ never holds more than one batch. Linux only: other systems lack the limits.
 from __future__ import annotations
 
 import contextlib
-import functools
-import importlib.util
+import math
 import os
+import secrets
 import select
-import shutil
 import signal
-import struct
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NoReturn, Self
 
 import numpy as np
@@ -33,9 +32,11 @@ import numpy.typing as npt
 
 from leaderboard.artefact import child
 from leaderboard.artefact.gate import inspect, printable
-from leaderboard.errors import BoardError, Rejection
+from leaderboard.artefact.isolation import START_SECONDS, Isolation, available_isolation, start
+from leaderboard.artefact.machine import processor_seconds, spare_memory
+from leaderboard.artefact.twin import rounding_twin
+from leaderboard.errors import BoardError, Rejection, ScoringFault
 from sme_registry.errors import StateError
-from sme_registry.io import require_packages
 
 Observations = npt.NDArray[np.float32]
 Actions = npt.NDArray[np.float32]
@@ -49,6 +50,11 @@ some hundreds of terms by about 1e-6 of its size, and more if weights are large.
 an action changes a normalised regret by at most about 4e-4, which changes no rank.
 """
 
+BASE_SECONDS, STATE_SECONDS, BYTE_SECONDS = 20.0, 1e-3, 4e-9
+TWIN_ROWS = 1024  # of one message to the twin, whose nodes take several times the memory
+MAX_ROUNDING = 1e-4
+"""Largest mean |Δ action| in a region if all rounding errors are drawn anew, in the unit range."""
+
 _CODES = {
     child.REFUSED: ("onnx_refused", "must be a model that onnxruntime loads", "Export it again"),
     child.FAILED: ("run_failed", "must run on any batch of rows", "Run it on 1 and on 100 rows"),
@@ -57,9 +63,8 @@ _CODES = {
 }
 # Sent by an operator or by a system that is short of memory, not caused by the model.
 _EXTERNAL_SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
-_SYSTEM_FOLDERS = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache")
-_ANSWER = struct.Struct("<BI")
 _ENDING_SECONDS = 2.0  # between closing its pipe and being gone
+_BUSY = 0.5  # of its wall time: with less processor time, the machine and not the model is slow
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,8 @@ class SandboxLimits:
     """Limits of one model.
 
     Attributes:
-      memory_bytes: address space, in addition to that of the libraries.
+      memory_bytes: address space, in addition to that of the libraries; a machine that has less to
+        spare grants less.
       cpu_seconds: total processor time.
       call_seconds: wall time of loading the model, and of each batch.
       start_seconds: wall time of starting the process; exceeding it is the machine's fault.
@@ -76,7 +82,19 @@ class SandboxLimits:
     memory_bytes: int = 2 * 2**30
     cpu_seconds: int = 300
     call_seconds: float = 60.0
-    start_seconds: float = 60.0
+    start_seconds: float = START_SECONDS
+
+    @classmethod
+    def for_policy(cls, file_bytes: int, states: int, agents: int = 1) -> Self:
+        """The limits of a policy that is evaluated at some states, and checked at as many at most.
+
+        Args:
+          file_bytes: the size of its file.
+          states: in all regions together.
+          agents: that call it in each state.
+        """
+        seconds = BASE_SECONDS + states * agents * (STATE_SECONDS + BYTE_SECONDS * file_bytes)
+        return cls(cpu_seconds=math.ceil(seconds))
 
 
 class Sandbox:
@@ -89,16 +107,20 @@ class Sandbox:
       observation_dim: S + 2.
       action_dim: A.
       limits: of time and memory.
+      isolation: "bwrap", "process" (resource limits alone), or None for `available_isolation()`.
 
     Raises:
       Rejection: a code of `gate.inspect`, or `onnx_refused`, `run_failed`, `run_time` or
         `run_memory` while the model loads.
-      BoardError: this system is not Linux, or the process cannot be started or was ended from
-        outside. The model is not judged.
+      ScoringFault: the isolation does not work, the process cannot be started or was ended from
+        outside, or the machine lacks memory or processor time. The model is not judged.
+      BoardError: this system is not Linux.
       MissingDependencyError: onnxruntime is not installed.
 
     Attributes:
-      isolation: "bwrap", or "process" if bwrap is missing or does not work.
+      isolation: of the process.
+      runtime: the version of onnxruntime that runs the model, as the process reports it before it
+        reads the model.
     """
 
     def __init__(
@@ -107,6 +129,8 @@ class Sandbox:
         observation_dim: int,
         action_dim: int,
         limits: SandboxLimits = SandboxLimits(),
+        *,
+        isolation: Isolation | None = None,
     ) -> None:
         inspect(data, observation_dim, action_dim)
         if sys.platform != "linux":
@@ -114,11 +138,15 @@ class Sandbox:
                 f"sys.platform={sys.platform!r}: policies run in a sandbox, which needs Linux. "
                 "Score on a Linux machine or in a Linux container."
             )
+        self.isolation: Isolation = isolation or available_isolation()
         self._observation_dim, self._action_dim = observation_dim, action_dim
         self._limits = limits
-        prefix = _bwrap()
-        self.isolation = "bwrap" if prefix else "process"
-        self._process = _start(prefix, limits, observation_dim, action_dim)
+        self._data = data
+        self._has_twin = False
+        memory = min(limits.memory_bytes, spare_memory())
+        self._process = start(
+            self.isolation, (memory, limits.cpu_seconds, observation_dim, action_dim)
+        )
         self._starting = True
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -126,9 +154,11 @@ class Sandbox:
         for pipe in (self._input, self._output):
             os.set_blocking(pipe.fileno(), False)
         with self._closed_on_error():
-            self._ask(limits.start_seconds)
+            started = self._ask(limits.start_seconds, size=child.START.size)
             self._starting = False
-            self._ask(limits.call_seconds, struct.pack("<I", len(data)), data)
+            self._memory, version = child.START.unpack(started)
+            self.runtime = printable(version.rstrip(b"\0"))
+            self._load(child.LOAD, data)
 
     def __call__(self, observations: Observations) -> Actions:
         """The model's actions, finite but not clipped.
@@ -142,51 +172,94 @@ class Sandbox:
         Raises:
           Rejection: `run_failed`, `run_output`, `run_not_finite`, `run_time` or `run_memory`; this
             closes the sandbox.
-          BoardError: the sandbox is closed, or its process was ended from outside.
+          ScoringFault: its process was ended from outside, or the machine lacks memory or processor
+            time; this closes the sandbox, too.
+          BoardError: the sandbox is closed.
           StateError: the observations have another shape.
         """
-        observations = np.ascontiguousarray(observations, dtype="<f4")
-        if observations.ndim != 2 or observations.shape[1] != self._observation_dim:
-            raise StateError(
-                f"observations of shape {observations.shape}: must be [B, {self._observation_dim}]."
+        a = self._run(child.RUN, observations, ROWS)
+        if not np.isfinite(a).all():
+            self.close()
+            row = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
+            raise Rejection(
+                "run_not_finite",
+                f"action={a[row].tolist()} on observation {observations[row].tolist()}: must "
+                "be finite. Guard divisions and logarithms, and check the weights for NaN.",
             )
-        a = np.empty((len(observations), self._action_dim), np.float32)
-        with self._closed_on_error():
-            for first in range(0, len(a), ROWS):
-                rows = observations[first : first + ROWS]
-                size = len(rows) * self._action_dim * 4
-                frame = struct.pack("<I", len(rows)), rows.tobytes()
-                answer = self._ask(self._limits.call_seconds, *frame, size=size)
-                a[first : first + ROWS] = np.frombuffer(answer, "<f4").reshape(len(rows), -1)
-            if not np.isfinite(a).all():
-                row = int(np.flatnonzero(~np.isfinite(a).all(axis=1))[0])
-                raise Rejection(
-                    "run_not_finite",
-                    f"action={a[row].tolist()} on observation {observations[row].tolist()}: must "
-                    "be finite. Guard divisions and logarithms, and check the weights for NaN.",
-                )
         return a
 
-    def check_rows(self, observations: Observations, rows: int = 16) -> None:
+    def check_rows(self, observations: Observations, rows: int | Sequence[int] = 16) -> None:
         """Reject a model whose action in a state depends on the other rows of the batch.
 
-        The batch in reverse, and some rows one at a time, must give the same actions as the batch.
-        Actions are compared as they are scored, clipped to [0, 1].
+        The batch in random order and in two parts, and some rows one at a time, must give the same
+        actions as the batch. Actions are compared as they are scored, clipped to [0, 1].
 
         Args:
           observations: `[B, S + 2]` float32, B ≥ 1, preferably a batch that is scored.
-          rows: number of rows evaluated one at a time, spread evenly.
+          rows: the rows evaluated one at a time, or their number, then drawn at random. Nobody can
+            predict the system's randomness.
 
         Raises:
           Rejection: `run_batch_dependent`, or the codes of a call.
           BoardError, StateError: see a call.
         """
+        rng = np.random.default_rng(secrets.randbits(128))
         batched = self(observations)
-        reversed_ = self(observations[::-1])[::-1]
-        self._refuse_difference("in reverse", observations, batched, reversed_)
-        chosen = np.unique(np.linspace(0, len(observations) - 1, rows).astype(int))
+        order = rng.permutation(len(observations))
+        parts = np.array_split(order, 2)
+        other = np.empty_like(batched)
+        for part in parts:
+            other[part] = self(observations[part])
+        self._refuse_difference("in another batch", observations, batched, other)
+        chosen = order[:rows] if isinstance(rows, int) else np.asarray(rows)
         single = np.concatenate([self(observations[row : row + 1]) for row in chosen])
         self._refuse_difference("alone", observations[chosen], batched[chosen], single)
+
+    def rounding(self, observations: Observations) -> npt.NDArray[np.float64]:
+        """How much the actions change if all rounding errors are drawn anew; see `twin`.
+
+        Args:
+          observations: `[B, S + 2]` float32.
+
+        Returns:
+          `[B]` mean |Δ action| over the channels, in [0, 1], of actions clipped to [0, 1]; 1 where
+          the changed action is not a number. Two calls draw different errors.
+
+        Raises:
+          Rejection, BoardError, StateError: see a call.
+        """
+        a = self(observations)
+        if not self._has_twin:
+            with self._closed_on_error():
+                self._load(child.LOAD_TWIN, rounding_twin(self._data))
+            self._has_twin = True
+        other = self._run(child.RUN_TWIN, observations, TWIN_ROWS)
+        change = np.abs(np.clip(a, 0.0, 1.0) - np.clip(other, 0.0, 1.0)).astype(np.float64)
+        return np.asarray(np.nan_to_num(change.mean(axis=1), nan=1.0))
+
+    def check_rounding(self, observations: Observations) -> float:
+        """Reject a model whose actions depend on the rounding of the runtime's arithmetic.
+
+        Args:
+          observations: `[B, S + 2]` float32, B ≥ 1: random rows of one region.
+
+        Returns:
+          Their mean |Δ action|, at most `MAX_ROUNDING`.
+
+        Raises:
+          Rejection: `run_rounding`, or the codes of a call.
+          BoardError, StateError: see a call.
+        """
+        mean = float(self.rounding(observations).mean())
+        if mean > MAX_ROUNDING:
+            self.close()
+            raise Rejection(
+                "run_rounding",
+                f"mean change of the actions by rounding errors={mean:.1e}: must be at most "
+                f"{MAX_ROUNDING:g}, or another machine computes another score. Avoid differences "
+                "of nearly equal numbers, large factors, and sums compared for equality.",
+            )
+        return mean
 
     def close(self) -> None:
         """End the process and its descendants. Closing twice is allowed."""
@@ -217,14 +290,34 @@ class Sandbox:
                 "Let no operator work across rows.",
             )
 
+    def _load(self, command: int, data: bytes) -> None:
+        self._ask(self._limits.call_seconds, child.HEAD.pack(command, len(data)), data)
+
+    def _run(self, command: int, observations: Observations, most_rows: int) -> Actions:
+        observations = np.ascontiguousarray(observations, dtype="<f4")
+        if observations.ndim != 2 or observations.shape[1] != self._observation_dim:
+            raise StateError(
+                f"observations of shape {observations.shape}: must be [B, {self._observation_dim}]."
+            )
+        a = np.empty((len(observations), self._action_dim), np.float32)
+        with self._closed_on_error():
+            for first in range(0, len(a), most_rows):
+                rows = observations[first : first + most_rows]
+                frame = child.HEAD.pack(command, len(rows)), rows.tobytes()
+                size = len(rows) * self._action_dim * 4
+                answer = self._ask(self._limits.call_seconds, *frame, size=size)
+                a[first : first + most_rows] = np.frombuffer(answer, "<f4").reshape(len(rows), -1)
+        return a
+
     def _ask(self, seconds: float, *frame: bytes, size: int = 0) -> bytearray:
         """Send the parts of a message; return the answer's payload of this size."""
         if self._process.returncode is not None:
             raise BoardError("The sandbox is closed. Open another one.")
         deadline = time.monotonic() + seconds
+        self._spent = processor_seconds(self._process.pid)
         for part in frame:
             self._send(memoryview(part), deadline)
-        status, length = _ANSWER.unpack(self._receive(_ANSWER.size, deadline))
+        status, length = child.HEAD.unpack(self._receive(child.HEAD.size, deadline))
         if status == child.OK and length == size:
             return self._receive(size, deadline)
         if status not in _CODES or length > child.MAX_TEXT:
@@ -233,6 +326,8 @@ class Sandbox:
             )
         code, allowed, remedy = _CODES[status]
         text = printable(b" ".join(self._receive(length, deadline).split()))
+        if status == child.MEMORY:
+            self._raise_if_memory_was_short(text)
         allowed = allowed.format(memory=self._limits.memory_bytes // 2**20)
         raise Rejection(code, f"artefact: {text}: {allowed}. {remedy}.")
 
@@ -264,14 +359,21 @@ class Sandbox:
         if poll.poll(max(deadline - time.monotonic(), 0.0) * 1000.0):
             return
         if self._starting:
-            raise BoardError(
+            raise ScoringFault(
                 f"The sandbox did not start within {self._limits.start_seconds:g} s. Try again "
                 "when the machine is less busy."
             )
+        used = processor_seconds(self._process.pid) - self._spent
+        limit = self._limits.call_seconds
+        if used < _BUSY * limit:
+            raise ScoringFault(
+                f"The sandbox did not answer within {limit:g} s, in which it got {used:.1f} s of "
+                "processor time. Try again when the machine is less busy."
+            )
         raise Rejection(
             "run_time",
-            f"artefact: no answer within {self._limits.call_seconds:g} s, the limit for loading "
-            "and for each batch. Submit a smaller network.",
+            f"artefact: no answer within {limit:g} s, the limit for loading and for each batch. "
+            "Submit a smaller network.",
         )
 
     def _ended(self) -> NoReturn:
@@ -287,16 +389,26 @@ class Sandbox:
                 f"artefact: more than {self._limits.cpu_seconds} s of processor time, the limit "
                 "for all batches. Submit a smaller network.",
             )
+        ended = f"The sandbox's process ended with status {status}"
         if self._starting or number in {getattr(signal, name) for name in _EXTERNAL_SIGNALS}:
-            raise BoardError(
-                f"The sandbox's process ended with status {status}, not caused by the model. "
-                "Check that onnxruntime can be imported and that memory is free, and try again."
+            raise ScoringFault(
+                f"{ended}, not caused by the model. Check that onnxruntime can be imported and "
+                "that memory is free, and try again."
             )
+        self._raise_if_memory_was_short(ended)  # libraries crash where they cannot allocate
         raise Rejection(
             "run_failed",
             f"artefact: the model crashed its process, which ended with status {status}. Run it on "
             "your machine with `sme-leaderboard check`.",
         )
+
+    def _raise_if_memory_was_short(self, what: str) -> None:
+        if self._memory < self._limits.memory_bytes:
+            raise ScoringFault(
+                f"{what}: the machine had {self._memory // 2**20:,} MiB to spare, less than the "
+                f"limit of {self._limits.memory_bytes // 2**20:,} MiB. Score on a machine with "
+                "more memory, or try again when more is free."
+            )
 
     @contextlib.contextmanager
     def _closed_on_error(self) -> Iterator[None]:
@@ -305,78 +417,3 @@ class Sandbox:
         except BaseException:
             self.close()
             raise
-
-
-def _start(
-    prefix: Sequence[str], limits: SandboxLimits, observation_dim: int, action_dim: int
-) -> subprocess.Popen[bytes]:
-    numbers = limits.memory_bytes, limits.cpu_seconds, observation_dim, action_dim
-    return subprocess.Popen(
-        [*prefix, *_script(), *map(str, numbers), *_library_folders()],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        bufsize=0,
-        cwd="/",
-        env=_environment(),
-        start_new_session=True,  # a separate process group, which Ctrl-C does not reach
-    )
-
-
-def _script() -> list[str]:
-    """The command of the child, without user settings or site hooks."""
-    return [sys.executable, "-I", "-S", "-B", str(Path(child.__file__).resolve())]
-
-
-def _environment() -> dict[str, str]:
-    """The environment variables of the child."""
-    kept = {name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ}
-    return {
-        "LANG": "C.UTF-8",
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-        # Without it onnxruntime keeps a database in the home folder and sends usage data.
-        "ORT_DISABLE_TELEMETRY": "1",
-        **kept,
-    }
-
-
-@functools.cache
-def _library_folders() -> tuple[str, ...]:
-    """The folders of NumPy and onnxruntime."""
-    libraries = {"numpy": "NumPy", "onnxruntime": "ONNX Runtime"}
-    require_packages("running a policy's ONNX file", libraries, "leaderboard")
-    packages = map(importlib.util.find_spec, libraries)
-    files = [package.origin for package in packages if package and package.origin]
-    return tuple(dict.fromkeys(str(Path(file).parents[1]) for file in files))
-
-
-@functools.cache
-def _bwrap() -> tuple[str, ...]:
-    """The bwrap command that starts a child; empty if bwrap is missing or does not work.
-
-    Containers often forbid what bwrap needs, so it is tried once, with a child without a model.
-    """
-    program = shutil.which("bwrap")
-    if program is None:
-        return ()
-    interpreter = Path(sys.executable)
-    readable = [
-        *(folder for folder in _SYSTEM_FOLDERS if os.path.exists(folder)),
-        *(sys.base_prefix, sys.prefix, str(interpreter.parent), str(interpreter.resolve().parent)),
-        *_library_folders(),
-        str(Path(child.__file__).resolve()),
-    ]
-    command = (
-        *(program, "--unshare-all", "--die-with-parent", "--cap-drop", "ALL"),
-        *(word for path in dict.fromkeys(readable) for word in ("--ro-bind", path, path)),
-        *("--proc", "/proc", "--dev", "/dev", "--chdir", "/", "--"),
-    )
-    limits = SandboxLimits()
-    with _start(command, limits, 1, 1) as process:
-        try:
-            answer, _ = process.communicate(timeout=limits.start_seconds)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            return ()
-    return command if answer.startswith(_ANSWER.pack(child.OK, 0)) else ()

@@ -88,6 +88,21 @@ def varints(packed: memoryview, budget: Budget) -> Iterator[int]:
         yield value
 
 
+def encoded(number: int, value: int | bytes | memoryview) -> bytes:
+    """A field: a number in [0, 2⁶⁴), or text, bytes or a message."""
+    if isinstance(value, int):
+        return _encoded_varint(number << 3 | VARINT) + _encoded_varint(value)
+    return _encoded_varint(number << 3 | LENGTH) + _encoded_varint(len(value)) + bytes(value)
+
+
+def _encoded_varint(value: int) -> bytes:
+    low = bytearray()
+    while value >= 0x80:
+        low.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*low, value])
+
+
 def signed(value: int) -> int:
     """The int64 that a varint represents."""
     return value - 2**64 if value >= 2**63 else value

@@ -1,0 +1,137 @@
+"""How the process of a policy is isolated: by bubblewrap, or by resource limits alone.
+
+    bwrap      no network, no files but the system's and Python's, its own processes and devices
+    process    resource limits, an empty environment, no open file
+
+Isolation is chosen and never lowered: bubblewrap that is installed and does not work is a fault of
+the machine. Only a machine without it uses "process", and `serve` refuses even that.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from leaderboard.artefact import child
+from leaderboard.errors import ScoringFault
+from sme_registry.io import require_packages
+
+Isolation = Literal["bwrap", "process"]
+
+START_SECONDS = 60.0
+
+_SYSTEM_FOLDERS = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache")
+
+
+def available_isolation() -> Isolation:
+    """The isolation that this machine has: "bwrap", or "process" if bubblewrap is not installed.
+
+    Raises:
+      ScoringFault: bubblewrap is installed, but does not start a process here.
+      MissingDependencyError: onnxruntime is not installed.
+    """
+    if shutil.which("bwrap") is None:
+        return "process"
+    _bwrap()
+    return "bwrap"
+
+
+def start(isolation: Isolation, arguments: Sequence[int]) -> subprocess.Popen[bytes]:
+    """Start a child with its limits, its pipes open and unbuffered.
+
+    Raises:
+      ScoringFault: bubblewrap is missing or does not work, or the system starts no process.
+      MissingDependencyError: onnxruntime is not installed.
+    """
+    return _start(_bwrap() if isolation == "bwrap" else (), arguments)
+
+
+def _start(prefix: Sequence[str], arguments: Sequence[int]) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(
+            [*prefix, *_script(), *map(str, arguments), *_library_folders()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            cwd="/",
+            env=_environment(),
+            start_new_session=True,  # a separate process group, which Ctrl-C does not reach
+        )
+    except OSError as error:
+        raise ScoringFault(
+            f"The sandbox's process cannot be started: {error}. Check the machine's limits on "
+            "processes, memory and open files, and try again."
+        ) from None
+
+
+def _script() -> list[str]:
+    """The command of the child, without user settings or site hooks."""
+    return [sys.executable, "-I", "-S", "-B", str(Path(child.__file__).resolve())]
+
+
+def _environment() -> dict[str, str]:
+    """The environment variables of the child."""
+    kept = {name: os.environ[name] for name in ("LD_LIBRARY_PATH",) if name in os.environ}
+    return {
+        "LANG": "C.UTF-8",
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        # Without it onnxruntime keeps a database in the home folder and sends usage data.
+        "ORT_DISABLE_TELEMETRY": "1",
+        **kept,
+    }
+
+
+@functools.cache
+def _library_folders() -> tuple[str, ...]:
+    """The folders of NumPy and onnxruntime."""
+    libraries = {"numpy": "NumPy", "onnxruntime": "ONNX Runtime"}
+    require_packages("running a policy's ONNX file", libraries, "leaderboard")
+    packages = map(importlib.util.find_spec, libraries)
+    files = [package.origin for package in packages if package and package.origin]
+    return tuple(dict.fromkeys(str(Path(file).parents[1]) for file in files))
+
+
+@functools.cache  # of success only: an error is raised again, and the next call tries again
+def _bwrap() -> tuple[str, ...]:
+    """The bwrap command that starts a child, after it has started one without a model."""
+    program = shutil.which("bwrap")
+    if program is None:
+        raise ScoringFault(
+            'isolation="bwrap": bubblewrap is not installed. Install it '
+            "(apt install bubblewrap), or choose another isolation."
+        )
+    interpreter = Path(sys.executable)
+    readable = [
+        *(folder for folder in _SYSTEM_FOLDERS if os.path.exists(folder)),
+        *(sys.base_prefix, sys.prefix, str(interpreter.parent), str(interpreter.resolve().parent)),
+        *_library_folders(),
+        str(Path(child.__file__).resolve()),
+    ]
+    command = (
+        *(program, "--unshare-all", "--die-with-parent", "--cap-drop", "ALL"),
+        *(word for path in dict.fromkeys(readable) for word in ("--ro-bind", path, path)),
+        *("--proc", "/proc", "--dev", "/dev", "--chdir", "/", "--"),
+    )
+    with _start(command, (2**31, 60, 1, 1)) as process:
+        try:
+            answer, _ = process.communicate(timeout=START_SECONDS)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            answer = b""
+    if not answer.startswith(child.HEAD.pack(child.OK, child.START.size)):
+        raise ScoringFault(
+            f"bubblewrap is installed ({program}) but does not start a process, with status "
+            f"{process.returncode}. Containers often forbid user namespaces: allow them, or remove "
+            "bubblewrap if nobody else can submit to this board."
+        )
+    return command
