@@ -97,6 +97,7 @@ class Pages:
         tab = next(tab for tab in TABS if tab.key == metric)
         ranked = ranking.ranking(self.entries, metric)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
+        estimates = [rows.shown_estimate(row, metric) for row in ranked]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
         submitted = [row for row in ranked if not row.entry.reference]
         return self._render(
@@ -109,9 +110,11 @@ class Pages:
             listed=[row for row in submitted if not row.ranks],
             families=sorted({row.entry.family for row in submitted}),
             knowledges=sorted({row.entry.knowledge for row in submitted}),
+            unranked=[name for name in ranking.REASONS if name in {r.reason for r in submitted}],
             reasons=ranking.REASONS,
+            names={id: f"{entry.method} {entry.version}" for id, entry in self._by_id.items()},
             **self._overview,
-            bars=charts.Bars([getattr(one, metric) for one in scores], tab.references),
+            bars=charts.Bars(estimates, tab.references),
             sparks=dict(
                 zip((row.entry.id for row in ranked), charts.sparklines(regrets), strict=True)
             ),
@@ -167,6 +170,13 @@ class Pages:
             s=submission,
             result=result,
             withheld=withheld,
+            preparing=self.preparing,
+            reason=self._reasons.get(id, ""),
+            copies=[(each, self._by_id[each.id]) for each in entry.copy_of],
+            versions=[
+                (other, self._reasons.get(other.id, ""))
+                for other in rows.versions_of(entry, self._listed)
+            ],
             entry=entry,
             withdrawal=withdrawal and withdrawal.withdrawal,
             codes=CODES,
@@ -335,6 +345,13 @@ class Pages:
         return self.store.entries()
 
     @cached_property
+    def _reasons(self) -> dict[str, str]:
+        """Why entries have no rank by any metric, by their ids; empty without scores to show."""
+        if self.preparing:
+            return {}
+        return {row.entry.id: row.reason for row in ranking.ranking(self.entries, "wd_regret")}
+
+    @cached_property
     def _scored(self) -> list[Any]:
         """Entries with scores that are not withdrawn."""
         return [entry for entry in self.entries if entry.scores and entry.status == "scored"]
@@ -352,6 +369,7 @@ class Pages:
                 "protocol": document.protocol.digest,
             },
             "learned": ranking.LEARNED,
+            "marks": rows.MARKS,
             "address_digits": SHORT,
             "metrics": TABS,
         }
@@ -385,6 +403,7 @@ def _environment() -> Environment:
         "https_only": rows.https_only,
         "minute": rows.minute,
         "number": charts.number,
+        "shown": rows.shown_estimate,
         "short": lambda digest, digits=12: hex_of(digest)[:digits],
         "steps": rows.steps_text,
     }

@@ -6,9 +6,11 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from leaderboard.documents.result import Metric, Result, RunScore
+from leaderboard.documents.checks import skeleton
+from leaderboard.documents.result import Estimate, Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
-from leaderboard.scoring.ranking import REFERENCES
+from leaderboard.scoring.ranking import REFERENCES, RankedRow
+from leaderboard.store import EntryRow
 from sme_registry.statistics import iqm
 
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
@@ -33,8 +35,37 @@ TABS = (
     MetricTab("ood_decay", "ood_decay.html", "ood_decay", "N̄ − N₀", "OOD decay N̄ − N₀", _NO_DECAY),
 )
 
+MARKS = {
+    "reference": "reference row",
+    "too_few_runs": "too few runs",
+    "copy": "copy",
+    "superseded": "superseded",
+    "not_learned": "not learned",
+}
+"""Short names of the reasons in `ranking.REASONS`."""
+
 RunRow = tuple[str, Run | None, RunScore | None]
 """Class name, the run as submitted, and as scored."""
+
+
+def shown_estimate(row: RankedRow, metric: Metric) -> Estimate:
+    """The score that a row shows: what it ranks by, or its own score if it has no rank."""
+    own: Estimate = getattr(row.entry.scores, metric)
+    return own if row.first is None else row.value
+
+
+def versions_of(entry: EntryRow, entries: list[EntryRow]) -> list[EntryRow]:
+    """Other submissions of an entry's key with its method or its policies, the newest first."""
+    if entry.reference:
+        return []
+    method = skeleton(entry.method)
+    return [
+        other
+        for other in reversed(entries)
+        if other.key == entry.key
+        and other.id != entry.id
+        and (skeleton(other.method) == method or other.origin == entry.origin)
+    ]
 
 
 def run_rows(

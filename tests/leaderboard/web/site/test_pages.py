@@ -15,7 +15,7 @@ from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedWithdrawal, Withdrawal
 from leaderboard.errors import BoardError, NotPublishable
-from leaderboard.store import Store
+from leaderboard.store import Likeness, Store
 from leaderboard.web.site import STATIC, Pages, content_type, rows, write_site
 from leaderboard.web.site import pages as site_pages
 from sme_registry.errors import OptionError
@@ -225,7 +225,7 @@ def test_the_board_shows_rank_ranges_references_and_what_is_not_ranked_with_its_
         ("2–3", "TD3"),
     ]
     assert shown[-1] == ("–", "PPO small")
-    assert "fewer than 10 runs in a class" in rows[-1][2]
+    assert ">too few runs</span>" in rows[-1][2]
     assert 'href="method.html#oracle-like"' in rows[2][2]
     assert ">requested</td>" in rows[2][2]
     assert 'href="https://example.org/sac?a=1&amp;b=2"' in rows[3][2]
@@ -238,8 +238,66 @@ def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
     rows = {name: (rank, row) for rank, name, row in rows_of((site / "ood_decay.html").read_text())}
     rank, row = rows["A method with quite a long name (ensemble of 16 critics)"]
     assert rank == "–"
-    assert "WD regret not certainly below 0.5" in row
+    assert ">not learned</span>" in row
     assert rows["SAC"][0] == "2–4"
+
+
+def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(tmp_path):
+    key = SigningKey.generate()
+    with boards.create(tmp_path / "board", classes=1) as store:
+        boards.submit(store, key, "Worse inside", [0.3, *[0.1] * 5], spread=0.0)
+        boards.submit(store, SigningKey.generate(), "Better", [0.1] * 6, spread=0.0)
+        text = Pages(store).read("ood_decay.html").decode()
+    rows = {name: row for _, name, row in rows_of(text)}
+    assert 'data-value="0.0"' in rows["Worse inside"]
+    assert "<span>itself \u22120.200</span>" in rows["Worse inside"]
+    assert "itself" not in rows["Better"]
+
+
+def test_a_superseded_entry_is_listed_as_history_and_its_versions_link_to_one_another(tmp_path):
+    key = SigningKey.generate()
+    with boards.create(tmp_path / "board", classes=1) as store:
+        first = boards.submit(store, key, "PPO", [0.2] * 6, statement="first")
+        second = boards.submit(store, key, "P-P-0", [0.2] * 6, statement="second")
+        boards.submit(store, SigningKey.generate(), "PPO", [0.3] * 6)
+        pages = Pages(store)
+        marks = {name: row for _, name, row in rows_of(pages.board("wd_regret"))}
+        old, new = Page(pages.submission(first)), Page(pages.submission(second))
+    assert ">superseded</span>" in marks["PPO"] or ">superseded</span>" in marks["P-P-0"]
+    assert "Superseded." in old.words
+    assert "Superseded." not in new.words
+    for page, other in ((old, second), (new, first)):
+        links = [a["href"] for a in page.all("a")]
+        assert f"{hex_of(other)}.html" in links
+        assert "History of this method" in page.words
+
+
+def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(tmp_path, monkeypatch):
+    with boards.create(tmp_path / "board", classes=1) as store:
+        first = boards.submit(store, SigningKey.generate(), "First", [0.2] * 6)
+        whole = boards.submit(store, SigningKey.generate(), "Whole", [0.2] * 6)
+        part = boards.submit(store, SigningKey.generate(), "Part", [0.2] * 6)
+        key = store.entry(first).key
+        entries = [
+            dataclasses.replace(
+                entry, alike=(Likeness(first, key, {whole: 10, part: 2}[entry.id]),)
+            )
+            if entry.id in (whole, part)
+            else entry
+            for entry in store.entries()
+        ]
+        monkeypatch.setattr(store, "entries", lambda: list(entries))
+        pages = Pages(store)
+        shown = {name: (rank, row) for rank, name, row in rows_of(pages.board("wd_regret"))}
+        words = {id: Page(pages.submission(id)).words for id in (first, whole, part)}
+    link = f'href="submissions/{hex_of(first)}.html"'
+    assert shown["Whole"][0] == "–"
+    assert f"{link}>copy of <bdi>First 1.0" in shown["Whole"][1]
+    assert shown["Part"][0] != "–"
+    assert f"{link}>2 runs like <bdi>First 1.0" in shown["Part"][1]
+    assert "10 of 10 policies act like those of earlier entries" in words[whole]
+    assert "2 of 10 policies act like" in words[part]
+    assert "act like" not in words[first]
 
 
 def test_submissions_that_are_not_scored_are_listed_below_with_their_status(pages):
