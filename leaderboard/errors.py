@@ -26,7 +26,7 @@ CODES = {
     "unknown_suite": "the suite, protocol or track is not the board's",
     "unknown_spec": "a run's spec digest is not an instance of the suite",
     "duplicate_run": "a run, or an artefact within one spec, is listed twice",
-    "missing_run": "an instance of the suite has no run, or runs_started is below the runs listed",
+    "missing_run": "an instance has no run, no run has a policy, or runs_started is too small",
     "unsafe_name": "a name or path has forbidden characters, or is reserved for the board",
     "name_taken": "another key has used this name, or one that looks like it, on this board",
     "unknown_submission": "no submission on the board has this id",

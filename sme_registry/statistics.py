@@ -5,6 +5,7 @@
     draw      in each class, n runs with replacement:  θ* = mean over classes of
               IQM + √(n/(n − 1)) (IQM* − IQM)
     95 %      θ ± max(θ − q₂.₅(θ*), q₉₇.₅(θ*) − θ)
+    strata    in general, with weights w:  θ = Σ w × statistic / Σ w, and θ* likewise
     gap       mean of max(0, target − score)
     profile   P̂(τ) = mean over classes of the share of runs above τ
     P(X > Y)  mean over classes of the share of pairs (x, y) with x > y, ties counting ½
@@ -40,7 +41,9 @@ Statistic = Callable[[npt.ArrayLike], Array]  # of [n, …] over the first axis:
 __all__ = [
     "DRAWS",
     "LEVEL",
+    "Array",
     "Estimate",
+    "Statistic",
     "aggregate",
     "iqm",
     "mean",
@@ -160,21 +163,32 @@ def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Arr
     return x[last], running_median(y, window)[last], window
 
 
-def aggregate(classes: Mapping[str, Array], statistic: Statistic = iqm) -> Array:
+def aggregate(
+    classes: Mapping[str, Array],
+    statistic: Statistic | Mapping[str, Statistic] = iqm,
+    weights: Mapping[str, float] | None = None,
+) -> Array:
     """θ: the mean over classes, which have equal weight regardless of their number of runs.
 
     Args:
       classes: by name, `[n, K]` scores of its runs.
-      statistic: applied within each class.
+      statistic: applied within each class; one for all, or one for each by its name.
+      weights: of the classes, positive; None for equal ones.
 
     Returns:
       `[K]`, in the scores' units.
     """
-    return np.asarray(np.mean([statistic(runs) for runs in classes.values()], axis=0))
+    values, shares = _statistics(classes, statistic), _weights(classes, weights)
+    weighted = [shares[name] * values[name](runs) for name, runs in classes.items()]
+    return np.asarray(np.sum(weighted, axis=0) / sum(shares.values()))
 
 
 def stratified_bootstrap(
-    classes: Mapping[str, Array], draws: int, seed: str, statistic: Statistic = iqm
+    classes: Mapping[str, Array],
+    draws: int,
+    seed: str,
+    statistic: Statistic | Mapping[str, Statistic] = iqm,
+    weights: Mapping[str, float] | None = None,
 ) -> tuple[Array, Array]:
     """95 % intervals of `aggregate`, with the same resampled runs for all columns.
 
@@ -185,31 +199,35 @@ def stratified_bootstrap(
       draws: number of samples to draw.
       seed: any text. The intervals depend only on it and the other arguments: each class has its
         own stream of random bits, the same in every version of NumPy.
-      statistic: applied within each class.
+      statistic: applied within each class; one for all, or one for each by its name.
+      weights: of the classes, positive; None for equal ones.
 
     Returns:
       The lower and upper ends, `[K]` each, in the scores' units; NaN where each class has a
       single run.
     """
-    value = aggregate(classes, statistic)
+    value = aggregate(classes, statistic, weights)
     if max(map(len, classes.values())) == 1:
         return np.full_like(value, np.nan), np.full_like(value, np.nan)
+    shares = _weights(classes, weights)
+    total = sum(shares.values())
     deviation = np.zeros((len(value), draws))
-    for name, runs in classes.items():
+    for name, of_class in _statistics(classes, statistic).items():
+        runs = classes[name]
         n = len(runs)
         if n == 1:
             continue
-        widened = math.sqrt(n / (n - 1)) / len(classes)
-        centre = statistic(runs)[:, None]
+        widened = math.sqrt(n / (n - 1)) * shares[name] / total
+        centre = of_class(runs)[:, None]
         bits = _stream(seed, name)
         rows = max(1, _MAX_NUMBERS // runs.size)
         for first in range(0, draws, rows):
             part = deviation[:, first : first + rows]
             chosen = _resampled(bits, n, part.shape[1])
-            if statistic is iqm:
+            if of_class is iqm:
                 resampled = _weighted_iqm(runs, _counts(chosen))
             else:
-                resampled = statistic(runs[chosen.T]).T
+                resampled = of_class(runs[chosen.T]).T
             part += widened * (resampled - centre)
     return _around(value, deviation)
 
@@ -277,6 +295,20 @@ def probability_of_improvement(
         return Estimate(value, bound, value) if value[0] else Estimate(value, value, 1.0 - bound)
     low, high = _around(value, deviation)
     return Estimate(value, low.clip(0.0, 1.0), high.clip(0.0, 1.0))
+
+
+def _statistics(
+    classes: Mapping[str, Array], statistic: Statistic | Mapping[str, Statistic]
+) -> dict[str, Statistic]:
+    """The statistic of each class."""
+    if isinstance(statistic, Mapping):
+        return {name: statistic[name] for name in classes}
+    return dict.fromkeys(classes, statistic)
+
+
+def _weights(classes: Mapping[str, Array], weights: Mapping[str, float] | None) -> dict[str, float]:
+    """The weight of each class."""
+    return {name: 1.0 if weights is None else weights[name] for name in classes}
 
 
 def _around(value: Array, deviation: Array) -> tuple[Array, Array]:

@@ -91,9 +91,9 @@ def init(
     kind = "a practice board" if document.practice else "a board"
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     out().print(
-        f"A ranked entry needs {templates.plural(runs, 'trained policy', 'trained policies')}: one "
-        f"on each instance of the suite ({instances}), at least {runs_to_rank} in each class "
-        f"({classes}).",
+        f"A ranked entry needs {templates.plural(runs, 'trained policy', 'trained policies')}: at "
+        f"least {runs_to_rank} in each class ({classes}), and as many on each of its instances "
+        f"({instances} in the suite).",
         soft_wrap=True,
     )
     out().print(

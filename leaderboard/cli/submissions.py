@@ -247,7 +247,7 @@ def check(
 
 def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
     """A board of a suite that does not exist, to score by."""
-    from leaderboard.documents.board import BoardDocument
+    from leaderboard.documents.board import RULES, BoardDocument
     from sme_registry.evaluation import resolve_protocol
 
     return BoardDocument(
@@ -257,6 +257,7 @@ def _board_of(file: SuiteFile, protocol: str) -> BoardDocument:
         protocol_name=Path(protocol).stem,
         protocol=resolve_protocol(protocol),
         key="0" * 64,
+        rules=RULES,
     )
 
 
@@ -270,7 +271,7 @@ def _print_scores(result: Result) -> None:
     kind = "95 % intervals over runs" if known else "no intervals: the spread of one run is unknown"
     out().print(f"{kind}; fewest runs in a class: n = {fewest}", style="dim")
     if not result.enough_runs:
-        out().print("The board will list it without a rank: too few runs in a class.")
+        out().print("The board will list it without a rank: too few runs on an instance.")
     if result.oracle_like:
         out().print("The board will mark it oracle-like, which requires the method's code.")
 

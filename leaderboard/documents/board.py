@@ -14,8 +14,9 @@ The log is authoritative. A board has one suite and one protocol.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
@@ -36,7 +37,7 @@ from sme_registry.spec import (
     SuiteFile,
 )
 
-RULES = 2
+RULES: Final = 2
 """The rules of new boards."""
 
 FILE = "board.json"
@@ -75,8 +76,8 @@ class BoardDocument(Document):
       key: the public key of the log's signatures.
       rules: version of the rules of signatures, scores and intervals. Boards of version 1, whose
         JSON has no such field, can be read and verified, and accept nothing.
-      runs_to_rank: runs that a ranked entry needs in each class; below 10 the board is for
-        practice, and says so.
+      runs_to_rank: runs that a ranked entry needs in each class, spread over its instances; below
+        10 the board is for practice, and says so.
       draws: number of bootstrap resamples.
     """
 
@@ -112,8 +113,15 @@ class BoardDocument(Document):
 
     @property
     def runs_needed(self) -> int:
-        """Runs of a ranked entry: at least one on each instance, and enough in each class."""
-        return sum(max(len(one.seeds), self.runs_to_rank) for one in self.suite.classes)
+        """Runs of a ranked entry, in all classes."""
+        return sum(
+            len(member.seeds) * self.runs_on_each(len(member.seeds))
+            for member in self.suite.classes
+        )
+
+    def runs_on_each(self, instances: int) -> int:
+        """Runs that a ranked entry needs on each instance of a class with this many, at least 1."""
+        return math.ceil(self.runs_to_rank / instances)
 
     @property
     def suite_file(self) -> SuiteFile:

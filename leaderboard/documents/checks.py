@@ -9,7 +9,8 @@ Checks that the schema cannot express, in this order. The first failure is repor
     stale_time       and is near the board's
     unknown_spec     every run is on an instance of the suite
     duplicate_run    no run, and no artefact within one instance, is listed twice
-    missing_run      every instance has a run, and every class a count of the runs started
+    missing_run      every instance has a run, a run has a policy, and every class a count of the
+                     runs started
     schema           that count fits into a result
     too_large        no artefact exceeds the board's limit
 
@@ -24,7 +25,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 
-from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.board import RULES, BoardDocument
 from leaderboard.documents.submission import (
     MAX_ARTEFACT_BYTES,
     MAX_BYTES,
@@ -43,6 +44,7 @@ THE_BOARD, REFERENCE_FAMILY = "the board", "reference"
 """Submitter and family reserved for the board's own reference rows."""
 
 MINUTES_AHEAD = 10
+_MAX_RUNS_1 = 10_000  # by rules 1
 
 # ASCII only: a similar letter of another script would let one method imitate another.
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
@@ -157,17 +159,20 @@ def _folded(name: str) -> str:
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()) -> None:
+def check_runs(
+    suite: Suite, submission: Submission, sources: Sequence[str] = (), rules: int = RULES
+) -> None:
     """Reject runs that are not on the suite's instances, listed twice, missing or not counted.
 
     Args:
       suite: the board's suite.
       submission: the submission.
       sources: what to call each run in an error, such as its folder; empty for `runs.0`, ….
+      rules: of the board. Rules 1 admit submissions without a policy and 10,000 runs started.
 
     Raises:
       Rejection: `unknown_spec`, `duplicate_run`, `missing_run`, or `schema` if more runs were
-        started than fit into a result.
+        started than are allowed.
     """
     class_of = {spec.digest: member.name for member in suite.classes for spec in member.instances}
     for index, run in enumerate(submission.runs):
@@ -187,13 +192,18 @@ def check_runs(suite: Suite, submission: Submission, sources: Sequence[str] = ()
                 f"runs: none on {digest} of class {name}: every instance must have one. "
                 "Train on it, or list a failed run (policy null in runs.json), which scores 1.",
             )
-    _check_started(submission, Counter(class_of[run.spec] for run in submission.runs))
+    if rules > 1 and all(run.artefact is None for run in submission.runs):
+        raise Rejection(
+            "missing_run", "runs: none has a policy: at least one must. Submit a trained policy."
+        )
+    listed = Counter(class_of[run.spec] for run in submission.runs)
+    _check_started(submission, listed, MAX_RUNS if rules > 1 else _MAX_RUNS_1)
 
 
 def refuse_unsubmittable(board: BoardDocument) -> None:
     """Refuse a board whose suite needs more runs than a submission can list.
 
-    An entry needs one run on each instance, and `runs_to_rank` runs in each class.
+    An entry needs `runs_to_rank` runs in each class, the same number on each instance.
 
     Raises:
       BoardError: they exceed the size limit of a submission.
@@ -201,10 +211,10 @@ def refuse_unsubmittable(board: BoardDocument) -> None:
     needed, most = board.runs_needed, most_runs(board)
     if needed > most:
         raise BoardError(
-            f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, one on each instance "
-            f"and {board.runs_to_rank} in each class: must be at most {most}, which fit into the "
-            f"{MAX_BYTES:,} bytes of a submission. Use fewer classes or instances, or lower "
-            "runs_to_rank."
+            f"suite={board.suite_name}: a ranked entry needs {needed:,} runs, "
+            f"{board.runs_to_rank} in each class and as many on each instance: must be at most "
+            f"{most}, which fit into the {MAX_BYTES:,} bytes of a submission. Use fewer classes or "
+            "instances, or lower runs_to_rank."
         )
 
 
@@ -268,7 +278,7 @@ def _check_duplicates(submission: Submission, sources: Sequence[str]) -> None:
                 )
 
 
-def _check_started(submission: Submission, listed: Counter[str]) -> None:
+def _check_started(submission: Submission, listed: Counter[str], most: int) -> None:
     started = submission.runs_started
     for name in started:
         if name not in listed:
@@ -285,9 +295,9 @@ def _check_started(submission: Submission, listed: Counter[str]) -> None:
                 "listed runs. Count every run that was ever started with this method (option "
                 "--started).",
             )
-    if sum(started.values()) > MAX_RUNS:
+    if sum(started.values()) > most:
         raise Rejection(
             "schema",
-            f"runs_started={sum(started.values())}: must be at most {MAX_RUNS:,} in total. "
+            f"runs_started={sum(started.values())}: must be at most {most:,} in total. "
             "Count the runs of this version of the method only.",
         )

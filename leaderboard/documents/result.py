@@ -10,14 +10,15 @@ Per run, ρ_m the mean |a − a*| of region m and ρ⁰_m the same of the consta
     similarity loss          100 (r̃_WD − mean r̃_OOD) points, the paper's form
 
 A run that failed, or was started and not listed, scores 1 in every region and every metric, and
-loses 100 points of similarity: a missing policy never improves a score.
+loses 100 points of similarity: a missing policy never improves a score. `scoring.aggregation` says
+how runs become scores. Fields younger than version 1 are left out of the JSON at their defaults.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from leaderboard.errors import CODES
 from sme_registry.spec import (
@@ -34,6 +35,7 @@ Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 """The metrics that a board ranks by."""
 
 METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
+Isolation = Literal["", "bwrap", "process"]
 _Regions = Annotated[tuple[Real, ...], Field(strict=False, min_length=2)]
 
 
@@ -48,7 +50,7 @@ class RunScore(StrictModel):
     """One run.
 
     Attributes:
-      spec: digest of the instance; of a run that was started and not listed, null.
+      spec: digest of the instance; null in results of rules 1 for runs started and not listed.
       class_name: the suite's class that the instance belongs to.
       artefact: digest of the policy; null where the run failed.
       evaluation_seed: of the states, derived from protocol, spec and artefact; null likewise.
@@ -58,6 +60,8 @@ class RunScore(StrictModel):
         module.
       agents: of a team, in the order of the channels that they own; empty for a single agent and
         where there is no policy.
+      rounding: mean |Δa| on random states if the arithmetic is rounded at random; null where there
+        is no policy, and in results of rules 1.
     """
 
     spec: Digest | None
@@ -72,6 +76,14 @@ class RunScore(StrictModel):
     regret_slope: Real
     similarity_loss: Real
     agents: Annotated[tuple[AgentScore, ...], Field(strict=False)] = ()
+    rounding: Real | None = None
+
+    @model_serializer(mode="wrap")
+    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        if self.rounding is None:
+            del plain["rounding"]
+        return plain
 
 
 class Estimate(StrictModel):
@@ -97,7 +109,7 @@ class Estimate(StrictModel):
 
 
 class ClassScore(StrictModel):
-    """One class of the suite: interquartile means over its runs.
+    """One class of the suite: the mean over its instances of the interquartile mean over runs.
 
     Attributes:
       runs: number of runs counted, including failed and missing ones.
@@ -114,7 +126,7 @@ class ClassScore(StrictModel):
 
 
 class Scores(StrictModel):
-    """θ of each metric: the mean over classes of the interquartile mean within a class.
+    """θ of each metric: the mean over classes of the scores of a class.
 
     Attributes:
       normalised_regret: θ of N_m of each region, WD first.
@@ -137,10 +149,12 @@ class Result(Document):
       status: "scored" or "rejected".
       code, message: why it was rejected; empty where it was scored.
       scores, classes, runs: null and empty where it was rejected.
-      enough_runs: whether each class has the runs that ranking needs.
+      runs: those that the submission lists, in its order; by rules 1 then those that it does not.
+      enough_runs: whether each instance (by rules 1, each class) has the runs that ranking needs.
       oracle_like: OOD regret ≤ 0.01, or WD regret ≤ 0.02 and |OOD decay| ≤ 0.01: the page asks
         for code.
       versions: of the packages on which the numbers depend.
+      isolation: of the sandbox, "bwrap" or "process"; empty in results of rules 1.
     """
 
     schema_version: SchemaVersion = 1
@@ -156,6 +170,14 @@ class Result(Document):
     enough_runs: bool = False
     oracle_like: bool = False
     versions: dict[str, str] = Field(default_factory=dict)
+    isolation: Isolation = ""
+
+    @model_serializer(mode="wrap")
+    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        if not self.isolation:
+            del plain["isolation"]
+        return plain
 
     @model_validator(mode="after")
     def _status_fits(self) -> Self:

@@ -30,8 +30,8 @@ FILE = "submission.json"
 ARTEFACTS = "artefacts"
 MAX_BYTES = 64 * 2**10
 MAX_ARTEFACT_BYTES = 8 * 2**20
-MAX_RUNS = 10_000
-"""Largest total of `runs_started`: each run takes a line of the result."""
+MAX_RUNS = 1000
+"""Largest total of `runs_started`."""
 
 Track = Literal["open"]
 Knowledge = Literal["generic", "family", "oracle"]

@@ -21,18 +21,11 @@ from typing import Any, NoReturn
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
 from leaderboard.documents.keys import verifies
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import Artefact, Run, SignedSubmission, SignedWithdrawal
+from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.score import (
-    Progress,
-    agent_names,
-    evaluation_seed,
-    failed_run,
-    never_listed,
-    result_of,
-    run_metrics,
-    score_submission,
-)
+from leaderboard.scoring.aggregation import never_listed, result_of
+from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
+from leaderboard.scoring.score import Progress, agent_names, evaluation_seed, score_submission
 from leaderboard.store import (
     Index,
     IndexUnusable,
@@ -318,7 +311,7 @@ class _Verifier:
             assert result is not None
             if result.status == "scored":
                 _check_runs(store, result)
-                _check_scores(store.document, result)
+                _check_scores(store, result)
             self.count_row()
         return len(ids)
 
@@ -357,40 +350,49 @@ def _check_runs(store: Store, result: Result) -> None:
     """Check that the scores are of the submitted runs on their own states; failed runs score 1."""
     document, instances = store.document, store.document.instances
     submission = store.submission(result.submission).submission
-    try:
-        unlisted = never_listed(document, submission)
-    except Rejection as error:
-        _refuse_result(result.submission, f"its submission cannot be scored: {error}")
-    pairs = itertools.zip_longest([*submission.runs, *unlisted], result.runs)
-    for number, (run, score) in enumerate(pairs):
-        match run:
-            case Run(spec=spec, artefact=Artefact(sha256=digest)):
-                seed = evaluation_seed(document.protocol.digest, spec, digest)
-                matches = score is not None and (
-                    (score.spec, score.class_name, score.artefact, score.evaluation_seed)
-                    == (spec, instances[spec][0], digest, seed)
-                    and [agent.name for agent in score.agents] == agent_names(instances[spec][1])
-                )
-            case Run(spec=spec):
-                matches = score == failed_run(document, instances[spec][0], spec)
-            case _:
-                matches = score == run
+    listed = result.runs[: len(submission.runs)]
+    for number, (run, score) in enumerate(itertools.zip_longest(submission.runs, listed)):
+        if score is None:
+            matches = False
+        elif run.artefact is None:
+            matches = score == failed_run(document, instances[run.spec][0], run.spec)
+        else:
+            class_name, spec = instances[run.spec]
+            digest = run.artefact.sha256
+            seed = evaluation_seed(document.protocol.digest, run.spec, digest)
+            matches = (score.spec, score.class_name, score.artefact, score.evaluation_seed) == (
+                *(run.spec, class_name, digest, seed),
+            ) and [agent.name for agent in score.agents] == agent_names(spec)
         if not matches:
             _refuse_result(result.submission, f"runs.{number}: does not match the submitted run")
 
 
-def _check_scores(document: BoardDocument, result: Result) -> None:
+def _check_scores(store: Store, result: Result) -> None:
     """Check that each run's metrics follow from its regions, and the scores from the runs."""
-    levels = [high for _, high in document.protocol.edges]
+    document = store.document
+    submission = store.submission(result.submission).submission
     for number, run in enumerate(result.runs):
-        for name, value in run_metrics(run.normalised_regret, run.similarity, levels).items():
+        for name, value in run_metrics(
+            run.normalised_regret, run.similarity, levels_of(document)
+        ).items():
             if not _close(value, getattr(run, name), EXACT):
                 _refuse_result(
                     result.submission, f"runs.{number}.{name}: does not follow from its regions"
                 )
-    expected = result_of(document, result.submission, result.runs, result.versions)
+    try:
+        unlisted = never_listed(document, submission)
+    except Rejection as error:
+        _refuse_result(result.submission, f"its submission cannot be scored: {error}")
+    expected = result_of(
+        document,
+        result.submission,
+        result.runs[: len(submission.runs)],
+        result.versions,
+        unlisted=unlisted,
+        isolation=result.isolation,
+    )
     if not _close(expected.to_dict(), result.to_dict(), EXACT):
-        _refuse_result(result.submission, "its scores do not follow from its runs")
+        _refuse_result(result.submission, "its runs or scores do not follow from its submission")
 
 
 def _rescore(store: Store, id: str) -> None:

@@ -125,10 +125,11 @@ def test_artefacts_pass_the_gate_with_the_widths_of_their_spec(
 
 
 def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> None:
-    signed, _ = tiny_submission(store, key)
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
     plain = signed.submission.to_dict()
-    for run in plain["runs"]:
-        run["artefact"] = None
+    plain["runs"].append({**plain["runs"][0], "seed": 9, "artefact": None})
+    plain["runs_started"]["Tiny"] += 1
     failed = type(signed.submission).from_dict(plain).signed(key)
     assert receive(store, failed) == failed.id
 

@@ -138,7 +138,9 @@ class Pages:
             "waiting": [entry for entry in entrants if entry.status == "waiting"],
             "closed": [e for e in reversed(entrants) if e.status in ("rejected", "withdrawn")],
             "address": self._address,
-            "seeds": max(max(len(one.seeds), self.document.runs_to_rank) for one in classes),
+            "seeds": max(
+                len(one.seeds) * self.document.runs_on_each(len(one.seeds)) for one in classes
+            ),
         }
 
     def submission(self, id: str) -> str:

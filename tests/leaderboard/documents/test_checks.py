@@ -9,6 +9,7 @@ import pytest
 from leaderboard.documents.board import BoardDocument, Limits
 from leaderboard.documents.checks import (
     check_names,
+    check_runs,
     check_submission,
     most_runs,
     refuse_unsubmittable,
@@ -262,17 +263,24 @@ def test_runs_started_that_do_not_count_the_runs_listed_are_refused(started, mat
     refused("missing_run", match, runs_started=started)
 
 
-def test_more_runs_started_than_a_result_can_hold_are_refused():
-    accepted(runs_started={"A": 9_000, "B": 1_000})
+def test_more_than_a_thousand_runs_started_are_refused():
+    accepted(runs_started={"A": 900, "B": 100})
     refused(
         "schema",
-        "runs_started=10001: must be at most 10,000 in total",
-        runs_started={"A": 9_000, "B": 1_001},
+        "runs_started=1001: must be at most 1,000 in total",
+        runs_started={"A": 900, "B": 101},
     )
 
 
+def test_runs_without_any_policy_are_refused_by_new_rules_only():
+    runs = [run(A0), run(A1), run(B0)]
+    refused("missing_run", "none has a policy", runs=runs)
+    many = submission(runs=runs, runs_started={"A": 9_000, "B": 1_000})
+    check_runs(BOARD.suite, many, rules=1)
+
+
 def test_failed_runs_count_as_started():
-    runs = [run(A0), run(A1), run(B0), run(B0, 1)]
+    runs = [run(A0, 0, policy(1)), run(A1), run(B0), run(B0, 1)]
     refused("missing_run", "runs_started.B=1: must be at least 2", runs=runs)
 
 
@@ -317,7 +325,7 @@ def test_a_board_whose_suite_exceeds_a_submission_is_refused(tmp_path):
     refuse_unsubmittable(board_of(most))
     with pytest.raises(BoardError, match=rf"suite=two-v1: .* {most + 1} runs.*at most {most},"):
         refuse_unsubmittable(board_of(most + 1))
-    with pytest.raises(BoardError, match="and 300 in each class"):
+    with pytest.raises(BoardError, match="300 in each class and as many on each instance"):
         refuse_unsubmittable(board_of(1, runs_to_rank=300))
     with pytest.raises(BoardError, match="needs 260 runs"):
         Store.create(

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import trim_mean
 
 from benchmarks.interval_coverage import CLASSES, DISTRIBUTIONS, RUNS, simulate
+from leaderboard.scoring.metrics import run_metrics
 from leaderboard.scoring.ranking import rank_ranges
-from leaderboard.scoring.score import run_metrics
 from sme_registry import statistics
 from sme_registry.statistics import Array, iqm
 from sme_registry.statistics import aggregate as theta

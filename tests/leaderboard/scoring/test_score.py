@@ -19,14 +19,9 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
-from leaderboard.scoring.score import (
-    _oracle_like,
-    evaluation_seed,
-    failed_run,
-    result_of,
-    run_metrics,
-    score_submission,
-)
+from leaderboard.scoring.aggregation import _oracle_like, result_of
+from leaderboard.scoring.metrics import failed_run, run_metrics
+from leaderboard.scoring.score import evaluation_seed, score_submission
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
 from sme_registry.spec import Suite
 from tests.leaderboard.artefact import models

@@ -30,8 +30,7 @@ def board(store, submit) -> Path:
     """A board of two real policies and one run that failed."""
     submit(1)
     submit(2)
-    failed = {"spec": store.document.suite.instances[0].digest, "seed": 0, "steps": 5}
-    submit(3, runs=[failed])
+    submit(3)
     return store.folder.path
 
 

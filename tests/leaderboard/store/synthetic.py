@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from leaderboard.documents.result import Result, RunScore
-from leaderboard.scoring.score import evaluation_seed, result_of, run_metrics
+from leaderboard.scoring.aggregation import result_of
+from leaderboard.scoring.metrics import run_metrics
+from leaderboard.scoring.score import evaluation_seed
 from leaderboard.store import Store
 
 

@@ -15,7 +15,7 @@ import pytest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.scoring.score import result_of
+from leaderboard.scoring.aggregation import result_of
 from leaderboard.store import Index, Store, collect_garbage
 from tests.leaderboard.conftest import (
     put_submission,

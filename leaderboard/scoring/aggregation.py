@@ -1,0 +1,210 @@
+"""`result_of`: from the runs of a submission to a method's scores, with their intervals.
+
+                    rules 2, of new boards               rules 1, of earlier boards
+    group           the runs on one instance             the runs of one class
+    class score     mean over groups of the interquartile mean (IQM) of a group
+    θ               mean over the classes
+    a rank needs    ⌈runs_to_rank / groups of the class⌉ runs in every group
+    unlisted runs   count for the instance of their      are runs of the result,
+                    class with the fewest runs           without an instance
+    bootstrap       of sorted columns, seeded by suite   of runs, seeded by the
+                    and protocol                         submission's id
+
+Groups prevent an instance that a method gives up from being trimmed: the IQM of a class of two
+instances and of a method with ten runs on one of them and a failed one on the other would be the
+ten runs alone. θ is not the pooled IQM of all runs, which hardly changes when a method fails on a
+whole class.
+
+Rules 2 leave a submitter no influence on the random numbers of the bootstrap: its seed is the
+board's, and the order of runs does not matter. Sorting each column is allowed, because runs are
+exchangeable and each interval is of one column.
+
+The bootstrap's strata are the groups of two or more runs. The single runs of a class's other
+groups form one stratum, whose statistic is the mean: its spread is that of runs and instances, so
+the interval is rather too wide than too narrow. The spread of one single run in a class is unknown,
+and adds nothing. `python -m benchmarks.interval_coverage` measures the coverage.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.checks import check_runs
+from leaderboard.documents.result import (
+    METRICS,
+    ClassScore,
+    Estimate,
+    Isolation,
+    Result,
+    RunScore,
+    Scores,
+)
+from leaderboard.documents.submission import Submission
+from leaderboard.scoring.metrics import failed_run
+from sme_registry.statistics import Array, Statistic, aggregate, iqm, mean, stratified_bootstrap
+
+ORACLE_OOD, ORACLE_WD, FLAT = 0.01, 0.02, 0.01
+"""Oracle-like: N̄ at most the first, or N₀ at most the second and |N̄ − N₀| at most the third."""
+
+_SIGNED = ("ood_decay", "regret_slope", "similarity_loss")  # may be negative
+
+Groups = dict[str, dict[str, list[RunScore]]]
+"""The runs by class, and in each class by group."""
+
+
+def result_of(
+    board: BoardDocument,
+    submission: str,
+    runs: Sequence[RunScore],
+    versions: dict[str, str],
+    *,
+    unlisted: Sequence[RunScore] = (),
+    isolation: Isolation = "",
+) -> Result:
+    """The result of scored runs: θ, intervals and flags.
+
+    Args:
+      board: the suite, the rules, and the numbers of runs and bootstrap draws.
+      submission: its id.
+      runs: the listed runs, at least one of each class.
+      versions: of packages.
+      unlisted: the runs that were started and not listed, as `never_listed` gives them.
+      isolation: of the sandbox.
+    """
+    counted = [*runs, *unlisted]
+    groups = groups_of(board, counted)
+    scores = _scores(board, groups, submission)
+    return Result(
+        submission=submission,
+        suite=board.suite.digest,
+        protocol=board.protocol.digest,
+        status="scored",
+        scores=scores,
+        classes=tuple(_class_score(name, members) for name, members in groups.items()),
+        runs=tuple(counted if board.rules == 1 else runs),
+        enough_runs=all(
+            len(group) >= board.runs_on_each(len(members))
+            for members in groups.values()
+            for group in members.values()
+        ),
+        oracle_like=_oracle_like(scores),
+        versions=versions,
+        isolation=isolation,
+    )
+
+
+def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]:
+    """A score of 1 for each run that was started and is not listed, in the order of classes.
+
+    By rules 2 each is on the instance of its class with the fewest runs so far, the first of these
+    in the suite's order.
+
+    Raises:
+      Rejection: a code of `check_runs`.
+    """
+    check_runs(board.suite, submission, rules=board.rules)
+    listed = Counter(run.spec for run in submission.runs)
+    runs = []
+    for member in board.suite.classes:
+        counts = {spec.digest: listed[spec.digest] for spec in member.instances}
+        for _ in range(submission.runs_started[member.name] - sum(counts.values())):
+            fewest = min(counts, key=lambda digest: counts[digest])
+            counts[fewest] += 1
+            runs.append(failed_run(board, member.name, None if board.rules == 1 else fewest))
+    return runs
+
+
+def groups_of(board: BoardDocument, runs: Sequence[RunScore]) -> Groups:
+    """All runs of a submission, listed or not, in the groups of the board's rules.
+
+    Groups are in the suite's order, and none is empty.
+    """
+    if board.rules == 1:
+        names = [member.name for member in board.suite.classes]
+        return {name: {name: [run for run in runs if run.class_name == name]} for name in names}
+    groups: Groups = {member.name: {} for member in board.suite.classes}
+    for digest, (name, _) in board.instances.items():
+        groups[name][digest] = []
+    for run in runs:
+        assert run.spec is not None  # by rules 2, `never_listed` gives each run an instance
+        groups[run.class_name][run.spec].append(run)
+    return groups
+
+
+def class_mean(
+    members: dict[str, list[RunScore]], values: Callable[[RunScore], Sequence[float]]
+) -> Array:
+    """The score of a class: the mean over its groups of the IQM over a group's runs.
+
+    Args:
+      members: the class's runs by group.
+      values: `[K]` of a run.
+
+    Returns:
+      `[K]`.
+    """
+    return mean([iqm([values(run) for run in group]) for group in members.values()])
+
+
+def _class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
+    runs = [run for group in members.values() for run in group]
+    wd, ood = class_mean(members, lambda run: (run.wd_regret, run.ood_regret)).tolist()
+    return ClassScore(
+        name=name,
+        runs=len(runs),
+        submitted=sum(run.artefact is not None for run in runs),
+        wd_regret=wd,
+        ood_regret=ood,
+        normalised_regret=tuple(class_mean(members, lambda run: run.normalised_regret).tolist()),
+    )
+
+
+def _scores(board: BoardDocument, groups: Groups, submission: str) -> Scores:
+    """θ of each metric and each region, with intervals."""
+    strata: dict[str, Array] = {}
+    statistics: dict[str, Statistic] = {}
+    weights: dict[str, float] = {}
+    for name, runs, statistic, weight in _strata(groups):
+        columns = [
+            [*(getattr(run, metric) for metric in METRICS), *run.normalised_regret] for run in runs
+        ]
+        strata[name] = np.array(columns) if board.rules == 1 else np.sort(columns, axis=0)
+        statistics[name], weights[name] = statistic, weight
+    seed = submission if board.rules == 1 else f"{board.suite.digest}\n{board.protocol.digest}"
+    value = aggregate(strata, statistics, weights)
+    low, high = stratified_bootstrap(strata, board.draws, seed, statistics, weights)
+    # Regret is never negative, so a lower end below 0 carries no information.
+    signed = [name in _SIGNED for name in METRICS] + [False] * (len(value) - len(METRICS))
+    low = np.where(signed, low, np.maximum(low, 0.0))
+    ends = [(None, None)] * len(value) if np.isnan(low).any() else zip(low, high, strict=True)
+    estimates = [
+        Estimate(value=theta, low=low, high=high)
+        for theta, (low, high) in zip(value.tolist(), ends, strict=True)
+    ]
+    return Scores(
+        **dict(zip(METRICS, estimates, strict=False)),
+        normalised_regret=tuple(estimates[len(METRICS) :]),
+    )
+
+
+def _strata(groups: Groups) -> Iterator[tuple[str, list[RunScore], Statistic, float]]:
+    """Name, runs, statistic and weight of each stratum; the weights of a class sum to 1."""
+    for name, members in groups.items():
+        singles = []
+        for group, runs in members.items():
+            if len(runs) > 1:
+                yield group, runs, iqm, 1.0 / len(members)
+            else:
+                singles += runs
+        if singles:
+            yield name, singles, mean, len(singles) / len(members)
+
+
+def _oracle_like(scores: Scores) -> bool:
+    return scores.ood_regret.value <= ORACLE_OOD or (
+        scores.wd_regret.value <= ORACLE_WD and abs(scores.ood_decay.value) <= FLAT
+    )
