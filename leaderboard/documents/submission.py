@@ -243,7 +243,18 @@ def _validate(kind: type[_Model], plain: Any, name: str) -> _Model:
 
 def utc(moment: datetime.datetime) -> str:
     """A time as documents write it."""
-    return moment.astimezone(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    # Not strftime, which does not write the year 1 with four digits everywhere.
+    plain = moment.astimezone(datetime.UTC).replace(microsecond=0, tzinfo=None)
+    return f"{plain.isoformat()}Z"
+
+
+def shifted(moment: datetime.datetime, by: datetime.timedelta) -> datetime.datetime:
+    """A time in UTC later by so much, at most the last or the first one that Python knows."""
+    try:
+        return moment + by
+    except OverflowError:
+        end = datetime.datetime.max if by > datetime.timedelta() else datetime.datetime.min
+        return end.replace(tzinfo=datetime.UTC)
 
 
 def now() -> str:

@@ -19,9 +19,11 @@ from leaderboard.documents.submission import (
     Artefact,
     SignedSubmission,
     Submission,
+    shifted,
     utc,
 )
 from leaderboard.errors import Rejection
+from leaderboard.intake.uploads import quota_window
 from leaderboard.store import Store
 
 _DAY = datetime.timedelta(days=1)
@@ -95,9 +97,10 @@ def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
     limits = store.document.limits
     if key == store.document.key:
         return
-    times = store.submission_times(key, utc(moment - _DAY))
+    times = store.submission_times(key, *quota_window(moment))
     if len(times) >= limits.submissions_per_day:
-        free = datetime.datetime.fromisoformat(times[-limits.submissions_per_day]) + _DAY
+        first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
+        free = shifted(first, _DAY)
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "

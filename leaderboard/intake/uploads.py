@@ -10,12 +10,12 @@ import datetime
 import re
 
 from leaderboard.documents.keys import SigningKey, verifies
-from leaderboard.documents.submission import now, utc
+from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import Rejection
 from leaderboard.store import Store
 
 UPLOAD_MINUTES = 10
-_DAY = datetime.timedelta(days=1)
+_DAY, _SKEW = datetime.timedelta(days=1), datetime.timedelta(minutes=UPLOAD_MINUTES)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
     r"time=(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ),"
@@ -69,6 +69,14 @@ def uploader(header: str | None, digest: str, at: datetime.datetime | None = Non
     return key
 
 
+def quota_window(moment: datetime.datetime) -> tuple[str, str]:
+    """The times after and up to which submissions and uploads count: a day ago, soon.
+
+    What is dated later was received while the board's clock was wrong, and counts no longer.
+    """
+    return utc(shifted(moment, -_DAY)), utc(shifted(moment, _SKEW))
+
+
 def check_upload(
     store: Store,
     key: str,
@@ -99,7 +107,7 @@ def check_upload(
             "Export a smaller network.",
         )
     moment = at or datetime.datetime.now(datetime.UTC)
-    used = store.uploaded_bytes(key, utc(moment - _DAY)) + pending_of_key
+    used = store.uploaded_bytes(key, *quota_window(moment)) + pending_of_key
     if used + size > limits.upload_bytes_per_day:
         raise Rejection(
             "quota",

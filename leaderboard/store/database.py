@@ -18,7 +18,7 @@ from typing import Self
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import utc
+from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import FolderLock, digest_of, unwritable, write_document
 from leaderboard.store.index import Index, IndexUnusable
@@ -26,6 +26,8 @@ from leaderboard.store.log import EMPTY, Event, Head, Log
 from leaderboard.store.objects import Objects
 from sme_registry.io import sync_folder, temporary_beside
 from sme_registry.spec import StrictModel
+
+_EPOCH = datetime.datetime.fromtimestamp(0, datetime.UTC)
 
 
 class Database:
@@ -290,7 +292,8 @@ class Database:
         for digest, path in self.objects.paths():
             if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
                 stat = path.stat()
-                uploaded = utc(datetime.datetime.fromtimestamp(stat.st_mtime, datetime.UTC))
+                seconds = min(max(stat.st_mtime, 0.0), 1e12)  # of another machine's clock
+                uploaded = utc(shifted(_EPOCH, datetime.timedelta(seconds=seconds)))
                 index.connection.execute(
                     "INSERT INTO upload VALUES (?, ?, '', ?)", (digest, stat.st_size, uploaded)
                 )

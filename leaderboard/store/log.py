@@ -2,25 +2,32 @@
 
 entry_n.previous  = digest(entry_{n−1})          64 zeros for the first
 entry_n.signature = by the board's key, over the entry without it
+
+The number orders the entries. The time is the clock's own, which may have been wrong: it may go
+back from one entry to the next, but not to before the first.
 """
 
 from __future__ import annotations
 
+import datetime
+import functools
 import hashlib
 from typing import Annotated, Any, Literal, NamedTuple
 
 import rfc8785
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import Signature, SigningKey, verifies
 from leaderboard.documents.submission import UtcTime, now
-from leaderboard.errors import TamperedError
+from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import read_document, write_document
 from sme_registry.spec import Digest, Document, Integer, SchemaVersion
 
 Event = Literal["opened", "received", "result", "withdrawn"]
 NOTHING = "sha256:" + "0" * 64
+LONGEST_PAUSE = datetime.timedelta(days=3653)
+"""Between two entries: ten years; a clock that shows more is wrong."""
 
 
 class Head(NamedTuple):
@@ -44,7 +51,7 @@ class LogEntry(Document):
     Attributes:
       sequence: its number, 0 for the first.
       previous: digest of the entry before; 64 zeros for the first.
-      time: of the event by the board's clock, never earlier than the entry before.
+      time: of the event by the board's clock, which may have been set back since the entry before.
       event: "opened" (once, the first), "received", "result" or "withdrawn".
       subject: the submission's id; for "opened" the board document's digest.
       document: SHA-256 of the file written: the signed submission, the result, the signed
@@ -60,6 +67,12 @@ class LogEntry(Document):
     subject: Digest
     document: Digest
     signature: Signature
+
+    @field_validator("time")
+    @classmethod
+    def _is_a_time(cls, value: str) -> str:
+        datetime.datetime.fromisoformat(value)  # not 30 February
+        return value
 
     @property
     def signed_digest(self) -> str:
@@ -110,8 +123,6 @@ class Log:
         where = f"log/{entry.sequence:08d}.json"
         if entry.previous != head.digest:
             raise TamperedError(where, "does not follow the entry before it: one was replaced")
-        if entry.time < head.time:
-            raise TamperedError(where, f"time={entry.time}: is earlier than the entry before it")
         if (entry.event == "opened") != (entry.sequence == 0):
             raise TamperedError(where, "only the first entry may open a board")
         return entry
@@ -121,16 +132,18 @@ class Log:
     ) -> LogEntry:
         """Write the entry after `head`.
 
-        If the clock was set back, entries repeat the last time until the clock has caught up.
-
         Raises:
-          BoardError: it cannot be written, or another process has used its number.
+          BoardError: it cannot be written, another process has used its number, or the clock is
+            plainly wrong: before the first entry, or ten years after the last.
         """
+        time = now()
+        if head.sequence >= 0:
+            self._refuse_wrong_clock(time, head)
         fields = {
             "schema_version": 1,
             "sequence": head.sequence + 1,
             "previous": head.digest,
-            "time": max(now(), head.time),
+            "time": time,
             "event": event,
             "subject": subject,
             "document": document,
@@ -138,6 +151,23 @@ class Log:
         entry = LogEntry.from_dict({**fields, "signature": key.sign("log", _digest(fields))})
         write_document(self.folder.log_entry(entry.sequence), entry, new=True)
         return entry
+
+    @functools.cached_property
+    def _opened(self) -> str:
+        return self.read(0).time
+
+    def _refuse_wrong_clock(self, time: str, head: Head) -> None:
+        moment, last = (datetime.datetime.fromisoformat(each) for each in (time, head.time))
+        if time < self._opened:
+            fault = f"before the board was opened, at {self._opened}"
+        elif moment - last > LONGEST_PAUSE:
+            fault = f"more than ten years after the log's last entry, of {head.time}"
+        else:
+            return
+        raise BoardError(
+            f"clock={time}: is {fault}. Nothing was changed. Set the machine's clock, then try "
+            'again; docs/leaderboard.md, "A wrong clock", has the rest.'
+        )
 
 
 def _digest(fields: dict[str, Any]) -> str:

@@ -21,6 +21,7 @@ from leaderboard.store.queue import Queue
 from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
 
+LAST_TIME = "9999-12-31T23:59:59Z"
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -244,13 +245,19 @@ class Store(Database):
         with self.reading() as index:
             return index.head
 
-    def uploaded_bytes(self, key: str, since: str) -> int:
-        """Bytes that a key has uploaded since a time in the form of `submission.now()`."""
+    def uploaded_bytes(self, key: str, since: str, until: str = LAST_TIME) -> int:
+        """Bytes that a key has uploaded after `since` and not after `until`.
+
+        Both have the form of `submission.now()`. An upload dated after `until` was made while the
+        clock was wrong.
+        """
         with self.reading() as index:
             return index.number(
-                "SELECT (SELECT coalesce(sum(size), 0) FROM object WHERE key = ?1 AND received >= "
-                "?2) + (SELECT coalesce(sum(size), 0) FROM upload WHERE key = ?1 AND time >= ?2)",
-                *(key, since),
+                "SELECT (SELECT coalesce(sum(size), 0) FROM object "
+                "WHERE key = ?1 AND received > ?2 AND received <= ?3) + "
+                "(SELECT coalesce(sum(size), 0) FROM upload "
+                "WHERE key = ?1 AND time > ?2 AND time <= ?3)",
+                *(key, since, until),
             )
 
     def total_bytes(self) -> int:
@@ -261,12 +268,13 @@ class Store(Database):
                 " + (SELECT coalesce(sum(size), 0) FROM upload)"
             )
 
-    def submission_times(self, key: str, since: str) -> list[str]:
-        """When each submission of a key since a time was received, in order."""
+    def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:
+        """When each submission of a key was received, in order: after `since`, up to `until`."""
         with self.reading() as index:
             rows = index.connection.execute(
-                "SELECT received FROM entry WHERE key = ? AND received >= ? ORDER BY received",
-                (key, since),
+                "SELECT received FROM entry WHERE key = ? AND received > ? AND received <= ? "
+                "ORDER BY received",
+                (key, since, until),
             )
             return [received for (received,) in rows]
 

@@ -149,6 +149,45 @@ def test_the_daily_quota_frees_up_at_the_stated_time(tmp_path: Path, key: Signin
         assert receive(store, signed, at=after) == signed.id
 
 
+def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(
+    tmp_path: Path, key: SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = {"submissions_per_day": 1, "upload_bytes_per_day": 1000}
+    with tiny_board(tmp_path / "b", limits=limits) as store:
+        with monkeypatch.context() as patch:
+            later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=900)
+            patch.setattr("leaderboard.store.log.now", lambda: utc(later))
+            patch.setattr("leaderboard.store.store.now", lambda: utc(later))
+            put(store, key, {"sha256:" + _sha256(bytes(900)): bytes(900)})
+            put_submission(store, key, 1)
+        intake.check_upload(store, key.public, 1000)
+        signed, _ = tiny_submission(store, key, 1, statement="Again.")
+        assert receive(store, signed) == signed.id
+        again, _ = tiny_submission(store, key, 1, statement="Too many.")
+        assert code_of(lambda: receive(store, again)) == "quota"
+
+
+@pytest.mark.parametrize("year", [1, 9999])
+def test_the_first_and_the_last_year_have_quotas(
+    tmp_path: Path, key: SigningKey, monkeypatch: pytest.MonkeyPatch, year: int
+) -> None:
+    moment = datetime.datetime(year, 12 if year > 1 else 1, 31 if year > 1 else 1, 23, 59, 30)
+    moment = moment.replace(tzinfo=datetime.UTC)
+    for name in ("log", "store"):
+        monkeypatch.setattr(f"leaderboard.store.{name}.now", lambda: utc(moment))
+    monkeypatch.setattr("tests.leaderboard.conftest.now", lambda: utc(moment))
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 1}) as store:
+        intake.submit_references(store)
+        signed, artefacts = tiny_submission(store, key, 1)
+        put(store, key, artefacts)
+        intake.check_upload(store, key.public, 1, at=moment)
+        assert receive(store, signed, at=moment) == signed.id
+        signed, _ = tiny_submission(store, key, 1, statement="Too many.")
+        assert code_of(lambda: receive(store, signed, at=moment)) == "quota"
+        assert store.log()[-1].time == utc(moment)
+        store.reindex()
+
+
 def test_each_key_has_its_own_quota(tmp_path: Path, key: SigningKey) -> None:
     with tiny_board(tmp_path / "b", limits={"submissions_per_day": 1}) as store:
         put_submission(store, key, 1)

@@ -4,7 +4,9 @@ import pytest
 
 from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store import EMPTY, Store
+from leaderboard.scoring.verify import verify
+from leaderboard.store import EMPTY, LogEntry, Store
+from sme_registry.errors import SpecError
 from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_board
 
 
@@ -45,16 +47,57 @@ def test_a_range_of_the_log_stops_at_its_end(store, submit):
     assert store.log(4, 100) == []
 
 
-def test_times_stand_still_while_the_clock_is_set_back(store, submit, monkeypatch):
-    times = iter(["2030-01-01T00:00:00Z", "2020-01-01T00:00:00Z", "2031-01-01T00:00:00Z"])
-    monkeypatch.setattr("leaderboard.store.log.now", lambda: next(times))
-    for number in range(3):
-        submit(number)
-    assert [entry.time for entry in store.log(1)] == [
-        "2030-01-01T00:00:00Z",
-        "2030-01-01T00:00:00Z",
-        "2031-01-01T00:00:00Z",
-    ]
+@pytest.fixture
+def clock(monkeypatch):
+    """The board's clock, a list of one time."""
+    time = ["2030-01-01T00:00:00Z"]
+    monkeypatch.setattr("leaderboard.store.log.now", lambda: time[0])
+    monkeypatch.setattr("leaderboard.store.store.now", lambda: time[0])
+    return time
+
+
+def test_entries_have_the_clocks_own_time_which_may_go_back(tmp_path, key, clock):
+    times = ["2030-01-01T00:00:00Z", "2039-12-31T23:59:59Z", "2030-01-01T00:00:01Z"]
+    with tiny_board(tmp_path / "board") as store:
+        for number, time in enumerate(times):
+            clock[0] = time
+            put_submission(store, key, number)
+        assert [entry.time for entry in store.log(1)] == times
+        assert [row.received for row in store.entries()] == times
+        store.reindex()
+        assert [row.received for row in store.entries()] == times
+    verify(tmp_path / "board")
+    with Store.open(tmp_path / "board", read_only=True) as store:
+        assert store.head.time == times[-1]
+
+
+@pytest.mark.parametrize(
+    "wrong", ["2029-12-31T23:59:59Z", "2040-01-03T00:00:00Z", "9999-12-31T23:59:59Z"]
+)
+def test_a_clock_that_is_plainly_wrong_writes_nothing(tmp_path, key, clock, wrong):
+    with tiny_board(tmp_path / "board") as store:
+        clock[0] = wrong
+        with pytest.raises(BoardError, match=f"clock={wrong}"):
+            put_submission(store, key)
+        assert store.entries() == []
+        clock[0] = "2030-01-02T00:00:00Z"
+        put_submission(store, key)
+    assert verify(tmp_path / "board").entries == 2
+
+
+def test_a_clock_off_by_decades_is_repaired_in_steps(tmp_path, key, clock):
+    clock[0] = "0001-01-01T00:00:00Z"
+    with tiny_board(tmp_path / "board") as store:
+        for number, time in enumerate(["0010-06-01T00:00:00Z", "0020-05-01T00:00:00Z"]):
+            clock[0] = time
+            put_submission(store, key, number)
+    verify(tmp_path / "board")
+
+
+def test_a_time_that_does_not_exist_is_no_entry(store):
+    (entry,) = store.log()
+    with pytest.raises(SpecError, match="time"):
+        LogEntry.from_dict({**entry.to_dict(), "time": "2026-02-30T00:00:00Z"})
 
 
 def test_a_board_without_its_key_can_be_read_but_not_written(tmp_path, key):
