@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-from typing import Any
+from typing import Any, get_args
 
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS, Estimate, Metric
@@ -21,7 +21,8 @@ Rows = list[RankedRow]
 Head = tuple[int, str]
 
 _METHOD_FIELDS = ("method", "version", "family", "knowledge", "submitter", "key")
-_RECORD_FIELDS = ("runs", "steps", "oracle_like", "received", "id")
+_RECORD_FIELDS = ("runs", "steps", "steps_per_run", "oracle_like", "received", "id")
+_RANKED: tuple[Metric, ...] = get_args(Metric)
 _FORMULA_STARTS = tuple("=+-@＝＋－＠|%")
 
 
@@ -91,10 +92,10 @@ def to_latex(
     lines = [f"% {name}: {_latex(str(value))}" for name, value in provenance.items()]
     lines += [
         f"% ranked by {metric}; regrets: 0 optimal, 1 the constant policy; 95 % intervals",
-        r"\begin{tabular}{rllrrr}",
+        r"\begin{tabular}{rllrrlrrr}",
         r"\toprule",
-        r"Rank & Method & By & WD regret $N_0$ & OOD regret $\bar{N}$ "
-        r"& OOD decay $\bar{N} - N_0$ \\",
+        r"Rank & Method & By & Runs & Steps per run & Received & WD regret $N_0$ "
+        r"& OOD regret $\bar{N}$ & OOD decay $\bar{N} - N_0$ \\",
         r"\midrule",
     ]
     for row in rows:
@@ -102,7 +103,9 @@ def to_latex(
         assert scores is not None  # every row of a ranking has scores
         rank = row.ranks.replace("–", "--") or "--"
         cells = [rank, _latex(f"{entry.method} {entry.version}"), _latex(entry.submitter)]
-        cells += map(_interval, (scores.wd_regret, scores.ood_regret, scores.ood_decay))
+        cells += [str(entry.runs), f"{entry.steps_per_run:,}", entry.received[:10]]
+        shown = {name: getattr(scores, name) for name in _RANKED} | {metric: row.shown(metric)}
+        cells += map(_interval, shown.values())
         lines.append(" & ".join(cells) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines) + "\n"
@@ -126,9 +129,12 @@ def _facts(row: RankedRow) -> dict[str, Any]:
         "first": row.first,
         "last": row.last,
         "not_ranked": row.reason,
+        "rank_value": row.value.value,
         **{name: getattr(row.entry, name) for name in _METHOD_FIELDS},
         "code": row.entry.code_link or "",
         **{name: getattr(row.entry, name) for name in _RECORD_FIELDS},
+        "copied_runs": row.entry.copied_runs,
+        "copy_of": row.entry.copy_of[0].id if row.entry.copy_of else "",
     }
 
 

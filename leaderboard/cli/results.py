@@ -83,34 +83,57 @@ def rank(
 
 def _ranking_table(rows: list[RankedRow], metric: Metric, board: BoardDocument) -> Table:
     from leaderboard.scoring.ranking import REASONS
+    from leaderboard.web.site.rows import steps_text
 
     reasons: dict[str, None] = dict.fromkeys(row.reason for row in rows if row.reason)
     notes = dict(zip(reasons, "*†‡§¶", strict=False))
+    entries = [row.entry for row in rows]
     caption = [f"{sign} not ranked: {REASONS[code]}" for code, sign in notes.items()]
+    if any(entry.oracle_like and not entry.reference for entry in entries):
+        caption.append("oracle-like: so close to π* that the method's code is requested")
     if board.practice:
         runs = "one run" if board.runs_to_rank == 1 else f"{board.runs_to_rank} runs"
         caption.append(f"A practice board: {runs} in each class suffice for a rank.")
-    columns = {"rank": "number", "method": "text", "submitter": "text"}
+    columns = {"rank": "number", "method": "text", "submitter": "text", "marks": "text"}
+    if not any(map(_marks, entries)):
+        del columns["marks"]
+    after = {"runs": "number", "steps/run": "number", "received": "name"}
     ranking = Table(
         f"{LABELS[metric]} on {board.suite_name} (0 optimal, 1 the constant ½; 95 % intervals)",
-        {**columns, **dict.fromkeys(SYMBOLS.values(), "number"), "runs": "number"},
+        {**columns, **dict.fromkeys(SYMBOLS.values(), "number"), **after},
         caption="\n".join(caption),
     )
     for row in rows:
         entry = row.entry
         scores = {name: getattr(entry.scores, name) for name in SYMBOLS}
+        scores[metric] = row.shown(metric)
         ranking.add_row(
             row.ranks or notes.get(row.reason, ""),
             escape(f"{entry.method} {entry.version}".strip()),
             escape(entry.submitter),
+            *([_marks(entry)] if "marks" in columns else []),
             *(
                 f"[bold]{_interval(value)}[/]" if name == metric else fixed(value.value)
                 for name, value in scores.items()
             ),
             str(entry.runs),
+            steps_text(entry.steps_per_run),
+            entry.received[:10],
             style="dim" if row.first is None else None,
         )
     return ranking
+
+
+def _marks(entry: EntryRow) -> str:
+    """What readers should know of an entry, in a few words; empty for most."""
+    if entry.reference:
+        return ""
+    marks = ["oracle-like"] * entry.oracle_like
+    if entry.copied_runs:
+        first = entry.copy_of[0].id.removeprefix("sha256:")[:8]
+        what = "copy of" if entry.is_copy else f"{entry.copied_runs} runs like"
+        marks.append(f"{what} {first}")
+    return ", ".join(marks)
 
 
 def _interval(value: Estimate) -> str:
@@ -177,14 +200,16 @@ def _public_view(board: str, id: str) -> PublicView:
 def _print_submission(view: PublicView) -> None:
     submission = view.signed.submission
     method, runs = submission.method, submission.runs
-    steps = sum(run.steps for run in runs)
+    total = sum(run.steps for run in runs)
+    steps = sorted({run.steps for run in runs if run.artefact is not None})
+    each = "–".join(f"{one:,}" for one in dict.fromkeys((*steps[:1], *steps[-1:])))
     pairs: dict[str, object] = {
         "id": view.id,
         "received": view.received,
         "key": submission.submitter.key,
         "family, knowledge": f"{method.family}, {method.knowledge}",
         "code": submission.code or "none",
-        "runs": f"{len(runs):,} with {steps:,} steps in total",
+        "runs": f"{len(runs):,}, each of {each or 0} steps, {total:,} in total",
         "training": submission.training.library or "not stated",
         "statement": submission.statement or "none",
     }

@@ -77,6 +77,11 @@ class RankedRow:
             return ""
         return str(self.first) if self.last == self.first else f"{self.first}–{self.last}"
 
+    def shown(self, metric: Metric) -> Estimate:
+        """The score in a table: what the row ranks by, or the entry's own if it has no rank."""
+        own: Estimate = getattr(self.entry.scores, metric)
+        return own if self.first is None else self.value
+
 
 def ranking(entries: list[EntryRow], metric: Metric) -> list[RankedRow]:
     """Every scored entry that is not withdrawn, ordered by its score, the best first.

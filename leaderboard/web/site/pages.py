@@ -97,7 +97,7 @@ class Pages:
         tab = next(tab for tab in TABS if tab.key == metric)
         ranked = ranking.ranking(self.entries, metric)
         scores = [row.entry.scores for row in ranked if row.entry.scores]
-        estimates = [rows.shown_estimate(row, metric) for row in ranked]
+        estimates = [row.shown(metric) for row in ranked]
         regrets = [[each.value for each in one.normalised_regret] for one in scores]
         submitted = [row for row in ranked if not row.entry.reference]
         return self._render(
@@ -405,7 +405,6 @@ def _environment() -> Environment:
         "https_only": rows.https_only,
         "minute": rows.minute,
         "number": charts.number,
-        "shown": rows.shown_estimate,
         "short": lambda digest, digits=12: hex_of(digest)[:digits],
         "steps": rows.steps_text,
     }

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from leaderboard.documents.checks import skeleton
-from leaderboard.documents.result import Estimate, Metric, Result, RunScore
+from leaderboard.documents.result import Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
-from leaderboard.scoring.ranking import REFERENCES, RankedRow
+from leaderboard.scoring.ranking import REFERENCES
 from leaderboard.store import EntryRow
 from sme_registry.statistics import iqm
 
@@ -46,12 +46,6 @@ MARKS = {
 
 RunRow = tuple[str, Run | None, RunScore | None]
 """Class name, the run as submitted, and as scored."""
-
-
-def shown_estimate(row: RankedRow, metric: Metric) -> Estimate:
-    """The score that a row shows: what it ranks by, or its own score if it has no rank."""
-    own: Estimate = getattr(row.entry.scores, metric)
-    return own if row.first is None else row.value
 
 
 def versions_of(entry: EntryRow, entries: list[EntryRow]) -> list[EntryRow]:

@@ -434,6 +434,23 @@ def test_no_cell_begins_with_a_formula(start: str) -> None:
     assert line["submitter"] == f"'{start[-1]}cmd"
 
 
+def test_an_export_has_what_an_entry_ranks_by_its_steps_per_run_and_what_it_copies() -> None:
+    copied = replace(
+        entry(3, scores(0.3, 0.1)),
+        runs=10,
+        steps=1000,
+        policies=10,
+        alike=(Likeness("sha256:" + "a" * 64, "f" * 64, 2),),
+    )
+    rows = ranking([copied], "ood_decay")
+    (line,) = csv.DictReader(io.StringIO(to_csv(rows, "ood_decay", BOARD, HEAD, DATE)))
+    assert float(line["rank_value"]) == 0.0
+    assert float(line["ood_decay"]) == pytest.approx(-0.2)
+    assert (line["steps_per_run"], line["copied_runs"]) == ("100", "2")
+    assert line["copy_of"] == "sha256:" + "a" * 64
+    assert r"& 10 & 100 & " in to_latex(rows, "ood_decay", BOARD, HEAD, DATE)
+
+
 def test_the_csv_has_every_score_with_its_interval() -> None:
     lines = list(
         csv.DictReader(io.StringIO(to_csv(hostile_rows(), "wd_regret", BOARD, HEAD, DATE)))
@@ -454,8 +471,8 @@ def test_latex_commands_in_names_are_escaped() -> None:
     line = next(line for line in text.splitlines() if "passwd" in line)
     assert line == (
         r"2 & \textbackslash{}input\{/etc/passwd\} 50\% \& \$x\_1\textasciicircum{}2\$ "
-        r"\#\textasciitilde{} +1 & somebody & $0.600$ [$0.550$, $0.650$] & "
-        r"$0.700$ [$0.650$, $0.750$] & $0.100$ [$0.050$, $0.150$] \\"
+        r"\#\textasciitilde{} +1 & somebody & 60 & 16,667 & 2026-11-21 & "
+        r"$0.600$ [$0.550$, $0.650$] & $0.700$ [$0.650$, $0.750$] & $0.100$ [$0.050$, $0.150$] \\"
     )
 
 
