@@ -51,6 +51,8 @@ PAGES_KEPT = 256
 _Render = Callable[[Pages, str], bytes]
 _CHUNK = 2**18  # bytes
 _LOG_ENTRIES = 100
+_DOCUMENTS = 64  # signed documents to verify at the same time
+_ADMISSIONS = 16  # keys with a submission to check at the same time
 
 
 def create_app(
@@ -60,6 +62,7 @@ def create_app(
     upload_seconds: float = limits.UPLOAD_SECONDS,
     pages_kept: int = PAGES_KEPT,
     url: str = "",
+    requests_of_address: int = limits.REQUESTS_OF_ADDRESS,
 ) -> FastAPI:
     """The ASGI application of a board.
 
@@ -70,6 +73,8 @@ def create_app(
       pages_kept: number of rendered pages to keep until the log grows; 0 renders every request.
       url: the board's public address, shown on its pages; empty if it is not known. It is never
         taken from a request, whose Host header anyone can choose.
+      requests_of_address: the most requests in progress from one IPv4 address or IPv6 /64 network;
+        those of this machine are not counted.
 
     Raises:
       BoardError: the folder holds no board.
@@ -96,7 +101,8 @@ def create_app(
         },
     )
     app.state.scores = score_workers > 0  # see `errors.on_board_error`
-    app.add_middleware(Guard)
+    app.add_middleware(limits.RequestsByAddress, limit=requests_of_address)
+    app.add_middleware(Guard)  # the last one is the outermost
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
     app.add_api_route("/api/objects/{digits}", routes.get_object, methods=["GET", "HEAD"])
@@ -120,7 +126,8 @@ class _Routes:
     def __init__(self, store: Store, upload_seconds: float, pages: _PageCache) -> None:
         self._store = store
         self._upload_seconds = upload_seconds
-        self._admissions = CapacityLimiter(1)
+        self._documents = limits.Turns(_DOCUMENTS)
+        self._admissions = limits.Turns(_ADMISSIONS)
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
         self._pages = pages
@@ -146,7 +153,7 @@ class _Routes:
                     new = await to_thread.run_sync(self._store_object, spool, digest, key)
         except Rejection:
             if size <= limit:
-                await limits.drain(request, limit, self._upload_seconds)
+                await limits.drain(request, limit)
             raise
         return JSONResponse({"digest": digest}, 201 if new else 200)
 
@@ -160,11 +167,10 @@ class _Routes:
     async def post_submission(self, request: Request) -> Response:
         text = await limits.read_document(request, "submission")
 
-        def admit() -> tuple[str, bool]:
-            signed = SignedSubmission.read(text)
-            return signed.id, intake.admit(self._store, signed)
-
-        id, new = await to_thread.run_sync(admit, limiter=self._admissions)
+        # Garbage without a valid signature never waits with submissions, whose check is longer.
+        signed = await self._documents.run(lambda: SignedSubmission.read(text))
+        id, key = signed.id, signed.submission.submitter.key
+        new = await self._admissions.run(lambda: intake.admit(self._store, signed), key)
         url = f"/api/submissions/{hex_of(id)}"
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 
@@ -187,7 +193,7 @@ class _Routes:
             self._store.withdraw(signed)
             return signed.withdrawal.submission
 
-        id = await to_thread.run_sync(withdraw, limiter=self._admissions)
+        id = await self._documents.run(withdraw)
         return JSONResponse({"id": id, "status": "withdrawn"})
 
     async def get_board(self, request: Request) -> Response:

@@ -18,6 +18,7 @@ HTTP_CODES = {
     "too_slow": "the body did not arrive in time",
     "not_publishable": "a reference row is missing, waiting or off",
     "bad_request": "the request is invalid",
+    "busy": "the server has as many such requests as it can take; try again in a few seconds",
     "internal": "the server failed; its log has the details",
 }
 
@@ -34,6 +35,7 @@ STATUSES = {
     "too_large": 413,
     "quota": 429,
     "internal": 500,
+    "busy": 503,
     "not_publishable": 503,
 }
 """Any other code of a `Rejection` is 422, any other code is 400."""
@@ -73,6 +75,9 @@ async def on_board_error(request: Request, error: Exception) -> Response:
 def error_answer(request: Request, code: str, message: str, headers: Any = None) -> Response:
     """An error as JSON, or as a page if a browser asks for one."""
     status = STATUSES.get(code, 400 if code in HTTP_CODES else 422)
+    message = message[:_MESSAGE_CHARACTERS]
+    if code == "busy":
+        headers = {**(headers or {}), "Retry-After": str(_RETRY_SECONDS)}
     if _wants_page(request):
         page = _ERROR_PAGE.format(
             status=status,
@@ -95,6 +100,7 @@ def _root(request: Request) -> str:
 
 
 _RETRY_SECONDS = 5
+_MESSAGE_CHARACTERS = 2000
 
 _ERROR_PAGE = """<!DOCTYPE html>
 <html lang="en">

@@ -1,24 +1,116 @@
-"""Limits on what a client sends: the size and time of a body, and its room in the quotas."""
+"""Limits on what clients send: size and time of a body, quotas, requests at the same time."""
 
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Iterable
+from typing import TypeVar
 
 import anyio
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from leaderboard import intake
 from leaderboard.documents.submission import MAX_BYTES
 from leaderboard.errors import Rejection
 from leaderboard.store import Store
-from leaderboard.web.errors import HTTP_CODES, RequestError
+from leaderboard.web.errors import HTTP_CODES, RequestError, error_answer
 
+REQUESTS_OF_ADDRESS = 32
 UPLOAD_SECONDS = 300.0
 _DOCUMENT_SECONDS = 30.0
+_DRAIN_SECONDS = 30.0
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+_T = TypeVar("_T")
+
+
+LOOPBACK: tuple[Network, ...] = (
+    ipaddress.ip_network("127.0.0.0/8"),
+    ipaddress.ip_network("::1/128"),
+)
+
+
+def counted_address(host: str, uncounted: Iterable[Network] = LOOPBACK) -> str:
+    """The address by which a client is counted; empty if it is not counted.
+
+    An IPv6 address counts with its /64 network, which is what one client is usually given.
+    """
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:  # a Unix socket
+        return ""
+    if isinstance(address, ipaddress.IPv6Address):
+        address = address.ipv4_mapped or address
+    if any(address in network for network in uncounted):
+        return ""
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(ipaddress.ip_network((address, 64), strict=False))
+    return str(address)
+
+
+class RequestsByAddress:
+    """ASGI middleware: at most `limit` requests of one address are in progress; `busy` for more."""
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self._app = app
+        self._limit = limit
+        self._running: Counter[str] = Counter()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        address = counted_address((scope.get("client") or ("",))[0])
+        if scope["type"] != "http" or not address:
+            await self._app(scope, receive, send)
+            return
+        if self._running[address] >= self._limit:
+            answer = error_answer(
+                Request(scope),
+                "busy",
+                f"address={address}: has {self._limit} requests in progress. Wait for some.",
+            )
+            await answer(scope, receive, send)
+            return
+        self._running[address] += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._running -= Counter({address: 1})  # drops an address without requests
+
+
+class Turns:
+    """Work on requests in a thread, one at a time; at most `places` of them wait or run.
+
+    Each waits for those before it only, so whoever sends many of them fills the places of others at
+    worst for moments, and never the threads that serve pages.
+    """
+
+    def __init__(self, places: int) -> None:
+        self._places = places
+        self._thread = CapacityLimiter(1)
+        self._taken: Counter[str] = Counter()
+
+    async def run(self, work: Callable[[], _T], owner: str = "") -> _T:
+        """The value of `work()`.
+
+        Args:
+          work: called in the thread.
+          owner: has one place at a time; empty for no such limit.
+
+        Raises:
+          RequestError: `busy`, if there is no place.
+        """
+        if self._taken.total() >= self._places or (owner and self._taken[owner]):
+            raise RequestError("busy", f"{HTTP_CODES['busy']}.")
+        self._taken[owner] += 1
+        try:
+            return await to_thread.run_sync(work, limiter=self._thread)
+        finally:
+            self._taken -= Counter({owner: 1})
 
 
 class UploadReservations:
@@ -98,8 +190,11 @@ async def body_chunks(
         yield chunk
 
 
-async def drain(request: Request, limit: int, seconds: float) -> None:
-    """Let a client finish its body: one that is cut off while it sends may never read why."""
+async def drain(request: Request, limit: int, seconds: float = _DRAIN_SECONDS) -> None:
+    """Let a client finish its body: one that is cut off while it sends may never read why.
+
+    Nothing is kept of it. A client that takes longer loses the answer, not the server a slot.
+    """
     with contextlib.suppress(Rejection, RequestError, RuntimeError):  # already read to its end
         async for _ in body_chunks(request, limit, seconds):
             pass

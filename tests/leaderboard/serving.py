@@ -14,7 +14,8 @@ from typing import Any
 import uvicorn
 
 from leaderboard.web.app import create_app
-from leaderboard.web.serve import listen, url_of
+from leaderboard.web.connections import Connections
+from leaderboard.web.serve import listen, server_config, url_of
 
 _SERVE = """
 import sys
@@ -24,13 +25,15 @@ serve(sys.argv[1], port=0, workers=int(sys.argv[2]), announce=lambda url: print(
 
 
 @contextlib.contextmanager
-def serving(path: Path, **options: Any) -> Iterator[str]:
+def serving(
+    path: Path, connections: Connections | None = None, host: str = "127.0.0.1", **options: Any
+) -> Iterator[str]:
     """A server in a thread; yields its URL."""
-    with listen("127.0.0.1", 0) as listener:
-        config = uvicorn.Config(
-            create_app(path, **options), http="h11", ws="none", log_level="critical"
+    with listen(host, 0) as listener:
+        app = create_app(path, **options)
+        server = uvicorn.Server(
+            server_config(app, Connections() if connections is None else connections)
         )
-        server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
