@@ -8,7 +8,7 @@ from typing import Any
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import NotPublishable
-from leaderboard.scoring.ranking import refuse_unpublishable
+from leaderboard.scoring.ranking import ranking, refuse_unpublishable
 from leaderboard.store import EntryRow, Store
 from sme_registry.errors import SpecError
 
@@ -25,6 +25,12 @@ class PublicView:
       result: None before scoring, and while its scores are withheld.
       withheld: why the scores are withheld; empty if they are not.
       withdrawal: None unless the submission is withdrawn.
+      not_ranked: why it has no rank by any metric, a key of `ranking.REASONS`; empty if it has one,
+        or no scores.
+      copy_of: earlier submissions of other keys that its policies behave like: their ids, and the
+        number of its runs that do.
+      faults, fault: how often a fault of the board's machine ended its scoring while it waits, and
+        the last of them.
     """
 
     id: str
@@ -34,6 +40,10 @@ class PublicView:
     result: Result | None
     withheld: str
     withdrawal: SignedWithdrawal | None
+    not_ranked: str = ""
+    copy_of: tuple[tuple[str, int], ...] = ()
+    faults: int = 0
+    fault: str = ""
 
     @classmethod
     def from_dict(cls, plain: dict[str, Any]) -> PublicView:
@@ -58,6 +68,7 @@ class PublicView:
             result=None if documents[0] is None else Result.from_dict(documents[0]),
             withheld=withheld,
             withdrawal=None if documents[1] is None else SignedWithdrawal.from_dict(documents[1]),
+            **_facts(plain),
         )
         if view.signed.id != id:
             raise SpecError(f"id={id!r:.80}: the submission has another digest. Check the URL.")
@@ -73,17 +84,50 @@ class PublicView:
             "result": self.result and self.result.to_dict(),
             "withheld": self.withheld,
             "withdrawal": self.withdrawal and self.withdrawal.to_dict(),
+            "not_ranked": self.not_ranked,
+            "copy_of": [{"id": id, "runs": runs} for id, runs in self.copy_of],
+            "faults": self.faults,
+            "fault": self.fault,
         }
 
 
 def public_view(store: Store, entry: EntryRow) -> PublicView:
     """The public view of a submission; it has scores only while the board is publishable."""
     result = store.result(entry.id)
-    withheld = ""
+    withheld, reason = "", ""
     if result is not None and result.scores is not None:
+        entries = store.entries()
         try:
-            refuse_unpublishable(store.entries())
+            refuse_unpublishable(entries)
+            rows = ranking(entries, "wd_regret")
+            reason = next((row.reason for row in rows if row.entry.id == entry.id), "")
         except NotPublishable as error:
             result, withheld = None, str(error)
-    signed, withdrawal = store.submission(entry.id), store.withdrawal(entry.id)
-    return PublicView(entry.id, entry.status, entry.received, signed, result, withheld, withdrawal)
+    return PublicView(
+        id=entry.id,
+        status=entry.status,
+        received=entry.received,
+        signed=store.submission(entry.id),
+        result=result,
+        withheld=withheld,
+        withdrawal=store.withdrawal(entry.id),
+        not_ranked=reason,
+        copy_of=() if withheld else tuple((each.id, each.runs) for each in entry.copy_of),
+        faults=entry.faults,
+        fault=entry.fault,
+    )
+
+
+def _facts(plain: dict[str, Any]) -> dict[str, Any]:
+    """The fields that answers of earlier servers lack."""
+    try:
+        return {
+            "not_ranked": str(plain.get("not_ranked", "")),
+            "copy_of": tuple(
+                (str(row["id"]), int(row["runs"])) for row in plain.get("copy_of", ())
+            ),
+            "faults": int(plain.get("faults", 0)),
+            "fault": str(plain.get("fault", "")),
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise SpecError(f"submission: invalid answer: {error}. Check the URL.") from None

@@ -198,6 +198,8 @@ def _public_view(board: str, id: str) -> PublicView:
 
 
 def _print_submission(view: PublicView) -> None:
+    from leaderboard.scoring.ranking import REASONS
+
     submission = view.signed.submission
     method, runs = submission.method, submission.runs
     total = sum(run.steps for run in runs)
@@ -213,6 +215,12 @@ def _print_submission(view: PublicView) -> None:
         "training": submission.training.library or "not stated",
         "statement": submission.statement or "none",
     }
+    if view.faults:
+        pairs["failed attempts"] = f"{view.faults}, no verdict; the last: {view.fault}"
+    if view.not_ranked not in ("", "reference"):
+        pairs["not ranked"] = REASONS.get(view.not_ranked, view.not_ranked)
+    for id, count in view.copy_of:
+        pairs[f"{count} of {len(runs)} runs act like"] = id
     if view.withdrawal is not None:
         pairs["reason for withdrawal"] = view.withdrawal.withdrawal.reason or "not stated"
     title = f"{method.name} {method.version}", submission.submitter.name, view.status

@@ -207,6 +207,11 @@ class Queue:
         """Number of submissions that scorers work on."""
         return self._count(f"FROM lease WHERE {_CLAIMED}", *_uptime())
 
+    def faults(self) -> int:
+        """Number of faults that waiting submissions have met."""
+        with self._database.reading() as index:
+            return index.number("SELECT coalesce(sum(faults), 0) FROM lease")
+
     def _count(self, clauses: str, *values: Any) -> int:
         with self._database.reading() as index:
             return index.number(f"SELECT count(*) {clauses}", *values)

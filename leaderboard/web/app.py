@@ -246,7 +246,7 @@ class _CachedFile(NamedTuple):
 
 
 class _PageCache:
-    """Rendered files, at most `kept`, discarded when the log grows.
+    """Rendered files, at most `kept`, discarded when the log grows or a scoring fails.
 
     One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
     page that is not cached wait for one rendering of it.
@@ -257,11 +257,11 @@ class _PageCache:
         self._kept = kept
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
-        self._head: Head | None = None
+        self._head: tuple[Head, int] | None = None
 
     def get(self, render: _Render, name: str) -> _CachedFile:
         """The file of this name, rendered if it is not cached."""
-        head = self._store.head
+        head = self._store.head, self._store.queue.faults()
         if head != self._head:
             rendered = functools.partial(_rendered, Pages(self._store, self._address))
             self._head, self._file = head, functools.lru_cache(self._kept)(rendered)

@@ -22,6 +22,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import BoardError
+from leaderboard.public_view import PublicView
 from leaderboard.store import Store
 from leaderboard.web import app
 from leaderboard.web.errors import HTTP_CODES, STATUSES
@@ -225,6 +226,23 @@ def test_a_new_board_says_that_it_prepares_and_how_to_submit(store: Store) -> No
         for path in ("/api/board", "/board.csv", "/board-data.js"):
             assert refusal(HTTP.get(url + path)) == (503, "not_publishable")
         assert HTTP.get(f"{url}/submissions/x").status_code == 404
+
+
+def test_a_waiting_entry_shows_the_faults_that_postponed_it(tmp_path: Path) -> None:
+    with boards.create(tmp_path / "board", classes=1) as store:
+        id = boards.submit(store, SigningKey.generate(), "Unlucky", None)
+        paths = ("/", f"/submissions/{hex_of(id)}.html")
+        with serving(store.folder.path) as url:
+            before = [HTTP.get(url + path).text for path in paths]  # the server keeps them
+            claim = store.queue.claim("scorer")
+            assert claim is not None
+            store.queue.fault(claim, "no space left <on> device")
+            after = [HTTP.get(url + path).text for path in paths]
+            view = HTTP.get(f"{url}/api/submissions/{hex_of(id)}").json()
+    assert not any("no space left" in text for text in before)
+    assert all("no space left &lt;on&gt; device" in text for text in after)
+    assert (view["faults"], view["fault"]) == (1, "no space left <on> device")
+    assert PublicView.from_dict(view).to_dict() == view
 
 
 def test_while_a_board_prepares_an_entry_that_was_scored_first_shows_no_scores(

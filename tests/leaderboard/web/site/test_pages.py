@@ -303,7 +303,7 @@ def test_a_copy_names_the_entry_that_it_copies_and_the_number_of_runs(tmp_path, 
 def test_submissions_that_are_not_scored_are_listed_below_with_their_status(pages):
     words = pages["index.html"].words
     waiting, closed = words.split("Waiting to be scored")[1].split("Rejected and withdrawn")
-    assert re.search(r"Runs 1 ?PPO 2\.7\.2 ?by R\. Okafor ?\d{4}-\d\d-\d\d \d\d:\d\d", waiting)
+    assert re.search(r"Attempts PPO 2\.7\.2 ?by R\. Okafor ?\d{4}-\d\d-\d\d \d\d:\d\d", waiting)
     assert re.search(r"Broken 0\.1.*rejected onnx_op", closed)
     assert re.search(r"Gone 1\.0.*withdrawn", closed)
     assert "1 waiting" in words.split("Waiting to be scored")[0]
