@@ -151,6 +151,7 @@ def make_board(
                 Path(temporary, f"bundle-{index}"),
                 suite=suite,
                 key=key,
+                board=store.document.key,
                 runs=[source],
                 method=method,
                 submitter=submitter,

@@ -58,6 +58,7 @@ class PublicView:
             )
             documents = plain["result"], plain["withdrawal"]
             signed = {name: plain[name] for name in ("submission", "signature")}
+            signed["board"] = plain.get("board")  # absent on boards of rules 1
         except KeyError as error:
             raise SpecError(f"submission: field {error} is missing. Check the URL.") from None
         view = cls(

@@ -41,7 +41,7 @@ def test_the_python_of_a_page_runs_from_top_to_bottom(
 def test_the_page_on_own_agents_works_from_training_to_the_board(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for package in ("torch", "matplotlib", "onnx", "onnxruntime", "cryptography"):
+    for package in ("torch", "matplotlib", "onnx", "onnxruntime", "nacl"):
         pytest.importorskip(package)
     from leaderboard.cli import app as leaderboard
     from sme_registry.cli import app as sme

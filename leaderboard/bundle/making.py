@@ -49,6 +49,7 @@ def make_bundle(
     runs_started: dict[str, int] | None = None,
     training: Training | None = None,
     algorithm: str | None = None,
+    board: str | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Bundle:
@@ -71,6 +72,8 @@ def make_bundle(
         of listed runs.
       training: facts of the training; None takes them from the records of the runs.
       algorithm: of folders with runs of several, the only one to submit.
+      board: the public key of the only board that accepts it; None leaves it open, until
+        `submit_bundle` or `client.submit` signs for the board that it is sent to.
       force: replace an existing bundle.
       progress: called after each run with the number of finished runs and of all runs.
 
@@ -104,7 +107,7 @@ def make_bundle(
     }
     # Everything that does not depend on the policies is checked before they are exported.
     unexported = _submission(fields, suite, listed, _placeholders(listed))
-    SignedSubmission.read(unexported.signed(key).to_bytes())
+    SignedSubmission.read(unexported.signed(key, board).to_bytes())
     with build_folder(folder, force=force) as building:
         (building / ARTEFACTS).mkdir()
         artefacts = []
@@ -112,7 +115,7 @@ def make_bundle(
             artefacts.append(_put_artefact(run, building))
             if progress is not None:
                 progress(done, len(listed))
-        signed = _submission(fields, suite, listed, artefacts).signed(key)
+        signed = _submission(fields, suite, listed, artefacts).signed(key, board)
         write_atomically(building / FILE, signed.to_bytes())
         Bundle.read(building)
         _refuse_existing(folder, force)

@@ -86,6 +86,7 @@ def _create_board(folder: Path, run: Path, record: RunRecord) -> None:
         make_bundle(
             folder / "bundle",
             suite=file,
+            board=store.document.key,
             key=SigningKey.generate(),
             runs=[run],
             method=record.algorithm,

@@ -15,7 +15,6 @@ from leaderboard.cli.options import (
     BundleFolder,
     Json,
     KeyFile,
-    SuiteName,
     board_document,
     board_or_url,
     complete_protocol,
@@ -28,12 +27,12 @@ from leaderboard.documents.submission import Knowledge, SignedWithdrawal
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
+from sme_registry.spec import SuiteFile, catalogue
 from sme_registry.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
     from leaderboard.documents.board import BoardDocument
     from leaderboard.documents.result import Result
-    from sme_registry.spec import SuiteFile
 
 
 def keygen(key: KeyFile = DEFAULT_KEY) -> None:
@@ -89,7 +88,23 @@ def new(
     ],
     method: Annotated[str, typer.Option(help="Name of the method, as the board shows it.")],
     submitter: Annotated[str, typer.Option(help="Your name or your lab's.")],
-    suite: SuiteName = "smoke-v1",
+    board: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BOARD",
+            help="The folder or URL of the only board that shall accept it, whose suite the runs "
+            "are of. Without it, `submit` signs it for the board that it is sent to.",
+            parser=board_or_url,
+        ),
+    ] = None,
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Without --board: a suite's name (see `sme list`) or file, or a board that has "
+            "it; smoke-v1 by default.",
+            autocompletion=catalogue.completion(SuiteFile),
+        ),
+    ] = None,
     algorithm: Annotated[
         str | None,
         typer.Option(
@@ -135,11 +150,16 @@ def new(
       sme train sha256:dfe78aa6aba8 --algorithm TD3 --seed 0
 
       sme-leaderboard new td3 --runs 'runs/*' --method TD3 --submitter "A Lab"
+
+      sme-leaderboard new ppo --board board --runs runs/smoke --method PPO --submitter "A Lab"
     """
     from leaderboard.bundle import make_bundle
 
+    if board is not None and suite is not None:
+        raise OptionError("--board, --suite: the board has a suite. Leave out --suite.")
     folders = _expanded(runs)
-    file = find_suite(suite)
+    document = None if board is None else board_document(board)
+    file = find_suite(suite or "smoke-v1") if document is None else document.suite_file
     with Progress("exporting", max(1, len(folders)), console=err(), unit="runs") as progress:
         new_bundle = make_bundle(
             bundle,
@@ -155,12 +175,14 @@ def new(
             statement=statement,
             runs_started=_runs_started(started or []),
             algorithm=algorithm,
+            board=None if document is None else document.key,
             force=force,
             progress=progress.update_of,
         )
     runs_listed = len(new_bundle.signed.submission.runs)
     out().print(f"{new_bundle.signed.id}\n{runs_listed} runs", soft_wrap=True)
-    out().print(f"Next: sme-leaderboard check {escape(str(bundle))} BOARD", soft_wrap=True)
+    target = escape(board or "BOARD")
+    out().print(f"Next: sme-leaderboard check {escape(str(bundle))} {target}", soft_wrap=True)
 
 
 def _expanded(patterns: list[str]) -> list[Path]:
@@ -283,7 +305,8 @@ def submit(
 ) -> None:
     """Send a submission to a board's folder or to a served board.
 
-    Sending the same one twice changes nothing. A served board needs the key for the uploads.
+    Sending the same one twice changes nothing. The key signs it for this board, unless `new
+    --board` did, and signs the uploads to a served board.
 
     Examples:
 
@@ -296,14 +319,18 @@ def submit(
     from leaderboard.store import Store
     from leaderboard.web import client
 
+    signed = Bundle.read(bundle).signed
     if is_url(board):
-        total = len(Bundle.read(bundle).signed.submission.runs)
+        total = len(signed.submission.runs)
         with Progress("uploading", total, console=err(), unit="artefacts") as progress:
             id = client.submit(board, bundle, SigningKey.read(key), progress=progress.update_of)
+        out().print(id, soft_wrap=True)
+        err().print(client.page_of(board, id), soft_wrap=True)
+        err().print(f"Next: sme-leaderboard show {escape(board)} {id}", soft_wrap=True)
     else:
         with Store.open(Path(board)) as store:
-            id = intake.submit_bundle(store, bundle)
-    out().print(id, soft_wrap=True)
+            signing_key = SigningKey.read(key) if signed.board is None else None
+            out().print(intake.submit_bundle(store, bundle, signing_key), soft_wrap=True)
 
 
 def withdraw(
@@ -337,5 +364,6 @@ def withdraw(
     else:
         with Store.open(Path(board)) as store:
             id = find_entry(store, id).id
-            store.withdraw(SignedWithdrawal.create(id, signing_key, reason))
+            withdrawal = SignedWithdrawal.create(id, signing_key, reason, board=store.document.key)
+            store.withdraw(withdrawal)
     out().print(f"{id} withdrawn", soft_wrap=True)

@@ -112,6 +112,11 @@ class BoardDocument(Document):
         return self.runs_to_rank < RUNS_TO_RANK
 
     @property
+    def signatures_for(self) -> str | None:
+        """The board that its submissions and withdrawals are signed for; None with rules 1."""
+        return None if self.rules == 1 else self.key
+
+    @property
     def runs_needed(self) -> int:
         """Runs of a ranked entry, in all classes."""
         return sum(

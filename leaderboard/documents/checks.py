@@ -85,6 +85,23 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             )
 
 
+def check_board(board: BoardDocument, signed_for: str | None) -> None:
+    """Reject (`wrong_board`) a document whose signature is not for this board.
+
+    Args:
+      board: the board.
+      signed_for: the public key of the board that the signature is for; None if it is for none.
+    """
+    if signed_for is None or signed_for != board.signatures_for:
+        stated = "none" if signed_for is None else f"{signed_for[:16]}…"
+        raise Rejection(
+            "wrong_board",
+            f"board={stated}: the signature must be for this board, {board.key[:16]}…. Send a "
+            "bundle that is signed for no board with `sme-leaderboard submit`, or create it with "
+            "`sme-leaderboard new --board`.",
+        )
+
+
 def check_names(submission: Submission, board_key: str | None = None) -> None:
     """Reject what is unsafe to show: markup, formulas, control characters, the board's own names.
 

@@ -1,9 +1,13 @@
 """Ed25519 keys of submitters and boards.
 
 A key is 32 random bytes; its public half, 64 hex digits, is the identity. A signature
-covers the SHA-256 digest of a document and a purpose, and is invalid for any other purpose.
+covers the SHA-256 digest of a document, a purpose and the public key of a board, and is invalid
+for any other purpose or board.
 
-    signature = Ed25519(key, "sme-leaderboard/" purpose "/" digest)
+    signature = Ed25519(key, "sme-leaderboard/" purpose "/" board "/" digest)
+
+`board "/"` is left out in a board's own log, where a submission is signed for no board yet, and on
+boards of rules 1.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from leaderboard.errors import BoardError
 from sme_registry.io import require_packages
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from nacl import signing
 
 Purpose = Literal["submission", "withdrawal", "log", "upload"]
 PublicKey = Annotated[
@@ -34,15 +38,15 @@ Signature = Annotated[
 class SigningKey:
     """A private key; `repr` never shows it."""
 
-    _private: Ed25519PrivateKey
+    _private: signing.SigningKey
 
     @classmethod
     def generate(cls) -> SigningKey:
         """A new key from the operating system's randomness."""
-        _require_cryptography()
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        _require_nacl()
+        from nacl import signing
 
-        return cls(Ed25519PrivateKey.generate())
+        return cls(signing.SigningKey.generate())
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SigningKey:
@@ -51,12 +55,12 @@ class SigningKey:
         Raises:
           BoardError: the file is missing or contains no key.
         """
-        _require_cryptography()
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        _require_nacl()
+        from nacl import signing
 
         try:
             text = Path(path).read_text("ascii").strip()
-            return cls(Ed25519PrivateKey.from_private_bytes(bytes.fromhex(text)))
+            return cls(signing.SigningKey(bytes.fromhex(text)))
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or "not 64 hex digits"
             raise BoardError(
@@ -80,7 +84,7 @@ class SigningKey:
         except OSError as error:
             raise BoardError(f"{path}: cannot be written: {error.strerror}.") from None
         with os.fdopen(handle, "w") as stream:
-            stream.write(self._private.private_bytes_raw().hex() + "\n")
+            stream.write(self._private.encode().hex() + "\n")
             stream.flush()
             os.fsync(stream.fileno())
         return path
@@ -88,34 +92,50 @@ class SigningKey:
     @property
     def public(self) -> str:
         """The public half, 64 hex digits."""
-        return self._private.public_key().public_bytes_raw().hex()
+        return self._private.verify_key.encode().hex()
 
-    def sign(self, purpose: Purpose, digest: str) -> str:
-        """The signature of a digest (or other short text) for a purpose, 128 hex digits."""
-        return self._private.sign(_message(purpose, digest)).hex()
+    def sign(self, purpose: Purpose, digest: str, board: str | None = None) -> str:
+        """The signature of a digest (or other short text), 128 hex digits.
+
+        Args:
+          purpose: the signature is valid for this one only.
+          digest: of the document.
+          board: the public key of the only board that may take it; None for no board.
+        """
+        return self._private.sign(_message(purpose, digest, board)).signature.hex()
 
     def __repr__(self) -> str:
         return f"SigningKey(public={self.public!r})"
 
 
-def verifies(public: str, signature: str, purpose: Purpose, digest: str) -> bool:
-    """Whether the signature of this digest and purpose is by this public key."""
-    _require_cryptography()
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+def verifies(
+    public: str, signature: str, purpose: Purpose, digest: str, board: str | None = None
+) -> bool:
+    """Whether this public key signed this digest for this purpose and board.
+
+    False for every public key outside the group of prime order: with one of small order, some
+    signatures fit every document (RFC 8032, section 8.9; libsodium refuses them, too).
+    """
+    _require_nacl()
+    from nacl.bindings import crypto_core_ed25519_is_valid_point
+    from nacl.exceptions import CryptoError
+    from nacl.signing import VerifyKey
 
     try:
-        key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
-        key.verify(bytes.fromhex(signature), _message(purpose, digest))
-    except (InvalidSignature, ValueError):
+        key = bytes.fromhex(public)
+        if not crypto_core_ed25519_is_valid_point(key):
+            return False
+        VerifyKey(key).verify(_message(purpose, digest, board), bytes.fromhex(signature))
+    except (CryptoError, ValueError):
         return False
     return True
 
 
-def _require_cryptography() -> None:
+def _require_nacl() -> None:
     """Imported where it is used, so that commands can show their help without it."""
-    require_packages("signatures", {"cryptography": "cryptography"}, "leaderboard")
+    require_packages("signatures", {"nacl": "PyNaCl"}, "leaderboard")
 
 
-def _message(purpose: Purpose, digest: str) -> bytes:
-    return f"sme-leaderboard/{purpose}/{digest}".encode()
+def _message(purpose: Purpose, digest: str, board: str | None) -> bytes:
+    parts = ["sme-leaderboard", purpose, *([] if board is None else [board]), digest]
+    return "/".join(parts).encode()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import datetime
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
 from leaderboard.errors import Rejection
@@ -148,16 +148,43 @@ class Submission(Document):
     training: Training = Training()
     statement: _Text = ""
 
-    def signed(self, key: SigningKey) -> SignedSubmission:
-        """This submission, signed with the submitter's key."""
-        return SignedSubmission(submission=self, signature=key.sign("submission", self.digest))
+    def signed(self, key: SigningKey, board: str | None = None) -> SignedSubmission:
+        """This submission, signed with the submitter's key.
+
+        Args:
+          key: the submitter's.
+          board: the public key of the only board that accepts it; None if it is not known yet.
+        """
+        signature = key.sign("submission", self.digest, board)
+        return SignedSubmission(submission=self, signature=signature, board=board)
 
 
-class SignedSubmission(StrictModel):
-    """`submission.json`."""
+class _Signed(StrictModel):
+    """A document with the signature of the submitter's key, for one board or for none.
+
+    `board` is left out of the JSON where it is None, as in boards of rules 1.
+    """
+
+    @model_serializer(mode="wrap")
+    def _omit_no_board(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        if plain["board"] is None:
+            del plain["board"]
+        return plain
+
+
+class SignedSubmission(_Signed):
+    """`submission.json`.
+
+    Attributes:
+      submission: the content.
+      signature: of the submitter's key, for this submission and board.
+      board: the public key of the only board that accepts it; None if it is not known yet.
+    """
 
     submission: Submission
     signature: Signature
+    board: PublicKey | None = None
 
     @classmethod
     def read(cls, text: bytes) -> SignedSubmission:
@@ -172,16 +199,41 @@ class SignedSubmission(StrictModel):
                 "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
             )
         signed = _validate(cls, plain, FILE)
-        submission = signed.submission
-        if not verifies(
-            submission.submitter.key, signed.signature, "submission", submission.digest
-        ):
+        if not signed.is_valid:
             raise Rejection(
                 "bad_signature",
-                f"signature={signed.signature[:16]}…: invalid for this submission and the key "
-                f"{submission.submitter.key[:16]}…. Sign it again after the last change.",
+                f"signature={signed.signature[:16]}…: invalid for this submission, its board and "
+                f"the key {signed.submission.submitter.key[:16]}…. Sign it again after the last "
+                "change.",
             )
         return signed
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the submitter's key made the signature, for this submission and board."""
+        key = self.submission.submitter.key
+        return verifies(key, self.signature, "submission", self.id, self.board)
+
+    def for_board(self, board: str, key: SigningKey) -> SignedSubmission:
+        """The same submission, signed for a board if it is signed for none.
+
+        Args:
+          board: the board's public key.
+          key: the submitter's.
+
+        Raises:
+          Rejection: `bad_signature` if `key` is not the submitter's.
+        """
+        if self.board is not None:
+            return self
+        if key.public != self.submission.submitter.key:
+            raise Rejection(
+                "bad_signature",
+                f"key={key.public[:16]}…: must be the submission's, "
+                f"{self.submission.submitter.key[:16]}…, to sign it for this board. Give that "
+                "key's file (option --key).",
+            )
+        return self.submission.signed(key, board)
 
     @property
     def id(self) -> str:
@@ -202,17 +254,38 @@ class Withdrawal(Document):
     reason: Annotated[str, Field(max_length=300)] = ""
 
 
-class SignedWithdrawal(StrictModel):
-    """A withdrawal, signed with the key of the submission."""
+class SignedWithdrawal(_Signed):
+    """A withdrawal, signed with the key of the submission.
+
+    Attributes:
+      withdrawal: the content.
+      signature: of the key that signed the submission, for this withdrawal and board.
+      board: the public key of the only board that accepts it.
+    """
 
     withdrawal: Withdrawal
     signature: Signature
+    board: PublicKey | None = None
 
     @classmethod
-    def create(cls, id: str, key: SigningKey, reason: str = "") -> SignedWithdrawal:
-        """A new withdrawal; `key` must be the one that signed the submission of this id."""
+    def create(
+        cls, id: str, key: SigningKey, reason: str = "", *, board: str | None = None
+    ) -> SignedWithdrawal:
+        """A new withdrawal.
+
+        Args:
+          id: the submission's.
+          key: the one that signed the submission.
+          reason: shown on the submission's page; up to 300 characters.
+          board: the public key of the submission's board.
+        """
         withdrawal = Withdrawal(submission=id, created=now(), reason=reason)
-        return cls(withdrawal=withdrawal, signature=key.sign("withdrawal", withdrawal.digest))
+        signature = key.sign("withdrawal", withdrawal.digest, board)
+        return cls(withdrawal=withdrawal, signature=signature, board=board)
+
+    def is_valid(self, key: str) -> bool:
+        """Whether this public key made the signature, for this withdrawal and board."""
+        return verifies(key, self.signature, "withdrawal", self.withdrawal.digest, self.board)
 
     @classmethod
     def read(cls, text: bytes) -> SignedWithdrawal:

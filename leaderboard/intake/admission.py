@@ -1,6 +1,6 @@
 """Submissions: read, checked against the board and its quotas, then stored.
 
-    read → known? → document against board → quotas → artefacts present → gate → store
+    read → for this board? → known? → document → quotas → artefacts present → gate → store
 
 The order is fixed with cheap steps first, so that one fault always has one code, and megabytes
 are read only after everything declared about them has passed.
@@ -14,14 +14,9 @@ from collections.abc import Callable
 
 from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle import Bundle
-from leaderboard.documents.checks import check_submission
-from leaderboard.documents.submission import (
-    Artefact,
-    SignedSubmission,
-    Submission,
-    shifted,
-    utc,
-)
+from leaderboard.documents.checks import check_board, check_submission
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import Artefact, SignedSubmission, Submission, shifted, utc
 from leaderboard.errors import Rejection
 from leaderboard.intake.uploads import quota_window
 from leaderboard.store import Store
@@ -51,6 +46,7 @@ def admit(
     Raises:
       Rejection: with the code of the first fault.
     """
+    check_board(store.document, signed.board)
     moment = at or datetime.datetime.now(datetime.UTC)
     known = store.entry(signed.id)
     if known is not None:
@@ -75,8 +71,15 @@ def admit(
         return store.receive(signed)
 
 
-def submit_bundle(store: Store, folder: str | os.PathLike[str]) -> str:
+def submit_bundle(
+    store: Store, folder: str | os.PathLike[str], key: SigningKey | None = None
+) -> str:
     """Admit a bundle: its submission and the artefacts in its folder.
+
+    Args:
+      store: the board.
+      folder: the bundle's.
+      key: the submitter's, to sign a submission that is signed for no board yet.
 
     Returns:
       The submission's id.
@@ -85,8 +88,9 @@ def submit_bundle(store: Store, folder: str | os.PathLike[str]) -> str:
       Rejection: with the code of the first fault; nothing is stored.
     """
     bundle = Bundle.read(folder)
-    admit(store, bundle.signed, artefact=bundle.artefact)
-    return bundle.signed.id
+    signed = bundle.signed if key is None else bundle.signed.for_board(store.document.key, key)
+    admit(store, signed, artefact=bundle.artefact)
+    return signed.id
 
 
 def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:

@@ -105,4 +105,4 @@ def _submission(
         runs_started=dict(Counter(class_name for class_name, _ in instances.values())),
         statement=reference.statement,
     )
-    return submission.signed(key), artefacts
+    return submission.signed(key, key.public), artefacts

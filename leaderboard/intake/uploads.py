@@ -1,7 +1,7 @@
 """Uploads: a signed permission for one object and ten minutes, and the quotas in bytes.
 
-Authorization: SME-Ed25519 key=<64 hex>,time=<utc>,signature=<128 hex>
-signature = Ed25519(key, "sme-leaderboard/upload/" digest " " time)
+Authorization: SME-Ed25519 key=<64 hex>,board=<64 hex>,time=<utc>,signature=<128 hex>
+signature = Ed25519(key, "sme-leaderboard/upload/" board "/" digest " " time)
 """
 
 from __future__ import annotations
@@ -18,37 +18,61 @@ UPLOAD_MINUTES = 10
 _DAY, _SKEW = datetime.timedelta(days=1), datetime.timedelta(minutes=UPLOAD_MINUTES)
 _HEADER = re.compile(
     r"SME-Ed25519 key=([0-9a-f]{64}),"
+    r"(?:board=([0-9a-f]{64}),)?"
     r"time=(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ),"
     r"signature=([0-9a-f]{128})"
 )
 
 
-def upload_header(key: SigningKey, digest: str, time: str | None = None) -> str:
-    """The value of `Authorization` that lets a key upload one object within ten minutes."""
+def upload_header(
+    key: SigningKey, digest: str, time: str | None = None, *, board: str | None = None
+) -> str:
+    """The value of `Authorization` that lets a key upload one object within ten minutes.
+
+    Args:
+      key: the submitter's.
+      digest: of the object.
+      time: of signing, as documents write it; now by default.
+      board: the public key of the board.
+    """
     time = time or now()
-    signature = key.sign("upload", f"{digest} {time}")
-    return f"SME-Ed25519 key={key.public},time={time},signature={signature}"
+    signature = key.sign("upload", f"{digest} {time}", board)
+    named = "" if board is None else f"board={board},"
+    return f"SME-Ed25519 key={key.public},{named}time={time},signature={signature}"
 
 
-def uploader(header: str | None, digest: str, at: datetime.datetime | None = None) -> str:
+def uploader(
+    header: str | None,
+    digest: str,
+    at: datetime.datetime | None = None,
+    *,
+    board: str | None = None,
+) -> str:
     """The public key that signed an upload.
 
     Args:
       header: the value of `Authorization`; None if there is none.
       digest: of the object.
       at: time of arrival; now by default.
+      board: the public key of the board.
 
     Raises:
-      Rejection: `bad_signature` or `stale_time`.
+      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
     """
     match = _HEADER.fullmatch(header or "")
     if match is None:
         raise Rejection(
             "bad_signature",
-            "Authorization: must be `SME-Ed25519 key=…,time=…,signature=…`. Sign the upload.",
+            "Authorization: must be `SME-Ed25519 key=…,board=…,time=…,signature=…`. Sign the "
+            "upload.",
         )
-    key, time, signature = match.groups()
-    if not verifies(key, signature, "upload", f"{digest} {time}"):
+    key, signed_for, time, signature = match.groups()
+    if signed_for != board:
+        raise Rejection(
+            "wrong_board",
+            f"Authorization: board={signed_for}: must be {board}. Sign the upload for this board.",
+        )
+    if not verifies(key, signature, "upload", f"{digest} {time}", board):
         raise Rejection(
             "bad_signature",
             "Authorization: the signature does not match this object, this time and the key "

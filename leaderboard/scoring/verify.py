@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
-from leaderboard.documents.keys import verifies
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
@@ -271,13 +270,13 @@ class _Verifier:
             if withdrawal is not None:
                 path = self.folder.withdrawal(id)
                 signed = read_document(self.folder, path, SignedWithdrawal)
-                if not verifies(key, signed.signature, "withdrawal", signed.withdrawal.digest):
+                if signed.board != self.document.signatures_for or not signed.is_valid(key):
                     self._refuse(path, "its signature does not match the submission's key")
 
     def _submission(self, id: str) -> SignedSubmission:
         path = self.folder.submission(id)
         signed = read_document(self.folder, path, SignedSubmission)
-        if not verifies(signed.submission.submitter.key, signed.signature, "submission", id):
+        if signed.board != self.document.signatures_for or not signed.is_valid:
             self._refuse(path, "its signature does not match the submitter's key")
         return signed
 

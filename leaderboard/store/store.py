@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
-from leaderboard.documents.checks import check_text, refuse_unsubmittable
-from leaderboard.documents.keys import SigningKey, verifies
+from leaderboard.documents.checks import check_board, check_text, refuse_unsubmittable
+from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
 from leaderboard.errors import BoardError, Rejection
@@ -170,8 +170,8 @@ class Store(Database):
           False if it was withdrawn before.
 
         Raises:
-          Rejection: `unknown_submission`, `unsafe_name` (the reason), or `bad_signature`, if the
-            submission's own key did not sign it.
+          Rejection: `unknown_submission`, `unsafe_name` (the reason), `wrong_board`, or
+            `bad_signature`, if the submission's own key did not sign it.
           BoardError: it cannot be written.
         """
         withdrawal = signed.withdrawal
@@ -180,7 +180,8 @@ class Store(Database):
             if row is None:
                 raise unknown_submission(withdrawal.submission)
             check_text("reason", withdrawal.reason)
-            if not verifies(row[0], signed.signature, "withdrawal", withdrawal.digest):
+            check_board(self.document, signed.board)
+            if not signed.is_valid(row[0]):
                 raise Rejection(
                     "bad_signature",
                     f"signature={signed.signature[:16]}…: does not match this withdrawal and the "

@@ -142,7 +142,9 @@ class _Routes:
         # The HTTP parser accepts digits only, and holds the body to them.
         size = int(request.headers.get("Content-Length", limit))
         try:
-            key = intake.uploader(request.headers.get("Authorization"), digest)
+            key = intake.uploader(
+                request.headers.get("Authorization"), digest, board=self._store.document.key
+            )
             async with self._reservations.reserve(key, size):
                 # Without a name, and in the board's file system.
                 with await to_thread.run_sync(

@@ -12,7 +12,7 @@ import ipaddress
 import json
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from leaderboard.bundle import Bundle
@@ -48,7 +48,7 @@ def submit(
     Args:
       url: of the board, such as `https://board.example`.
       bundle: the bundle's folder.
-      key: signs the uploads; the submission itself is already signed.
+      key: the submitter's; signs the uploads, and the submission if it is signed for no board yet.
       progress: called with the number of artefacts on the board and of all artefacts.
       insecure: allow plain http to other machines, in a network that you trust.
 
@@ -64,15 +64,22 @@ def submit(
     runs = content.signed.submission.runs
     digests = list(dict.fromkeys(run.artefact.sha256 for run in runs if run.artefact))
     with _Client(url, insecure=insecure) as client:
+        board = client.board_document().key
+        signed = content.signed.for_board(board, key)
         for done, digest in enumerate(digests, start=1):
+            # Also if the board has it: only those who have its bytes may submit it.
+            sign = functools.partial(upload_header, key, digest, board=board)
             path = f"/api/objects/{hex_of(digest)}"
-            if not client.has(path):
-                sign = functools.partial(upload_header, key, digest)
-                client.request("PUT", path, content.artefact(digest), sign)
+            client.request("PUT", path, content.artefact(digest), sign)
             if progress is not None:
                 progress(done, len(digests))
-        _, answer = client.request("POST", "/api/submissions", content.signed.to_bytes())
-    return str(_answer_for(content.signed.id, answer, url)["id"])
+        _, answer = client.request("POST", "/api/submissions", signed.to_bytes())
+    return str(_answer_for(signed.id, answer, url)["id"])
+
+
+def page_of(url: str, id: str) -> str:
+    """The address of a submission's page on a served board."""
+    return f"{url.rstrip('/')}/submissions/{_digits(id)}"
 
 
 def status(url: str, id: str, *, insecure: bool = False) -> dict[str, Any]:
@@ -98,11 +105,7 @@ def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
       OptionError: the URL is invalid.
     """
     with _Client(url, insecure=insecure) as client:
-        _, answer = client.request("GET", "/definition.json")
-    try:
-        return BoardDocument.from_dict(answer)
-    except SpecError as error:
-        raise BoardError(f"{url}: its definition is invalid: {_printable(error)}") from None
+        return client.board_document()
 
 
 def withdraw(
@@ -121,8 +124,10 @@ def withdraw(
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
-    signed = SignedWithdrawal.create(f"sha256:{_digits(id)}", key, reason)
+    id = f"sha256:{_digits(id)}"
     with _Client(url, insecure=insecure) as client:
+        board = client.board_document().key
+        signed = SignedWithdrawal.create(id, key, reason, board=board)
         client.request("POST", "/api/withdrawals", json.dumps(signed.to_dict()).encode())
 
 
@@ -143,9 +148,15 @@ class _Client:
     def __exit__(self, *_: object) -> None:
         self._client.close()
 
-    def has(self, path: str) -> bool:
-        """Whether a path of the board exists."""
-        return self.request("HEAD", path, allowed=(404,))[0] != 404
+    def board_document(self) -> BoardDocument:
+        """The board's definition; errors as for the function of this name."""
+        _, answer = self.request("GET", "/definition.json")
+        try:
+            return BoardDocument.from_dict(answer)
+        except SpecError as error:
+            raise BoardError(
+                f"{self._url}: its definition is invalid: {_printable(error)}"
+            ) from None
 
     def request(
         self,
@@ -153,8 +164,6 @@ class _Client:
         path: str,
         content: bytes | None = None,
         sign: Callable[[], str] | None = None,
-        *,
-        allowed: Collection[int] = (),
     ) -> tuple[int, Any]:
         """Status and JSON of the answer to a request, repeated after failures of the network.
 
@@ -176,7 +185,7 @@ class _Client:
             if code not in _TRANSIENT or wait is None:
                 break
             time.sleep(wait)
-        if 200 <= code < 300 or code in allowed:
+        if 200 <= code < 300:
             return code, answer
         fields = answer if isinstance(answer, dict) else {}
         message = _printable(fields.get("message") or f"answered with HTTP status {code}")

@@ -26,6 +26,7 @@ STATUSES = {
     "not_json": 400,
     "unsafe_name": 400,
     "bad_signature": 403,
+    "wrong_board": 403,
     "stale_time": 403,
     "unknown_submission": 404,
     "not_found": 404,

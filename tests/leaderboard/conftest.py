@@ -112,7 +112,7 @@ def tiny_submission(
         },
         **fields,
     }
-    return Submission.from_dict(plain).signed(key), {digest: data}
+    return Submission.from_dict(plain).signed(key, store.document.key), {digest: data}
 
 
 def put_submission(
@@ -126,9 +126,11 @@ def put_submission(
     return signed
 
 
-def signed_withdrawal(id: str, key: SigningKey) -> SignedWithdrawal:
-    """A withdrawal of a submission, signed by this key."""
-    return SignedWithdrawal.create(id, key, "a test")
+def signed_withdrawal(
+    store: Store, id: str, key: SigningKey, reason: str = "a test"
+) -> SignedWithdrawal:
+    """A withdrawal of a submission of a board, signed by this key."""
+    return SignedWithdrawal.create(id, key, reason, board=store.document.key)
 
 
 @pytest.fixture

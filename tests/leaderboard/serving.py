@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import uvicorn
 
+from leaderboard.documents.keys import SigningKey
+from leaderboard.intake import upload_header
 from leaderboard.web.app import create_app
 from leaderboard.web.connections import Connections
 from leaderboard.web.serve import listen, server_config, url_of
@@ -42,6 +45,12 @@ def serving(
             server.should_exit = True
             thread.join(10)
             assert not thread.is_alive()
+
+
+def authorization(url: str, key: SigningKey, digest: str, time: str | None = None) -> str:
+    """The header that lets a key upload an object to the board at this address."""
+    board = httpx.get(f"{url}/definition.json", trust_env=False).json()["key"]
+    return upload_header(key, digest, time, board=board)
 
 
 @contextlib.contextmanager

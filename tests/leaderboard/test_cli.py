@@ -14,6 +14,7 @@ from typer.testing import CliRunner, Result
 
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.scoring.score import score_submission
 from leaderboard.store import Store
@@ -332,7 +333,10 @@ def test_everything_a_submitter_needs_is_at_the_boards_address() -> None:
             "--submitter", "A Lab",
         ).split()[0]  # fmt: skip
         assert json.loads(good("check", "bundle", url, "--json"))["enough_runs"]
-        assert good("submit", "bundle", url).strip() == id
+        sent = board_command("submit", "bundle", url)
+        assert (sent.exit_code, sent.stdout.strip()) == (0, id)
+        assert f"{url}/submissions/{hex_of(id)}" in sent.stderr
+        assert f"sme-leaderboard show {url} {id}" in sent.stderr
         assert "waiting" in good("show", url, id)
         good("score", "board")
         assert "WD regret" in good("show", url, id)

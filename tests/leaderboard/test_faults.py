@@ -151,7 +151,9 @@ def fill(board: Path, key: SigningKey, *, entries: int, instances: int) -> None:
         for number in range(entries):
             method = first.method.model_copy(update={"name": f"Method {number}"})
             if number > 0:
-                store.receive(first.model_copy(update={"method": method}).signed(key))
+                store.receive(
+                    first.model_copy(update={"method": method}).signed(key, store.document.key)
+                )
             claim = store.queue.claim("filler")
             assert claim is not None
             assert store.queue.finish(claim, _shifted(result, claim.id, 0.0005 * number))

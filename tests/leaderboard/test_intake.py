@@ -3,6 +3,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,13 @@ from leaderboard.intake import references
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
-from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board, tiny_submission
+from tests.leaderboard.conftest import (
+    linear_onnx,
+    put_submission,
+    signed_withdrawal,
+    tiny_board,
+    tiny_submission,
+)
 
 ANY_TIME = "2000-01-01T00:00:00Z"
 
@@ -61,7 +68,7 @@ def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmissio
     plain = signed.submission.to_dict()
     for run in plain["runs"]:
         run["artefact"] = {"sha256": digest, "size": len(data)}
-    return type(signed.submission).from_dict(plain).signed(key)
+    return type(signed.submission).from_dict(plain).signed(key, store.document.key)
 
 
 # Submissions.
@@ -102,7 +109,7 @@ def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -
     put(store, key, artefacts)
     plain = signed.submission.to_dict()
     plain["runs"][0]["artefact"]["size"] -= 1
-    other = type(signed.submission).from_dict(plain).signed(key)
+    other = type(signed.submission).from_dict(plain).signed(key, store.document.key)
     assert code_of(lambda: receive(store, other)) == "artefact_digest"
     assert store.entries() == []
 
@@ -130,7 +137,7 @@ def test_a_run_that_failed_needs_no_artefact(store: Store, key: SigningKey) -> N
     plain = signed.submission.to_dict()
     plain["runs"].append({**plain["runs"][0], "seed": 9, "artefact": None})
     plain["runs_started"]["Tiny"] += 1
-    failed = type(signed.submission).from_dict(plain).signed(key)
+    failed = type(signed.submission).from_dict(plain).signed(key, store.document.key)
     assert receive(store, failed) == failed.id
 
 
@@ -206,6 +213,20 @@ def test_a_full_queue_accepts_no_more(tmp_path: Path, key: SigningKey) -> None:
         assert len(intake.submit_references(store)) == 2  # without them nothing is ever shown
 
 
+def test_a_submission_is_for_one_board(tmp_path: Path, store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    with tiny_board(tmp_path / "other") as other:
+        put(other, key, artefacts)
+        assert code_of(lambda: receive(other, signed)) == "wrong_board"
+        for_none = signed.submission.signed(key)
+        assert code_of(lambda: receive(other, for_none)) == "wrong_board"
+        # Whoever has no key of the submitter cannot write another board into the envelope.
+        relabelled = signed.model_copy(update={"board": other.document.key})
+        assert code_of(lambda: receive(other, relabelled)) == "bad_signature"
+        assert receive(other, for_none.for_board(other.document.key, key)) == signed.id
+    assert store.entries() == []
+
+
 # Bundles.
 
 
@@ -231,6 +252,27 @@ def test_a_bundle_that_is_refused_leaves_nothing(
     folder = bundle(tmp_path / "changed", signed, dict.fromkeys(artefacts, b"?"))
     assert code_of(lambda: intake.submit_bundle(store, folder)) == "artefact_digest"
     assert (objects(store), store.entries()) == ([], [])
+
+
+def test_a_bundle_for_no_board_is_signed_for_the_board_it_is_sent_to(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    folder = bundle(tmp_path / "bundle", signed.submission.signed(key), artefacts)
+    assert code_of(lambda: intake.submit_bundle(store, folder)) == "wrong_board"
+    other = SigningKey.generate()
+    assert code_of(lambda: intake.submit_bundle(store, folder, other)) == "bad_signature"
+    assert intake.submit_bundle(store, folder, key) == signed.id
+    assert store.submission(signed.id) == signed
+
+
+def test_a_bundle_for_another_board_is_refused(
+    tmp_path: Path, store: Store, key: SigningKey
+) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    elsewhere = signed.submission.signed(key, "a" * 64)
+    folder = bundle(tmp_path / "bundle", elsewhere, artefacts)
+    assert code_of(lambda: intake.submit_bundle(store, folder, key)) == "wrong_board"
 
 
 # The board's own rows.
@@ -288,7 +330,7 @@ def test_the_name_of_a_reference_row_does_not_make_one(store: Store, key: Signin
 
 def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
-    withdrawal = SignedWithdrawal.create(signed.id, key, "a bug")
+    withdrawal = signed_withdrawal(store, signed.id, key, "a bug")
     assert store.withdraw(withdrawal)
     assert not store.withdraw(withdrawal)
     entry = store.entry(signed.id)
@@ -299,9 +341,9 @@ def test_a_withdrawal_is_final(store: Store, key: SigningKey) -> None:
 
 def test_only_the_submitter_withdraws(store: Store, key: SigningKey) -> None:
     signed = put_submission(store, key)
-    forged = SignedWithdrawal.create(signed.id, SigningKey.generate())
+    forged = signed_withdrawal(store, signed.id, SigningKey.generate())
     assert code_of(lambda: store.withdraw(forged)) == "bad_signature"
-    board = SignedWithdrawal.create(signed.id, store.folder.signing_key())
+    board = signed_withdrawal(store, signed.id, store.folder.signing_key())
     assert code_of(lambda: store.withdraw(board)) == "bad_signature"
 
 
@@ -310,14 +352,25 @@ def test_a_reason_may_not_contain_control_characters(
     store: Store, key: SigningKey, letter: str
 ) -> None:
     signed = put_submission(store, key)
-    unsafe = SignedWithdrawal.create(signed.id, key, f"a bug{letter}[2J")
+    unsafe = signed_withdrawal(store, signed.id, key, f"a bug{letter}[2J")
     assert code_of(lambda: store.withdraw(unsafe)) == "unsafe_name"
     assert store.withdrawal(signed.id) is None
-    store.withdraw(SignedWithdrawal.create(signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+    store.withdraw(signed_withdrawal(store, signed.id, key, "ein Käfer <b>,\nzweite Zeile"))
+
+
+def test_a_withdrawal_is_for_one_board(store: Store, key: SigningKey) -> None:
+    """A submission's id is the same on every board, so only the signature names the board."""
+    signed = put_submission(store, key)
+    elsewhere = [SignedWithdrawal.create(signed.id, key, board=b) for b in (None, "a" * 64)]
+    for withdrawal in elsewhere:
+        assert code_of(partial(store.withdraw, withdrawal)) == "wrong_board"
+        relabelled = withdrawal.model_copy(update={"board": store.document.key})
+        assert code_of(partial(store.withdraw, relabelled)) == "bad_signature"
+    assert store.withdrawal(signed.id) is None
 
 
 def test_an_unknown_submission_cannot_be_withdrawn(store: Store, key: SigningKey) -> None:
-    withdrawal = SignedWithdrawal.create("sha256:" + "0" * 64, key)
+    withdrawal = signed_withdrawal(store, "sha256:" + "0" * 64, key)
     assert code_of(lambda: store.withdraw(withdrawal)) == "unknown_submission"
 
 
@@ -338,6 +391,18 @@ def test_an_upload_is_signed_for_one_object(key: SigningKey) -> None:
     assert intake.uploader(header, this) == key.public
     assert code_of(lambda: intake.uploader(header, other)) == "bad_signature"
     assert code_of(lambda: intake.uploader(None, this)) == "bad_signature"
+
+
+def test_an_upload_is_signed_for_one_board(key: SigningKey) -> None:
+    digest, board, other = "sha256:" + "1" * 64, "a" * 64, "b" * 64
+    header = intake.upload_header(key, digest, board=board)
+    assert intake.uploader(header, digest, board=board) == key.public
+    assert code_of(lambda: intake.uploader(header, digest, board=other)) == "wrong_board"
+    assert code_of(lambda: intake.uploader(header, digest)) == "wrong_board"
+    relabelled = header.replace(board, other)
+    assert code_of(lambda: intake.uploader(relabelled, digest, board=other)) == "bad_signature"
+    unbound = intake.upload_header(key, digest)
+    assert code_of(lambda: intake.uploader(unbound, digest, board=board)) == "wrong_board"
 
 
 @pytest.mark.parametrize("minutes", [-11, 11])

@@ -52,6 +52,7 @@ FIELDS: dict[str, Any] = {
     "draws": 100,
 }
 DOCUMENT = BoardDocument(key="0" * 64, **FIELDS)
+KEY = SigningKey.generate()
 WIDTHS = (6, 2)  # s, t/T, r_cum/k and two one-hot entries; the widest agent's channels
 
 
@@ -76,7 +77,7 @@ def bundle(folder: Path, team: bytes) -> Path:
     made = make_bundle(
         folder / "bundle",
         suite=FILE,
-        key=SigningKey.generate(),
+        key=KEY,
         runs=[folder / "runs.json"],
         method="Shared",
         submitter="A Lab",
@@ -89,7 +90,7 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
 ) -> None:
     folder = bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS))
     with Store.open(board) as store:
-        id = intake.submit_bundle(store, folder)
+        id = intake.submit_bundle(store, folder, KEY)
     run_scorers(board, 1)
     assert verify(board, rescore=3).rescored == 3
     with Store.open(board, read_only=True) as store:
@@ -146,7 +147,7 @@ def test_a_policy_of_other_widths_is_rejected(tmp_path: Path) -> None:
 
 def test_an_altered_agent_is_found(board: Path, tmp_path: Path) -> None:
     with Store.open(board) as store:
-        intake.submit_bundle(store, bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS)))
+        intake.submit_bundle(store, bundle(tmp_path / "mine", linear_onnx(400, *WIDTHS)), KEY)
     run_scorers(board, 1)
     results = sorted((board / "results").iterdir())
     path = next(path for path in results if "driver_0" in path.read_text())

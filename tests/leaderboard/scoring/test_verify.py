@@ -40,7 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with tiny_board(path, instances=2) as store:
         signed = [put_submission(store, key, number) for number in range(3)]
         run_scorer(path)
-        store.withdraw(signed_withdrawal(signed[2].id, key))
+        store.withdraw(signed_withdrawal(store, signed[2].id, key))
         put_submission(store, key, 3)
         assert store.head.sequence == 8
     return path
@@ -323,11 +323,10 @@ def test_a_foreign_file_is_named(board):
     assert first_altered(board) == "results/note.json"
 
 
-def test_a_submission_not_yet_logged_is_counted(board, tmp_path):
-    key = SigningKey.generate()
-    with tiny_board(tmp_path / "other", instances=2) as other:
-        signed = put_submission(other, key, 5)
-        shutil.copyfile(other.folder.submission(signed.id), Folder(board).submission(signed.id))
+def test_a_submission_not_yet_logged_is_counted(board):
+    with Store.open(board, read_only=True) as store:
+        signed, _ = tiny_submission(store, SigningKey.generate(), 5)
+    Folder(board).submission(signed.id).write_bytes(signed.to_bytes())
     assert verify(board).unlogged == 1
     path = Folder(board).submission(signed.id)
     alter(path, lambda plain: plain["submission"]["method"].update(name="Better"))

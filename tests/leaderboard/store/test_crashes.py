@@ -50,7 +50,7 @@ def finish(board: Path, key: SigningKey) -> object:
 
 def withdraw(board: Path, key: SigningKey) -> object:
     with Store.open(board) as store:
-        return store.withdraw(signed_withdrawal(store.entries()[0].id, key))
+        return store.withdraw(signed_withdrawal(store, store.entries()[0].id, key))
 
 
 def reindex(board: Path, key: SigningKey) -> object:

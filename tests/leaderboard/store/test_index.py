@@ -36,9 +36,9 @@ def fill(store: Store, key: SigningKey, *, waiting: bool = False) -> None:
         assert claim.id == signed[number].id
         code = "onnx_op" if number == 1 else ""
         assert store.queue.finish(claim, synthetic_result(store, claim.id, code=code))
-    store.withdraw(signed_withdrawal(signed[2].id, key))
+    store.withdraw(signed_withdrawal(store, signed[2].id, key))
     if not waiting:
-        store.withdraw(signed_withdrawal(signed[3].id, key))
+        store.withdraw(signed_withdrawal(store, signed[3].id, key))
 
 
 def put_artefacts(store: Store, key: SigningKey, number: int) -> SignedSubmission:
@@ -135,10 +135,10 @@ def test_the_same_submission_twice_is_one_row(store, submit):
 def test_only_the_submissions_own_key_withdraws_it_and_only_once(store, key, submit):
     signed = submit()
     with pytest.raises(Rejection) as refused:
-        store.withdraw(signed_withdrawal(signed.id, SigningKey.generate()))
+        store.withdraw(signed_withdrawal(store, signed.id, SigningKey.generate()))
     assert refused.value.code == "bad_signature"
-    assert store.withdraw(signed_withdrawal(signed.id, key))
-    assert not store.withdraw(signed_withdrawal(signed.id, key))
+    assert store.withdraw(signed_withdrawal(store, signed.id, key))
+    assert not store.withdraw(signed_withdrawal(store, signed.id, key))
     assert store.entry(signed.id).status == "withdrawn"
     assert store.queue.waiting() == 0
 
@@ -148,7 +148,7 @@ def test_an_unknown_id_is_reported(store, key):
     with pytest.raises(Rejection, match="unknown_submission"):
         store.submission(unknown)
     with pytest.raises(Rejection, match="unknown_submission"):
-        store.withdraw(signed_withdrawal(unknown, key))
+        store.withdraw(signed_withdrawal(store, unknown, key))
     assert store.result(unknown) is None
     assert store.entry(unknown) is None
 

@@ -12,7 +12,7 @@ from tests.leaderboard.conftest import put_submission, signed_withdrawal, tiny_b
 
 def test_each_entry_has_the_previous_digest_and_the_boards_signature(store, key, submit):
     signed = submit()
-    store.withdraw(signed_withdrawal(signed.id, key))
+    store.withdraw(signed_withdrawal(store, signed.id, key))
     entries = store.log()
     assert [entry.event for entry in entries] == ["opened", "received", "withdrawn"]
     assert [entry.sequence for entry in entries] == [0, 1, 2]

@@ -245,7 +245,7 @@ def test_a_row_rejected_by_an_earlier_version_stays_rejected(store):
 def test_a_submission_withdrawn_during_scoring_gets_no_result(store, key, submit):
     signed = submit()
     claim = store.queue.claim("worker")
-    store.withdraw(signed_withdrawal(signed.id, key))
+    store.withdraw(signed_withdrawal(store, signed.id, key))
     assert not store.queue.heartbeat(claim)
     assert not store.queue.finish(claim, synthetic_result(store, claim.id))
     assert store.result(signed.id) is None

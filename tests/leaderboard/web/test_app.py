@@ -20,7 +20,7 @@ from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
+from leaderboard.documents.submission import SignedSubmission, utc
 from leaderboard.errors import BoardError
 from leaderboard.public_view import PublicView
 from leaderboard.store import Store
@@ -35,7 +35,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
-from tests.leaderboard.serving import serving, serving_process
+from tests.leaderboard.serving import authorization, serving, serving_process
 from tests.leaderboard.web.site import boards
 
 # More patient than httpx, for busy machines; a connection for each request, as `httpx.get` has.
@@ -76,7 +76,7 @@ def put(
     url: str, key: SigningKey, data: bytes, digest: str | None = None, **more: Any
 ) -> httpx.Response:
     digest = digest or sha256(data)
-    headers = {"Authorization": intake.upload_header(key, digest), **more}
+    headers = {"Authorization": authorization(url, key, digest), **more}
     return HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=data, headers=headers)
 
 
@@ -368,7 +368,7 @@ def test_a_submission_is_served_with_its_result(published: tuple[str, dict[str, 
     assert (rejected["status"], rejected["result"]["code"]) == ("rejected", "onnx_op")
     assert (waiting["status"], waiting["result"]) == ("waiting", None)
     read = SignedSubmission.read(
-        json.dumps({name: scored[name] for name in ("submission", "signature")}).encode()
+        json.dumps({name: scored[name] for name in ("submission", "signature", "board")}).encode()
     )
     assert read.id == ids["sac"]
 
@@ -547,10 +547,8 @@ def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: Signin
 
 def test_an_upload_without_a_signature_is_refused(url: str, key: SigningKey) -> None:
     path = f"{url}/api/objects/{hex_of(sha256(b'x'))}"
-    other = intake.upload_header(key, sha256(b"y"))
-    forged = intake.upload_header(key, sha256(b"x")).replace(
-        key.public, SigningKey.generate().public
-    )
+    other = authorization(url, key, sha256(b"y"))
+    forged = authorization(url, key, sha256(b"x")).replace(key.public, SigningKey.generate().public)
     for header in (None, "", "Bearer x", other, forged, "SME-Ed25519 " + "x" * 10_000):
         headers = {} if header is None else {"Authorization": header}
         answer = HTTP.put(path, content=b"x", headers=headers)
@@ -562,12 +560,12 @@ def test_an_upload_signed_at_another_time_is_refused(
     url: str, key: SigningKey, minutes: int
 ) -> None:
     moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
-    header = intake.upload_header(key, sha256(b"x"), utc(moment))
+    header = authorization(url, key, sha256(b"x"), utc(moment))
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
 def test_an_upload_signed_at_an_impossible_time_is_rejected(url: str, key: SigningKey) -> None:
-    header = intake.upload_header(key, sha256(b"x"), "2026-02-31T00:00:00Z")
+    header = authorization(url, key, sha256(b"x"), "2026-02-31T00:00:00Z")
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
@@ -575,7 +573,7 @@ def test_an_upload_that_is_too_large_is_refused_by_its_length(
     store: Store, key: SigningKey, url: str
 ) -> None:
     limit = store.document.limits.artefact_bytes
-    header = intake.upload_header(key, sha256(b"x"))
+    header = authorization(url, key, sha256(b"x"))
     start = time.process_time()  # the server is a thread of this process
     answer = raw(
         url,
@@ -601,13 +599,13 @@ def test_an_upload_without_a_length_is_stopped_at_the_limit(
                     yield b"x" * 5000
 
             digest = sha256(b"x" * 200_000)
-            headers = {"Authorization": intake.upload_header(key, digest)}
+            headers = {"Authorization": authorization(url, key, digest)}
             answer = HTTP.put(
                 f"{url}/api/objects/{hex_of(digest)}", content=endless(), headers=headers
             )
             assert refusal(answer) == (413, "too_large")
             small = b"y" * 5000
-            headers = {"Authorization": intake.upload_header(key, sha256(small))}
+            headers = {"Authorization": authorization(url, key, sha256(small))}
             answer = HTTP.put(
                 f"{url}/api/objects/{hex_of(sha256(small))}", content=iter([small]), headers=headers
             )
@@ -622,7 +620,7 @@ def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: Signi
     for length in (999, 1001):
         head = (
             f"PUT /api/objects/{hex_of(sha256(data))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {intake.upload_header(key, sha256(data))}\r\n"
+            f"Authorization: {authorization(url, key, sha256(data))}\r\n"
             f"Connection: close\r\nContent-Length: {length}\r\n\r\n"
         )
         parts = urlsplit(url)
@@ -639,12 +637,12 @@ def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
     store: Store, key: SigningKey
 ) -> None:
     before = files_of(store)
-    head = (
-        f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-        f"Authorization: {intake.upload_header(key, sha256(b'z'))}\r\n"
-        "Content-Length: 1000000\r\n\r\n"
-    ).encode() + b"z" * 70_000
     with serving(store.folder.path, upload_seconds=2.0) as url:
+        head = (
+            f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {authorization(url, key, sha256(b'z'))}\r\n"
+            "Content-Length: 1000000\r\n\r\n"
+        ).encode() + b"z" * 70_000
         parts = urlsplit(url)
         with socket.create_connection((parts.hostname, parts.port), 60) as connection:
             connection.sendall(head)  # broken off
@@ -660,7 +658,7 @@ def test_the_quota_of_a_key_counts_uploads_in_progress(tmp_path: Path, key: Sign
     with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
         head = (
             f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {intake.upload_header(key, sha256(b'z'))}\r\n"
+            f"Authorization: {authorization(url, key, sha256(b'z'))}\r\n"
             "Content-Length: 600\r\n\r\n"
         ).encode()
         parts = urlsplit(url)
@@ -797,19 +795,20 @@ def test_an_invalid_submission_has_its_code(
     plain = uploaded(url, store, key).submission.to_dict()
     change(plain)
     start = time.process_time()  # the server is a thread of this process
-    answer = post(url, _signed_anyway(plain, key))
+    answer = post(url, _signed_anyway(plain, key, store.document.key))
     assert time.process_time() - start < 1.0
     assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
     assert set(answer.json()) == {"code", "message"}
     assert store.entries() == []
 
 
-def _signed_anyway(plain: Json, key: SigningKey) -> bytes:
+def _signed_anyway(plain: Json, key: SigningKey, board: str) -> bytes:
     """A submission signed rightly, whatever it holds."""
     import rfc8785
 
     digest = "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()
-    return json.dumps({"submission": plain, "signature": key.sign("submission", digest)}).encode()
+    signature = key.sign("submission", digest, board)
+    return json.dumps({"submission": plain, "signature": signature, "board": board}).encode()
 
 
 @pytest.mark.parametrize(
@@ -882,12 +881,12 @@ def test_a_withdrawal_by_the_submitter_is_final(url: str, store: Store, key: Sig
     signed = uploaded(url, store, key)
     post(url, signed.to_bytes())
     path = f"{url}/api/withdrawals"
-    by_another_key = SignedWithdrawal.create(signed.id, SigningKey.generate())
+    by_another_key = signed_withdrawal(store, signed.id, SigningKey.generate())
     answer = HTTP.post(path, json=by_another_key.to_dict())
     assert refusal(answer) == (403, "bad_signature")
-    unknown = SignedWithdrawal.create("sha256:" + "0" * 64, key)
+    unknown = signed_withdrawal(store, "sha256:" + "0" * 64, key)
     assert refusal(HTTP.post(path, json=unknown.to_dict())) == (404, "unknown_submission")
-    valid = SignedWithdrawal.create(signed.id, key, "a bug")
+    valid = signed_withdrawal(store, signed.id, key, "a bug")
     for _ in range(2):
         answer = HTTP.post(path, json=valid.to_dict())
         assert (answer.status_code, answer.json()["status"]) == (200, "withdrawn")

@@ -129,30 +129,36 @@ def test_a_rejection_has_the_boards_code_and_message(tmp_path: Path, key: Signin
     assert "within 24 hours" in caught.value.message
 
 
-def test_existing_artefacts_are_not_sent_again(
+def test_bytes_are_sent_even_if_the_board_has_them(
     tmp_path: Path, store: Store, key: SigningKey
 ) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
-    confirmation = json.dumps({"id": signed.id}).encode()
-    with scripted(lambda method, _: (200, b"" if method == "HEAD" else confirmation)) as (
-        url,
-        asked,
-    ):
+    answers = {
+        "GET": definition(store),
+        "PUT": (200, b"{}"),
+        "POST": (202, json.dumps({"id": signed.id}).encode()),
+    }
+    with scripted(lambda method, _: answers[method]) as (url, asked):
         client.submit(url, folder, key)
-    assert [line.split()[0] for line in asked] == ["HEAD", "POST"]
+    assert [line.split()[0] for line in asked] == ["GET", "PUT", "POST"]
 
 
 def test_lost_requests_are_repeated(tmp_path: Path, store: Store, key: SigningKey) -> None:
     folder, signed = bundle_of(tmp_path / "bundle", store, key)
     answers = {
-        "HEAD": iter([None, (404, b"")]),
+        "GET": iter([None, definition(store)]),
         "PUT": iter([None, (503, b"<html>"), (201, b"{}")]),
         "POST": iter([None, (202, json.dumps({"id": signed.id}).encode())]),
     }
     with scripted(lambda method, _: next(answers[method])) as (url, asked):
         assert client.submit(url, folder, key) == signed.id
     methods = [line.split()[0] for line in asked]
-    assert methods == ["HEAD"] * 2 + ["PUT"] * 3 + ["POST"] * 2
+    assert methods == ["GET"] * 2 + ["PUT"] * 3 + ["POST"] * 2
+
+
+def definition(store: Store) -> tuple[int, bytes]:
+    """A board's answer for its definition."""
+    return 200, json.dumps(store.document.to_dict()).encode()
 
 
 def test_an_unreachable_board_is_reported(tmp_path: Path, store: Store, key: SigningKey) -> None:
@@ -164,14 +170,17 @@ def test_an_unreachable_board_is_reported(tmp_path: Path, store: Store, key: Sig
         client.status(url, "0" * 64)
 
 
-def test_a_rejected_request_is_not_repeated(key: SigningKey) -> None:
+def test_a_rejected_request_is_not_repeated(store: Store, key: SigningKey) -> None:
     no = json.dumps({"code": "quota", "message": "none left"}).encode()
     with (
-        scripted(lambda *_: (429, no)) as (url, asked),
+        scripted(lambda method, _: definition(store) if method == "GET" else (429, no)) as (
+            url,
+            asked,
+        ),
         pytest.raises(Rejection, match="none left"),
     ):
         client.withdraw(url, "0" * 64, key)
-    assert len(asked) == 1
+    assert len(asked) == 2
 
 
 @pytest.mark.parametrize(
@@ -258,7 +267,7 @@ def test_an_artefact_that_was_changed_is_not_sent(
     folder, _ = bundle_of(tmp_path / "bundle", store, key)
     for path in (folder / "artefacts").iterdir():
         path.write_bytes(bytes(path.stat().st_size))
-    with scripted(lambda *_: (404, b"")) as (url, asked), pytest.raises(Rejection) as caught:
+    with scripted(lambda *_: definition(store)) as (url, asked), pytest.raises(Rejection) as caught:
         client.submit(url, folder, key)
     assert caught.value.code == "artefact_digest"
     assert not [line for line in asked if line.startswith("PUT")]

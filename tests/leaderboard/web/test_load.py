@@ -50,6 +50,7 @@ def test_a_hundred_large_uploads_at_once_take_little_memory(store: Store, key: S
     all_are_half_way = threading.Barrier(UPLOADS, timeout=120)
     statuses: list[int] = []
     digests: list[str] = []
+    board = store.document.key
 
     def upload(number: int, address: str) -> None:
         head = number.to_bytes(8, "big")  # each is another object
@@ -59,7 +60,7 @@ def test_a_hundred_large_uploads_at_once_take_little_memory(store: Store, key: S
         connection = http.client.HTTPConnection(address, timeout=120)
         connection.putrequest("PUT", f"/api/objects/{sha256.hexdigest()}")
         connection.putheader("Content-Length", str(UPLOAD_BYTES))
-        connection.putheader("Authorization", upload_header(key, digest))
+        connection.putheader("Authorization", upload_header(key, digest, board=board))
         connection.endheaders(head)
         connection.send(body[8:half])
         all_are_half_way.wait()

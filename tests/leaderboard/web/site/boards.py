@@ -115,7 +115,7 @@ def submit(
         training=training or Training(),
         statement=statement,
     )
-    signed = submission.signed(key)
+    signed = submission.signed(key, document.key)
     store.receive(signed)
     if profile is None and rejected is None:
         return signed.id

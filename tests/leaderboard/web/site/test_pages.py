@@ -75,8 +75,11 @@ def board(tmp_path_factory):
         gone = boards.submit(store, key, "Gone", [0.3] * 6)
         ids = boards.furnish(store)
         withdrawal = Withdrawal(submission=gone, created=boards.CREATED)
-        signature = key.sign("withdrawal", withdrawal.digest)
-        assert store.withdraw(SignedWithdrawal(withdrawal=withdrawal, signature=signature))
+        signed_for = store.document.key
+        signature = key.sign("withdrawal", withdrawal.digest, signed_for)
+        assert store.withdraw(
+            SignedWithdrawal(withdrawal=withdrawal, signature=signature, board=signed_for)
+        )
         yield store, {**ids, "gone": gone}
 
 
@@ -338,7 +341,7 @@ def test_the_page_of_a_withdrawn_submission_gives_its_reason_as_text(tmp_path):
     with boards.create(tmp_path / "board", classes=1) as store:
         id = boards.submit(store, key, "PPO", [0.2] * 6)
         assert "Reason:" not in Page(Pages(store).submission(id)).words
-        store.withdraw(SignedWithdrawal.create(id, key, boards.HOSTILE))
+        store.withdraw(SignedWithdrawal.create(id, key, boards.HOSTILE, board=store.document.key))
         page = Page(Pages(store).submission(id))
     assert f"Reason: {boards.HOSTILE}" in page.words
 
