@@ -6,18 +6,23 @@ Protocol, spec and artefact determine the seed of a run's states:
 
     seed = first 53 bits of SHA-256(protocol digest, spec digest, artefact digest)
 
-Anyone can recompute it, and each attempt at luckier states needs another policy. Memory holds one
-artefact and one batch of states at a time.
+Anyone can recompute it, and each attempt at luckier states needs another policy. The checks of a
+policy's behaviour use states and batches that the system's randomness draws, so no policy can
+behave well only where it is checked. Memory holds one artefact and one batch of states at a time.
 """
 
 from __future__ import annotations
 
 import hashlib
+import secrets
 from collections.abc import Callable
-from importlib import metadata
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from leaderboard.artefact.gate import widths
+from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.artefact.sandbox import Actions, Observations, Sandbox, SandboxLimits
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import AgentScore, Result, RunScore
@@ -28,8 +33,12 @@ from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
 from sme_registry.evaluation import EvaluationReport
+from sme_registry.io import versions
 
 Progress = Callable[[int, int], None]
+
+ROUNDING_STATES = 1024
+"""States of each region in which the effect of rounding is measured."""
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch")
@@ -41,33 +50,47 @@ def evaluation_seed(protocol_digest: str, spec_digest: str, artefact_digest: str
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 11
 
 
+@dataclass
+class _Machine:
+    """What scores: recorded in the result, whatever becomes of the submission."""
+
+    isolation: Isolation
+    versions: dict[str, str] = field(default_factory=lambda: versions(["numpy"]))
+
+
 def score_submission(
     board: BoardDocument,
     submission: Submission,
     artefact: Callable[[str], bytes],
     progress: Progress | None = None,
+    *,
+    isolation: Isolation | None = None,
 ) -> Result:
     """Score every run of a submission, and the method over its runs.
 
     Args:
-      board: the suite, the protocol, and the numbers of runs and bootstrap draws.
+      board: the suite, the rules, the protocol, and the numbers of runs and bootstrap draws.
       submission: accepted by `checks`.
       artefact: returns a file's bytes by its digest.
       progress: called after each batch with the number of evaluated states and of all states.
+      isolation: of the sandbox; None for the one that this machine has.
 
     Returns:
-      The result, a function of board, submission and artefacts up to floating-point rounding. It
-      is a rejection if an artefact, or its behaviour, is rejected.
+      The result, a function of board, submission and artefacts up to floating-point rounding,
+      except for the measured effect of rounding, `RunScore.rounding`. It is a rejection if an
+      artefact, or its behaviour, is rejected.
 
     Raises:
-      BoardError: a sandbox cannot be started or was ended from outside. The submission is not
-        judged.
+      ScoringFault: a sandbox does not start, was ended from outside, or lacks memory or processor
+        time. The submission is not judged.
+      BoardError: this system is not Linux.
       MissingDependencyError: onnxruntime is not installed.
       Errors of `artefact` and `progress`; a `Rejection` becomes the result.
     """
+    machine = _Machine(isolation or available_isolation())
     try:
         unlisted = never_listed(board, submission)
-        runs, versions = _score_runs(board, submission, artefact, progress)
+        runs = _score_runs(board, submission, artefact, progress, machine)
     except Rejection as error:
         return Result(
             submission=submission.digest,
@@ -76,8 +99,17 @@ def score_submission(
             status="rejected",
             code=error.code,
             message=error.message,
+            versions=machine.versions,
+            isolation=machine.isolation,
         )
-    return result_of(board, submission.digest, runs, versions, unlisted=unlisted)
+    return result_of(
+        board,
+        submission.digest,
+        runs,
+        machine.versions,
+        unlisted=unlisted,
+        isolation=machine.isolation,
+    )
 
 
 def _score_runs(
@@ -85,12 +117,12 @@ def _score_runs(
     submission: Submission,
     artefact: Callable[[str], bytes],
     progress: Progress | None,
-) -> tuple[list[RunScore], dict[str, str]]:
-    """The listed runs in order, and the versions of packages."""
+    machine: _Machine,
+) -> list[RunScore]:
+    """The listed runs in order."""
     instances = board.instances
     states = board.protocol.states_per_region * len(board.protocol.edges)
     policies = sum(run.artefact is not None for run in submission.runs)
-    versions: dict[str, str] = {}
     runs: list[RunScore] = []
     evaluated = 0
     for index, run in enumerate(submission.runs):
@@ -105,7 +137,7 @@ def _score_runs(
 
         digest = run.artefact.sha256
         try:
-            report = _evaluate(board, spec, artefact(digest), digest, advanced)
+            report, rounding = _evaluate(board, spec, artefact(digest), digest, advanced, machine)
         except Rejection as error:
             raise Rejection(
                 error.code,
@@ -113,9 +145,8 @@ def _score_runs(
                 f"{error.message}",
             ) from None
         evaluated += 1
-        runs.append(_run_score(board, class_name, report, digest))
-        versions = versions or _versions(report)
-    return runs, versions
+        runs.append(_run_score(board, class_name, report, digest, rounding))
+    return runs
 
 
 def agent_names(spec: SMESpec) -> list[str]:
@@ -124,38 +155,121 @@ def agent_names(spec: SMESpec) -> list[str]:
 
 
 def _evaluate(
-    board: BoardDocument, spec: SMESpec, data: bytes, digest: str, progress: Progress
-) -> EvaluationReport:
-    """Evaluate a policy in the sandbox on the states of its own seed."""
-    seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
-    protocol = board.protocol.model_copy(update={"seed": seed})
+    board: BoardDocument,
+    spec: SMESpec,
+    data: bytes,
+    digest: str,
+    progress: Progress,
+    machine: _Machine,
+) -> tuple[EvaluationReport, float]:
+    """Evaluate a policy in the sandbox on the states of its own seed; and its rounding."""
     agents = max(1, len(agent_names(spec)))
-    limits = SandboxLimits(cpu_seconds=agents * SandboxLimits.cpu_seconds)
+    states = board.protocol.states_per_region
+    limits = SandboxLimits.for_policy(len(data), states * len(board.protocol.edges), agents)
+    with Sandbox(data, *widths(spec), limits, isolation=machine.isolation) as sandbox:
+        machine.versions["onnxruntime"] = sandbox.runtime
+        policy = _CheckedPolicy(sandbox, states, agents)
+        report = _report(board, spec, policy, digest, progress)
+    used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
+    machine.versions = {**used, "onnxruntime": sandbox.runtime}
+    return report, float(np.mean(policy.rounding))
+
+
+def rounding_by_region(
+    board: BoardDocument, spec: SMESpec, data: bytes, digest: str
+) -> tuple[float, ...]:
+    """How much rounding may change a policy's normalised regret: mean |Δa| / mean |½ − a*|.
+
+    Args:
+      board: the protocol.
+      spec: the instance.
+      data: the policy's file.
+      digest: of the file, which determines the states.
+
+    Returns:
+      For each region, over all states that are scored, and all channels; dimensionless.
+
+    Raises:
+      Rejection, BoardError: see `Sandbox`.
+    """
+    agents = max(1, len(agent_names(spec)))
+    states = board.protocol.states_per_region
+    limits = SandboxLimits.for_policy(len(data), 16 * states * len(board.protocol.edges), agents)
+    sums = np.zeros(len(board.protocol.edges))
+    rows = 0
     with Sandbox(data, *widths(spec), limits) as sandbox:
-        evaluated = 0
 
         def policy(observations: Observations) -> Actions:
-            nonlocal evaluated
-            # `evaluate` proceeds region by region and asks for each agent in turn, so these are
-            # the first states of a region, for each agent.
-            if evaluated % (agents * protocol.states_per_region) < agents * len(observations):
-                sandbox.check_rows(observations)
-            evaluated += len(observations)
+            nonlocal rows
+            sums[rows // (states * agents)] += sandbox.rounding(observations).sum()
+            rows += len(observations)
             return sandbox(observations)
 
-        try:
-            return evaluate(
-                policy, spec, protocol, action_range="unit", name=digest, progress=progress
-            )
-        except PolicyError as error:
-            # `evaluate` wraps the sandbox's errors like those of any callable.
-            if isinstance(error.__cause__, SMEError):
-                raise error.__cause__ from None
-            raise
+        report = _report(board, spec, policy, digest)
+    constant = [region.mae for region in report.references["constant_half"]]
+    return tuple((sums / (states * agents) / constant).tolist())
+
+
+def _report(
+    board: BoardDocument,
+    spec: SMESpec,
+    policy: Callable[[Observations], Actions],
+    digest: str,
+    progress: Progress | None = None,
+) -> EvaluationReport:
+    """The evaluation of a sandboxed policy, whose errors it passes on as they are."""
+    seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
+    protocol = board.protocol.model_copy(update={"seed": seed})
+    try:
+        return evaluate(policy, spec, protocol, action_range="unit", name=digest, progress=progress)
+    except PolicyError as error:
+        # `evaluate` wraps the sandbox's errors like those of any callable.
+        if isinstance(error.__cause__, SMEError):
+            raise error.__cause__ from None
+        raise
+
+
+class _CheckedPolicy:
+    """A sandboxed policy as `evaluate` calls it: region by region, batch by batch, for each agent.
+
+    In each region, a random batch and the last one, which is often smaller, are checked for
+    dependence on other rows, and random states for dependence on rounding.
+
+    Attributes:
+      rounding: mean |Δa| of each region that is complete.
+    """
+
+    def __init__(self, sandbox: Sandbox, states: int, agents: int) -> None:
+        self.rounding: list[float] = []
+        self._sandbox, self._states, self._agents = sandbox, states, agents
+        self._random = np.random.default_rng(secrets.randbits(128))
+        self._begin_region()
+
+    def _begin_region(self) -> None:
+        self._first = self._calls = 0
+        self._batch_with = int(self._random.integers(self._states))
+        count = min(ROUNDING_STATES, self._states)
+        self._chosen = np.sort(self._random.choice(self._states, count, replace=False))
+        self._rows: list[Observations] = []
+
+    def __call__(self, observations: Observations) -> Actions:
+        end = self._first + len(observations)
+        if self._first <= self._batch_with < end or end == self._states:
+            self._sandbox.check_rows(observations)
+        low, high = np.searchsorted(self._chosen, (self._first, end))
+        self._rows.append(observations[self._chosen[low:high] - self._first])
+        a = self._sandbox(observations)
+        self._calls += 1
+        if self._calls % self._agents == 0:
+            self._first = end
+            if end == self._states:
+                self.rounding.append(self._sandbox.check_rounding(np.concatenate(self._rows)))
+                self._begin_region()
+        return a
 
 
 def _run_score(
-    board: BoardDocument, class_name: str, report: EvaluationReport, digest: str
+    board: BoardDocument, class_name: str, report: EvaluationReport, digest: str, rounding: float
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
@@ -173,12 +287,6 @@ def _run_score(
             )
             for name, each in report.agents.items()
         ),
+        rounding=rounding,
         **metrics,
     )
-
-
-def _versions(report: EvaluationReport) -> dict[str, str]:
-    return {
-        **{name: version for name, version in report.versions.items() if name not in _UNUSED},
-        "onnxruntime": metadata.version("onnxruntime"),
-    }

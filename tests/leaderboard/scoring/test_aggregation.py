@@ -1,0 +1,370 @@
+"""From runs to a method's scores: what an instance, a class and the method weigh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
+from leaderboard.documents.submission import Submission
+from leaderboard.scoring.aggregation import _oracle_like, never_listed, result_of
+from leaderboard.scoring.metrics import failed_run, run_metrics
+from sme_registry import EvaluationProtocol
+from sme_registry.spec import Suite
+from sme_registry.statistics import iqm
+
+SETTING = {"state_dim": 2, "action_dim": 1}
+SUITE = Suite.from_dict(
+    {
+        "classes": [
+            {"name": "two", "setting": SETTING, "seeds": [0, 1]},
+            {"name": "three", "setting": {**SETTING, "complexity": 2}, "seeds": [0, 1, 2]},
+        ]
+    }
+)
+BOARD = BoardDocument(
+    title="Aggregation",
+    suite_name="five-v1",
+    suite=SUITE,
+    protocol_name="few-v1",
+    protocol=EvaluationProtocol(states_per_region=60),
+    key="0" * 64,
+    rules=2,
+    draws=200,
+)
+CLASS_OF = {digest: name for digest, (name, _) in BOARD.instances.items()}
+SPECS = list(CLASS_OF)
+TWO, THREE = SPECS[:2], SPECS[2:]
+ID = "sha256:" + "0" * 64
+LEVELS = (0.0, *BOARD.protocol.epsilons)
+
+Regrets = dict[str, list[float | None]]
+"""WD regret of each run on each instance, None for a failed run."""
+
+
+def run(spec: str, regret: float | Sequence[float] | None) -> RunScore:
+    if regret is None:
+        return failed_run(BOARD, CLASS_OF[spec], spec)
+    if isinstance(regret, float):
+        regret = [regret + 0.1 * level for level in LEVELS]
+    similarity = tuple(1.0 - 0.25 * N for N in regret)
+    return RunScore(
+        spec=spec,
+        class_name=CLASS_OF[spec],
+        artefact="sha256:" + "a" * 64,
+        evaluation_seed=0,
+        normalised_regret=tuple(regret),
+        similarity=similarity,
+        **run_metrics(regret, similarity, LEVELS),
+    )
+
+
+def scored(regrets: Regrets, unlisted: dict[str, int] | None = None) -> Result:
+    """The result of these runs, and of so many unlisted ones of each class."""
+    runs = [run(spec, regret) for spec, values in regrets.items() for regret in values]
+    return result_of(BOARD, ID, runs, {}, unlisted=never_listed(BOARD, started(runs, unlisted)))
+
+
+def started(runs: Sequence[RunScore], unlisted: dict[str, int] | None) -> Submission:
+    artefact = {"sha256": "sha256:" + "a" * 64, "size": 1}
+    return Submission.from_dict(
+        {
+            "suite": BOARD.suite_reference,
+            "method": {"name": "m", "version": "1", "family": "f", "knowledge": "generic"},
+            "submitter": {"name": "s", "key": "0" * 64},
+            "created": "2026-11-21T09:30:00Z",
+            "runs": [
+                {
+                    "spec": each.spec,
+                    "seed": number,
+                    "steps": 1,
+                    "artefact": each.artefact and {**artefact, "sha256": f"sha256:{number:064x}"},
+                }
+                for number, each in enumerate(runs)
+            ],
+            "runs_started": {
+                name: sum(each.class_name == name for each in runs) + (unlisted or {}).get(name, 0)
+                for name in ("two", "three")
+            },
+        }
+    )
+
+
+def theta(result: Result, metric: str = "wd_regret") -> float:
+    assert result.scores is not None
+    return float(getattr(result.scores, metric).value)
+
+
+EVEN: Regrets = {**dict.fromkeys(TWO, [0.2] * 5), **dict.fromkeys(THREE, [0.2] * 4)}
+
+# What a method scores
+
+
+def test_a_class_is_the_mean_over_its_instances_and_the_method_the_mean_over_classes() -> None:
+    values = [[0.1], [0.2, 0.3, 0.4, 0.9], [0.5] * 7, [0.6], [0.7, 0.0]]
+    result = scored(dict(zip(SPECS, values, strict=True)))
+
+    means = [float(iqm(each)) for each in values]
+    classes = [np.mean(means[:2]), np.mean(means[2:])]
+    assert [each.wd_regret for each in result.classes] == pytest.approx(classes)
+    assert theta(result) == pytest.approx(np.mean(classes))
+    for index, region in enumerate(result.scores.normalised_regret):
+        assert region.value == pytest.approx(
+            np.mean([each.normalised_regret[index] for each in result.classes])
+        )
+
+
+ATTACKS: dict[str, tuple[Regrets, dict[str, int]]] = {
+    "failed runs on one instance": ({**EVEN, TWO[1]: [None] * 5}, {}),
+    "one failed run on one instance": ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [None]}, {}),
+    "the constant policy on one instance": ({**EVEN, TWO[1]: [1.0] * 5}, {}),
+    "one poor run on one instance": ({**EVEN, TWO[0]: [0.2] * 9, TWO[1]: [1.0]}, {}),
+    "many runs on the easy instance": ({**EVEN, TWO[0]: [0.2] * 100, TWO[1]: [1.0] * 5}, {}),
+    "a class given up": ({**EVEN, **dict.fromkeys(THREE, [None] * 4)}, {}),
+    "one instance of three given up": ({**EVEN, THREE[0]: [None] * 4}, {}),
+}
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize("metric", ["wd_regret", "ood_regret"])
+def test_what_is_given_up_costs_its_whole_share(name: str, metric: str) -> None:
+    regrets, unlisted = ATTACKS[name]
+    share = {"class": 1 / 2, "three": 1 / 6}.get(name.split()[1 if "class" in name else 3], 1 / 4)
+
+    lost = theta(scored(regrets, unlisted), metric) - theta(scored(EVEN), metric)
+
+    mean = 0.2 if metric == "wd_regret" else 0.2 + 0.1 * np.mean(LEVELS[1:])
+    worst = 1.0 if None in [each for v in regrets.values() for each in v] else 1.0 + mean - 0.2
+    assert lost == pytest.approx(share * (worst - mean))
+
+
+@pytest.mark.parametrize("on_one", [0, 1])
+@pytest.mark.parametrize("unlisted", [0, 1, 7, 50])
+def test_too_few_listed_runs_on_an_instance_earn_no_good_rank(on_one: int, unlisted: int) -> None:
+    regrets = {**EVEN, TWO[1]: [0.2] * on_one or [None]}
+    result = scored(regrets, {"two": unlisted})
+
+    others = theta(scored(EVEN))
+    assert not result.enough_runs or theta(result) > others + 0.05
+
+
+def test_each_instance_needs_its_share_of_the_runs() -> None:
+    assert scored(EVEN).enough_runs
+    for spec in SPECS:
+        fewer = {**EVEN, spec: EVEN[spec][1:]}
+        assert not scored(fewer).enough_runs
+        more = {other: runs * (10 if other != spec else 1) for other, runs in fewer.items()}
+        assert not scored(more).enough_runs
+        assert scored({**fewer, spec: [*fewer[spec], None]}).enough_runs
+    one_each = BOARD.model_copy(update={"runs_to_rank": 2})
+    assert result_of(one_each, ID, [run(spec, 0.3) for spec in SPECS], {}).enough_runs
+    assert (BOARD.runs_needed, one_each.runs_needed) == (22, 5)
+
+
+def test_unlisted_runs_count_on_the_instances_with_the_fewest_runs() -> None:
+    runs = [run(spec, 0.2) for spec in (TWO[0], TWO[1], TWO[1], *THREE)]
+    unlisted = never_listed(BOARD, started(runs, {"two": 4, "three": 2}))
+
+    assert [each.spec for each in unlisted] == [TWO[0], TWO[0], TWO[1], TWO[0], *THREE[:2]]
+    assert all(each.artefact is None and each.wd_regret == 1.0 for each in unlisted)
+    result = result_of(BOARD, ID, runs, {}, unlisted=unlisted)
+    assert result.runs == tuple(runs)
+    assert [(each.runs, each.submitted) for each in result.classes] == [(7, 3), (5, 3)]
+    assert theta(result) == pytest.approx(
+        np.mean([np.mean([1.0, iqm([0.2, 0.2, 1.0])]), np.mean([0.6, 0.6, 0.2])])
+    )
+
+
+def test_earlier_rules_pool_the_runs_of_a_class_and_list_all() -> None:
+    earlier = BOARD.model_copy(update={"rules": 1})
+    runs = [run(spec, regret) for spec in SPECS for regret in (0.1, 0.2, 0.4, 0.9)]
+    unlisted = never_listed(earlier, started(runs, {"two": 1}))
+    result = result_of(earlier, ID, runs, {}, unlisted=unlisted)
+
+    assert result.runs == (*runs, *unlisted)
+    assert [each.spec for each in unlisted] == [None]
+    pooled = [iqm([0.1, 0.2, 0.4, 0.9] * 2 + [1.0]), iqm([0.1, 0.2, 0.4, 0.9] * 3)]
+    assert theta(result) == pytest.approx(np.mean(pooled))
+    other = result_of(earlier, "sha256:" + "1" * 64, runs, {}, unlisted=unlisted)
+    assert other.scores != result.scores  # the id seeds the intervals
+    assert not result_of(earlier, ID, runs[:-3], {}).enough_runs
+
+
+# Giving up
+
+REGRET = st.floats(0.0, 1.0)
+RUNS = st.fixed_dictionaries({spec: st.lists(REGRET, min_size=1, max_size=9) for spec in SPECS})
+
+
+def flat(regrets: dict[str, list[float]]) -> list[RunScore]:
+    return [run(spec, [each] * 6) for spec, values in regrets.items() for each in values]
+
+
+@settings(deadline=None, max_examples=60)
+@given(RUNS, st.sampled_from(SPECS), st.integers(1, 20), st.sampled_from(METRICS[:3]))
+def test_giving_up_an_instance_costs_what_was_learned_there(
+    regrets: dict[str, list[float]], spec: str, failures: int, metric: str
+) -> None:
+    board = BOARD.model_copy(update={"draws": 100})
+    rest = flat({other: values for other, values in regrets.items() if other != spec})
+    failed = [failed_run(board, CLASS_OF[spec], spec)] * failures
+    honest, gave_up = (
+        result_of(board, ID, [*rest, *own], {}) for own in (flat({spec: regrets[spec]}), failed)
+    )
+
+    learned = 1.0 - (float(iqm(regrets[spec])) if metric != "ood_decay" else 0.0)
+    share = 1 / 4 if spec in TWO else 1 / 6
+    lost = theta(gave_up, metric) - theta(honest, metric)
+    assert lost == pytest.approx(share * learned, abs=1e-9)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(1, 6), st.data())
+def test_leaving_runs_out_never_improves_a_method_with_as_many_runs_on_each_instance(
+    count: int, data: st.DataObject
+) -> None:
+    board = BOARD.model_copy(update={"draws": 100})
+    values = {spec: data.draw(st.lists(REGRET, min_size=count, max_size=count)) for spec in SPECS}
+    left = {spec: data.draw(st.integers(0, count - 1)) for spec in SPECS}
+    kept = flat({spec: sorted(each)[: count - left[spec]] for spec, each in values.items()})
+    missing = {
+        "two": sum(left[spec] for spec in TWO),
+        "three": sum(left[spec] for spec in THREE),
+    }
+
+    honest = result_of(board, ID, flat(values), {})
+    chosen = result_of(board, ID, kept, {}, unlisted=never_listed(board, started(kept, missing)))
+
+    for metric in METRICS:
+        assert theta(chosen, metric) >= theta(honest, metric) - 1e-9, metric
+
+
+def test_omitting_the_runs_with_the_largest_decay_improves_no_metric() -> None:
+    slopes = [0.1 * number for number in range(1, 9)]
+    runs = [
+        run(spec, [0.2 + slope * level for level in LEVELS]) for spec in SPECS for slope in slopes
+    ]
+    withheld = [
+        each if each.regret_slope < 0.45 else failed_run(BOARD, each.class_name, each.spec)
+        for each in runs
+    ]
+    honest, chosen = (result_of(BOARD, ID, each, {}) for each in (runs, withheld))
+
+    for metric in METRICS:
+        assert theta(honest, metric) < theta(chosen, metric), metric
+
+
+# Intervals
+
+
+def ends(result: Result, metric: str = "wd_regret") -> tuple[float, float] | None:
+    assert result.scores is not None
+    interval: tuple[float, float] | None = getattr(result.scores, metric).interval
+    return interval
+
+
+def drawn(seed: int, counts: Sequence[int]) -> list[RunScore]:
+    rng = np.random.default_rng(seed)
+    return [
+        run(spec, rng.random(6).tolist())
+        for spec, count in zip(SPECS, counts, strict=True)
+        for _ in range(count)
+    ]
+
+
+def test_neither_the_id_nor_the_order_of_runs_changes_an_interval() -> None:
+    runs = drawn(0, [5, 5, 4, 4, 4])
+    result = result_of(BOARD, ID, runs, {})
+
+    for number in range(5):
+        shuffled = np.random.default_rng(number).permutation(len(runs))
+        other = result_of(BOARD, f"sha256:{number:064x}", [runs[i] for i in shuffled], {})
+        for metric in METRICS:
+            assert ends(other, metric) == pytest.approx(ends(result, metric), abs=1e-12)
+
+
+def test_a_small_change_of_a_run_changes_an_interval_little() -> None:
+    runs = drawn(1, [5, 5, 4, 4, 4])
+    widths = []
+    for number in range(20):
+        rng = np.random.default_rng(number)
+        nudged = [
+            run(each.spec, [N + 1e-6 * rng.random() for N in each.normalised_regret])
+            for each in runs
+        ]
+        low, high = ends(result_of(BOARD, ID, nudged, {}), "ood_decay")
+        widths.append(high - low)
+
+    assert max(widths) - min(widths) < 1e-5
+
+
+def test_suite_and_protocol_seed_the_intervals() -> None:
+    runs = drawn(2, [5, 5, 4, 4, 4])
+    protocol = EvaluationProtocol(states_per_region=61)
+    other = BOARD.model_copy(update={"protocol": protocol})
+
+    assert ends(result_of(BOARD, ID, runs, {})) != ends(result_of(other, ID, runs, {}))
+
+
+def test_single_runs_of_several_instances_have_a_wide_interval_and_lone_ones_none() -> None:
+    single = result_of(BOARD, ID, drawn(3, [1] * 5), {})
+    low, high = ends(single)
+    assert low < theta(single) < high
+
+    lone = BOARD.model_copy(
+        update={
+            "suite": Suite.from_dict(
+                {"classes": [{"name": "two", "setting": SETTING, "seeds": [0]}]}
+            )
+        }
+    )
+    result = result_of(lone, ID, [run(TWO[0], 0.5)], {})
+    assert ends(result) is None
+    assert result.scores.wd_regret.ends == (theta(result),) * 2
+    assert Result.from_dict(result.to_dict()) == result
+
+
+def test_no_interval_of_a_regret_reaches_below_zero() -> None:
+    regrets = {spec: [0.0, 0.0, 0.9, 0.0] for spec in SPECS}
+    result = scored(regrets)
+    low, _ = ends(result)
+    assert low == 0.0
+    assert ends(result_of(BOARD, ID, drawn(4, [4] * 5), {}), "ood_decay")[0] < 0.0
+
+
+# Marks
+
+
+@pytest.mark.parametrize(
+    ("wd", "ood", "expected"),
+    [
+        (0.0, 0.01, True),
+        (0.5, 0.01, True),
+        (0.02, 0.03, True),
+        (0.02, 0.031, False),
+        (0.021, 0.022, False),
+        (0.0, 0.011, False),
+    ],
+)
+def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
+    wd: float, ood: float, expected: bool
+) -> None:
+    values = {
+        "wd_regret": wd,
+        "ood_regret": ood,
+        "ood_decay": round(ood - wd, 9),
+        "regret_slope": 0.0,
+        "similarity_loss": 0.0,
+    }
+    estimates = {name: Estimate(value=x, low=x, high=x) for name, x in values.items()}
+    assert tuple(values) == METRICS
+
+    assert (
+        _oracle_like(Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2))
+        is expected
+    )
