@@ -15,16 +15,18 @@ The log is authoritative. A board has one suite and one protocol.
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, SigningKey
+from leaderboard.documents.reading import is_regular, read_regular
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError
 from sme_registry.errors import SMEError
-from sme_registry.io import read_json
+from sme_registry.io import parse_json
 from sme_registry.spec import (
     Document,
     EvaluationProtocol,
@@ -42,6 +44,12 @@ RULES: Final = 2
 
 FILE = "board.json"
 KEY = "board.key"
+MAX_BYTES = 2**20
+"""Of board.json; that of the largest suite that fits a board has about a tenth."""
+
+MAX_INSTANCES = 1000
+"""Of a board's suite, each of which takes a run of every submission."""
+
 RUNS_TO_RANK = 10
 """Runs in each class that a rank needs, unless the board is for practice."""
 
@@ -186,22 +194,34 @@ class Folder:
         Raises:
           BoardError: the folder contains no valid board.
         """
-        if not self.board.is_file():
+        if not os.path.lexists(self.board):
             raise BoardError(
                 f"{self.path}: contains no board (no {FILE}). Give a board's folder, or create a "
                 "board with `sme-leaderboard init`."
             )
         try:
-            return BoardDocument.from_dict(read_json(self.board), str(self.board))
+            data = read_regular(self.board, MAX_BYTES)
+            document = BoardDocument.from_dict(parse_json(data, str(self.board)), str(self.board))
+        except OSError as error:
+            raise BoardError(f"{self.board}: cannot be read: {error.strerror}.") from None
         except SMEError as error:
             raise BoardError(str(error)) from None
+        count = sum(len(member.seeds) for member in document.suite.classes)
+        if count > MAX_INSTANCES:
+            raise BoardError(
+                f"{self.board}: suite: has {count:,} instances, and a board has at most "
+                f"{MAX_INSTANCES:,}. No submission could list a run on each."
+            )
+        return document
 
     def signing_key(self) -> SigningKey:
         """The board's private key.
 
         Raises:
-          BoardError: it is missing.
+          BoardError: it is missing, or is not a regular file.
         """
+        if os.path.lexists(self.key) and not is_regular(self.key):
+            raise BoardError(f"{self.key}: is not a regular file. Restore the board's key.")
         return SigningKey.read(self.key)
 
     def submission(self, id: str) -> Path:

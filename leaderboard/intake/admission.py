@@ -68,6 +68,8 @@ def admit(
                 store.put_object(digest, [artefact(digest)], by=key)
     with store.transaction():  # no other submission can use the quota in between
         _check_quotas(store, key, moment)
+        for digest, declared in _artefacts(submission).items():  # nor can `gc` take an artefact
+            _check_stored(store, digest, declared.size)
         return store.receive(signed)
 
 

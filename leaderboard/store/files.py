@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 from leaderboard.documents.board import Folder, hex_of
+from leaderboard.documents.reading import read_regular
 from leaderboard.errors import BoardError, TamperedError
 from sme_registry import io
 from sme_registry.errors import SMEError
@@ -26,6 +27,10 @@ except ImportError:  # Windows, where boards can be read but not written
     fcntl = None  # type: ignore[assignment]
 
 BUSY_SECONDS = 60.0
+MAX_DOCUMENT_BYTES = 16 * 2**20
+"""Of a file that a board has written: a result of 10,000 failed runs has 3.3 MiB."""
+
+MAX_LOG_ENTRY_BYTES = 4096
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
@@ -78,7 +83,12 @@ def write_document(path: Path, document: StrictModel, *, new: bool = False) -> N
 
 
 def read_document(
-    folder: Folder, path: Path, kind: type[_Model], digest: str | None = None
+    folder: Folder,
+    path: Path,
+    kind: type[_Model],
+    digest: str | None = None,
+    *,
+    limit: int = MAX_DOCUMENT_BYTES,
 ) -> _Model:
     """Read a document of a board.
 
@@ -87,14 +97,15 @@ def read_document(
       path: the file.
       kind: the document's type.
       digest: of the file, as logged; None if the log does not name the file.
+      limit: its size in bytes.
 
     Raises:
-      TamperedError: the file is missing, is not a document of this type, differs from the logged
-        one, or is not in the form in which the board writes it.
+      TamperedError: the file is missing, is not a regular file, is too large, is not a document of
+        this type, differs from the logged one, or is not in the form in which the board writes it.
     """
     where = path.relative_to(folder.path).as_posix()
     try:
-        data = path.read_bytes()
+        data = read_regular(path, limit)
     except OSError as error:
         raise TamperedError(where, f"cannot be read: {error.strerror}") from None
     if digest is not None and hashlib.sha256(data).hexdigest() != hex_of(digest):

@@ -21,7 +21,7 @@ from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import Signature, SigningKey, verifies
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.store.files import read_document, write_document
+from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
 from sme_registry.spec import Digest, Document, Integer, SchemaVersion
 
 Event = Literal["opened", "received", "result", "withdrawn"]
@@ -105,7 +105,7 @@ class Log:
           TamperedError: it is missing, altered, or not signed by the board.
         """
         path = self.folder.log_entry(sequence)
-        entry = read_document(self.folder, path, LogEntry)
+        entry = read_document(self.folder, path, LogEntry, limit=MAX_LOG_ENTRY_BYTES)
         where = path.relative_to(self.folder.path).as_posix()
         if entry.sequence != sequence:
             raise TamperedError(where, f"holds entry {entry.sequence}")

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from leaderboard.documents.board import Folder
+from leaderboard.documents.reading import is_regular, read_regular
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.store.files import durable_file, unwritable
 
@@ -27,13 +29,8 @@ class Objects:
           Its size in bytes if it is new, otherwise None.
         """
         path = self.folder.object(digest)
-        try:
-            os.utime(path)  # so that `gc` keeps it for the submission that follows
+        if self.touch(digest):
             return None
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            raise unwritable(path, error) from error
         sha256, size = hashlib.sha256(), 0
         with durable_file(path) as stream:
             for chunk in chunks:
@@ -56,8 +53,23 @@ class Objects:
         return size
 
     def has(self, digest: str) -> bool:
-        """Whether the artefact exists."""
-        return self.folder.object(digest).is_file()
+        """Whether the artefact exists, as a regular file."""
+        return is_regular(self.folder.object(digest))
+
+    def touch(self, digest: str) -> bool:
+        """Make an artefact young, so that `gc` keeps it; False if it does not exist.
+
+        Raises:
+          BoardError: the folder is not writable.
+        """
+        path = self.folder.object(digest)
+        try:
+            os.utime(path)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise unwritable(path, error) from error
+        return True
 
     def read(self, digest: str) -> bytes:
         """Read an artefact and verify its digest.
@@ -68,7 +80,7 @@ class Objects:
         """
         path = self.folder.object(digest)
         try:
-            data = path.read_bytes()
+            data = read_regular(path, MAX_ARTEFACT_BYTES)
         except OSError as error:
             raise BoardError(
                 f"{path}: cannot be read: {error.strerror}. Upload the artefact again."

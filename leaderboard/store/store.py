@@ -138,15 +138,19 @@ class Store(Database):
         """
         self.refuse_read_only()
         self.signing_key()  # without it no submission could follow
-        size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
-        if size is None:
-            return False
-        with self.transaction() as index:
-            if index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
-                index.connection.execute(
-                    "INSERT OR IGNORE INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, now())
-                )
-        return True
+        while True:
+            size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
+            with self.transaction() as index:
+                if not self.objects.touch(digest):  # `gc` has just removed an old artefact
+                    if size is None:
+                        continue  # the chunks are unread
+                    raise BoardError(f"artefact={digest}: was removed meanwhile. Upload it again.")
+                if size and index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
+                    index.connection.execute(
+                        "INSERT OR IGNORE INTO upload VALUES (?, ?, ?, ?)",
+                        (digest, size, by, now()),
+                    )
+            return size is not None
 
     def receive(self, signed: SignedSubmission) -> bool:
         """Add a submission, which `intake` has checked, to the queue.

@@ -13,7 +13,8 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from leaderboard.documents.board import hex_of
-from leaderboard.errors import TamperedError
+from leaderboard.documents.reading import open_regular
+from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store import Store
 from leaderboard.web.errors import HTTP_CODES, RequestError
 
@@ -53,7 +54,10 @@ class Downloads:
         if not self._store.is_public(digest):
             raise RequestError("not_found", f"object={digest}: {HTTP_CODES['not_found']}.")
         path = self._store.folder.object(digest)
-        file = path.open("rb")
+        try:
+            file = open_regular(path)
+        except OSError as error:
+            raise BoardError(f"{path}: cannot be read: {error.strerror}.") from None
         try:
             status = os.fstat(file.fileno())
             version = digest, status.st_ino, status.st_size, status.st_mtime_ns

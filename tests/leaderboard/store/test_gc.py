@@ -6,7 +6,12 @@ import time
 
 import pytest
 
-from leaderboard.store import collect_garbage
+from leaderboard import intake
+from leaderboard.errors import Rejection
+from leaderboard.intake import admission
+from leaderboard.store import Store, collect_garbage
+from leaderboard.store.objects import Objects
+from tests.leaderboard.conftest import tiny_submission
 
 HOUR, DAY = 3600.0, 86400.0
 
@@ -81,3 +86,49 @@ def test_gc_keeps_an_upload_in_progress(store, key):
 
     assert store.put_object(digest, slow(), by=key.public)
     assert store.objects.read(digest) == data
+
+
+def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monkeypatch):
+    signed, artefacts = tiny_submission(store, key)
+    for digest, data in artefacts.items():
+        store.put_object(digest, [data], by=key.public)
+        age(store.folder.object(digest), DAY + 60)
+    real = admission._check_artefacts
+
+    def checked_then_collected(*arguments):
+        real(*arguments)
+        with Store.open(store.folder.path) as other:
+            assert collect_garbage(other).objects == len(artefacts)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(admission, "_check_artefacts", checked_then_collected)
+        with pytest.raises(Rejection) as refused:
+            intake.admit(store, signed)
+    assert refused.value.code == "artefact_missing"
+    assert store.entries() == []
+    for digest, data in artefacts.items():
+        assert store.put_object(digest, [data], by=key.public)
+    assert intake.admit(store, signed)
+    assert collect_garbage(store, objects_older_than=0).objects == 0
+
+
+def test_gc_takes_no_artefact_that_was_just_uploaded_again(store, key, monkeypatch):
+    """Another process collects just after the upload has found an old artefact in place."""
+    data = b"old, and uploaded again"
+    digest = put(store, key, data)
+    age(store.folder.object(digest), DAY + 60)
+    real, collected = Objects.put, []
+
+    def put_then_collected(*arguments):
+        size = real(*arguments)
+        if not collected:
+            age(store.folder.object(digest), DAY + 60)
+            with Store.open(store.folder.path) as other:
+                collected.append(collect_garbage(other).objects)
+        return size
+
+    monkeypatch.setattr(Objects, "put", put_then_collected)
+    assert put(store, key, data) == digest
+    assert collected == [1]
+    assert store.objects.read(digest) == data
+    assert collect_garbage(store).objects == 0
