@@ -43,9 +43,6 @@ def test_the_page_on_own_agents_works_from_training_to_the_board(
 ) -> None:
     for package in ("torch", "matplotlib", "onnx", "onnxruntime", "nacl"):
         pytest.importorskip(package)
-    from leaderboard.cli import app as leaderboard
-    from sme_registry.cli import app as sme
-
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "own_agents.md").read_text()
     assert "STEPS = 5_000" in page
@@ -55,12 +52,38 @@ def test_the_page_on_own_agents_works_from_training_to_the_board(
     commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", page, re.M)
     assert len(commands) == 11
     for program, command in commands:
-        arguments = shlex.split(command)
-        key = ["--key", "my.key"] if arguments[0] in ("keygen", "new", "submit") else []
-        app = sme if program == "sme" else leaderboard
-        result = CliRunner().invoke(app, [*arguments, *key])
-        assert result.exit_code == 0, result.output
-        assert arguments[0] != "rank" or "My DDPG" in result.output
+        output = run(program, command)
+        assert not command.startswith("rank") or "My DDPG" in output
+
+
+def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("torch", "onnx", "onnxruntime"):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "leaderboard.md").read_text()
+    (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)
+    commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", block, re.M)
+    assert len(commands) == 8
+    run("sme-leaderboard", "keygen")
+    for program, command in commands:
+        short = "-n 64 --set n_steps=64 --protocol quick-v1"
+        output = run(program, command.replace("-n 20000", short))
+    assert re.search(r"^ *1  PPO", output, re.M)
+
+
+def run(program: str, command: str) -> str:
+    """The output of a command of the documentation, which must succeed; with a key of its own."""
+    from leaderboard.cli import app as leaderboard
+    from sme_registry.cli import app as sme
+
+    arguments = shlex.split(command)
+    key = ["--key", "my.key"] if arguments[0] in ("keygen", "new", "submit") else []
+    key = key if program == "sme-leaderboard" else []
+    result = CliRunner().invoke(sme if program == "sme" else leaderboard, [*arguments, *key])
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
