@@ -63,8 +63,10 @@ def rest(connection: socket.socket) -> bytes:
 def drip(connection: socket.socket, byte: bytes = b"a") -> None:
     """Send one byte after another until the server closes the connection."""
     connection.settimeout(0.02)
+    deadline = time.monotonic() + PATIENCE
     with contextlib.suppress(ConnectionResetError, BrokenPipeError), connection:
         while True:
+            assert time.monotonic() < deadline
             with contextlib.suppress(TimeoutError):
                 if not connection.recv(2**16):
                     return
