@@ -187,22 +187,45 @@ def serve(
     url: Annotated[
         str, typer.Option(help="The board's public address, which its pages show to submitters.")
     ] = "",
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Address or network of a reverse proxy, whose X-Forwarded-For names the client. "
+            "Repeat it for several.",
+        ),
+    ] = None,
+    unsafe_no_sandbox: Annotated[
+        bool,
+        typer.Option(
+            "--unsafe-no-sandbox",
+            help="Score without bubblewrap: policies could read your files and use your network.",
+        ),
+    ] = False,
 ) -> None:
     """Serve the board: its pages, and an API that accepts submissions, and score them.
 
-    By default only this machine can reach it. Put an HTTPS proxy in front of it for others.
+    By default only this machine can reach it. Put an HTTPS proxy in front of it for others; see
+    docs/deployment.md. Scoring needs bubblewrap (apt install bubblewrap).
 
     Examples:
 
       sme-leaderboard serve board --port 8000 --workers 2
 
-      sme-leaderboard serve board --url https://board.example
+      sme-leaderboard serve board --url https://board.example --trusted-proxy 127.0.0.1
     """
     from leaderboard.documents.board import Folder
     from leaderboard.web.serve import serve as serve_board
 
     Folder(board).read()  # a wrong folder fails before anything listens
-    serve_board(board, host=host, port=port, workers=workers, url=url)
+    serve_board(
+        board,
+        host=host,
+        port=port,
+        workers=workers,
+        url=url,
+        trusted_proxies=trusted_proxy or (),
+        unsafe_no_sandbox=unsafe_no_sandbox,
+    )
 
 
 def reindex(board: BoardFolder = Path("board")) -> None:

@@ -23,6 +23,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
 
+from leaderboard.artefact.isolation import Isolation
 from leaderboard.documents.result import Result
 from leaderboard.errors import BoardError
 from leaderboard.scoring.score import Progress, score_submission
@@ -58,6 +59,7 @@ def run_scorer(
     stop: Callable[[], bool] | None = None,
     lease_seconds: float = LEASE_SECONDS,
     retry: bool = True,
+    isolation: Isolation | None = None,
 ) -> int:
     """Score in this process, one submission after another.
 
@@ -72,6 +74,7 @@ def run_scorer(
       stop: called between two submissions; True ends the scorer.
       lease_seconds: how long a claim outlives its scorer.
       retry: whether submissions that earlier faults have postponed are tried at once.
+      isolation: of the sandboxes; None for the one that this machine has.
 
     Returns:
       The number of results written.
@@ -92,7 +95,7 @@ def run_scorer(
             claim = store.queue.claim(worker, seconds=lease_seconds)
             if claim is not None:
                 with _heartbeats(store, claim):
-                    result = _score(store, claim, progress)
+                    result = _score(store, claim, progress, isolation)
                     written += result is not None and _finish(store, claim, result, patience, stop)
             elif until_empty:
                 break
@@ -101,11 +104,15 @@ def run_scorer(
     return written
 
 
-def _score(store: Store, claim: Claim, progress: Progress | None) -> Result | None:
+def _score(
+    store: Store, claim: Claim, progress: Progress | None, isolation: Isolation | None
+) -> Result | None:
     """Score a claimed submission; None after a fault, which postpones it."""
     try:
         submission = store.submission(claim.id).submission
-        return score_submission(store.document, submission, store.objects.read, progress)
+        return score_submission(
+            store.document, submission, store.objects.read, progress, isolation=isolation
+        )
     except (MissingDependencyError, KeyboardInterrupt):
         store.queue.release(claim)
         raise
@@ -162,7 +169,9 @@ def _heartbeats(store: Store, claim: Claim) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def background_scorers(path: str | Path, workers: int) -> Iterator[None]:
+def background_scorers(
+    path: str | Path, workers: int, isolation: Isolation | None = None
+) -> Iterator[None]:
     """Run scorer processes while the block runs, watched by a thread; 0 workers run none.
 
     Nothing but the end of the block ends the scoring: after an error it starts again, first after
@@ -178,7 +187,7 @@ def background_scorers(path: str | Path, workers: int) -> Iterator[None]:
         while not stop.is_set():
             begun = time.monotonic()
             try:
-                run_scorers(path, workers, until_empty=False, stop=stop.is_set)
+                run_scorers(path, workers, until_empty=False, stop=stop.is_set, isolation=isolation)
             except Exception as error:
                 if time.monotonic() - begun > _LONGEST_PAUSE:
                     pause = _FIRST_PAUSE
@@ -204,6 +213,7 @@ def run_scorers(
     stop: Callable[[], bool] | None = None,
     started: Callable[[int], None] | None = None,
     lease_seconds: float = LEASE_SECONDS,
+    isolation: Isolation | None = None,
 ) -> int:
     """Score in several processes at once; one that dies is replaced and its submission rescored.
 
@@ -220,6 +230,7 @@ def run_scorers(
       stop: called a few times a second; True ends the scoring.
       started: called with the process id of each new process.
       lease_seconds: how long a claim outlives its scorer if its death goes unnoticed.
+      isolation: of the sandboxes; None for the one that this machine has.
 
     Returns:
       The number of submissions done since the start.
@@ -233,7 +244,7 @@ def run_scorers(
     """
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with Store.open(path) as store:
-        scorers = _Scorers(path, store, workers, until_empty, lease_seconds)
+        scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation))
         before, done = store.queue.done(), 0
         store.queue.retry()
         try:
@@ -264,10 +275,14 @@ class _Scorers:
     """The scorer processes of one board, by name."""
 
     def __init__(
-        self, path: str | Path, store: Store, workers: int, until_empty: bool, lease_seconds: float
+        self,
+        path: str | Path,
+        store: Store,
+        workers: int,
+        options: tuple[bool, float, Isolation | None],
     ) -> None:
         self._path, self._store, self._workers = path, store, workers
-        self._until_empty, self._lease_seconds = until_empty, lease_seconds
+        self._options, self._until_empty = options, options[0]
         self._running: dict[str, _Scorer] = {}
         self._futile_deaths, self._done = 0, store.queue.done()
         self._paused_until, self._stopping = 0.0, False
@@ -303,7 +318,7 @@ class _Scorers:
         errors, child_end = context.Pipe(duplex=False)
         process = context.Process(
             target=_scorer_process,
-            args=(str(self._path), name, self._until_empty, self._lease_seconds, child_end),
+            args=(str(self._path), name, child_end, *self._options),
             name=name,
         )
         process.start()
@@ -378,7 +393,12 @@ class _Scorers:
 
 
 def _scorer_process(
-    path: str, worker: str, until_empty: bool, lease_seconds: float, errors: Connection
+    path: str,
+    worker: str,
+    errors: Connection,
+    until_empty: bool,
+    lease_seconds: float,
+    isolation: Isolation | None,
 ) -> None:
     # A terminal sends Ctrl-C to parent and children, and the parent passes it on: the second one
     # must not disturb the clean-up.
@@ -397,6 +417,7 @@ def _scorer_process(
             stop=lambda: parent is not None and not parent.is_alive(),
             lease_seconds=lease_seconds,
             retry=False,
+            isolation=isolation,
         )
     except KeyboardInterrupt:
         pass

@@ -8,7 +8,7 @@
     POST /api/withdrawals                200
     GET  /api/board?metric=wd_regret     the ranking
     GET  /api/log?start=0                a hundred entries of the signed log
-    GET  /healthz                        200 while the server runs
+    GET  /healthz                        200 while the server runs; scoring: ok, waiting or fault
 
 An error is {"code", "message"}: the code of a `Rejection`, or one of `errors.HTTP_CODES`. The
 server keeps no sessions and sets no cookies; every request that changes the board is signed.
@@ -31,10 +31,11 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from leaderboard import exports, intake
+from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Metric
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
-from leaderboard.errors import Rejection
+from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
 from leaderboard.scoring.worker import background_scorers
@@ -63,6 +64,7 @@ def create_app(
     pages_kept: int = PAGES_KEPT,
     url: str = "",
     requests_of_address: int = limits.REQUESTS_OF_ADDRESS,
+    isolation: Isolation = "bwrap",
 ) -> FastAPI:
     """The ASGI application of a board.
 
@@ -75,16 +77,20 @@ def create_app(
         taken from a request, whose Host header anyone can choose.
       requests_of_address: the most requests in progress from one IPv4 address or IPv6 /64 network;
         those of this machine are not counted.
+      isolation: of the scorers' sandboxes. "process", resource limits alone, is for a board to
+        which nobody else can submit.
 
     Raises:
-      BoardError: the folder holds no board.
+      BoardError: the folder holds no board, or bubblewrap is to isolate scorers and does not work.
     """
+    if score_workers:
+        _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
     routes = _Routes(store, upload_seconds, _PageCache(store, pages_kept, url))
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with background_scorers(os.fspath(path), score_workers), store:
+        with background_scorers(os.fspath(path), score_workers, isolation), store:
             yield
 
     app = FastAPI(
@@ -115,6 +121,19 @@ def create_app(
     return app
 
 
+def _refuse_missing(isolation: Isolation) -> None:
+    advice = "Only if nobody else can submit to this board, serve it with --unsafe-no-sandbox."
+    try:
+        missing = isolation == "bwrap" and available_isolation() != "bwrap"
+    except ScoringFault as error:
+        raise BoardError(f"{error} {advice}") from None
+    if missing:
+        raise BoardError(
+            "bubblewrap is not installed, without which submitted policies could read your files "
+            f"and use your network. Install it: apt install bubblewrap. {advice}"
+        )
+
+
 class _Routes:
     """The handlers of the routes. Calls that may block run in threads and never wait for a client.
 
@@ -130,11 +149,25 @@ class _Routes:
         self._admissions = limits.Turns(_ADMISSIONS)
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
+        self._health = CapacityLimiter(1)
         self._pages = pages
         self._downloads = Downloads(store)
 
     async def health(self) -> Response:
-        return JSONResponse({"status": "ok"})
+        return JSONResponse(
+            {
+                "status": "ok",
+                "scoring": await to_thread.run_sync(self._scoring, limiter=self._health),
+            }
+        )
+
+    def _scoring(self) -> str:
+        """Whether scoring works: "ok", "waiting" for its turn, or "fault"."""
+        try:
+            waiting = [entry for entry in self._store.entries() if entry.status == "waiting"]
+        except SMEError:
+            return "fault"
+        return "fault" if any(entry.faults for entry in waiting) else "waiting" if waiting else "ok"
 
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)

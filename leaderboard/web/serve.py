@@ -37,6 +37,7 @@ def serve(
     announce: Callable[[str], None] = print,
     url: str = "",
     trusted_proxies: Iterable[str] = (),
+    unsafe_no_sandbox: bool = False,
 ) -> None:
     """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
 
@@ -54,9 +55,12 @@ def serve(
       trusted_proxies: addresses or networks of reverse proxies. Their `X-Forwarded-For` names the
         client, which counts for the limit on requests by address, and they may open any number of
         connections. From anyone else the header is ignored.
+      unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
+        this account and use the network, so nobody else may be able to submit.
 
     Raises:
-      BoardError: the folder holds no board, or the address cannot be used.
+      BoardError: the folder holds no board, the address cannot be used, or bubblewrap, which the
+        scorers need, does not work.
       OptionError: the public address, or that of a proxy, is invalid.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
@@ -73,7 +77,12 @@ def serve(
 
     proxies = [_network(each) for each in trusted_proxies]
     limits = ConnectionLimits(connections=_connections())
-    app = create_app(path, score_workers=workers, url=url.rstrip("/"))
+    app = create_app(
+        path,
+        score_workers=workers,
+        url=url.rstrip("/"),
+        isolation="process" if unsafe_no_sandbox else "bwrap",
+    )
     config = server_config(app, Connections(limits, proxies))
     with listen(host, port) as listener:
         announce(url_of(listener))

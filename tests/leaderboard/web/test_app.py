@@ -17,6 +17,7 @@ import httpx
 import pytest
 
 from leaderboard import intake
+from leaderboard.artefact import isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
@@ -323,8 +324,39 @@ def test_a_browser_gets_a_page_for_an_unknown_address(
 # Reading by the API.
 
 
-def test_the_health_check_answers(published: tuple[str, dict[str, str]]) -> None:
-    assert HTTP.get(f"{published[0]}/healthz").json() == {"status": "ok"}
+def test_the_health_check_says_whether_scoring_works(url: str, store: Store) -> None:
+    def scoring() -> str:
+        answer = HTTP.get(f"{url}/healthz")
+        assert answer.status_code == 200
+        assert answer.json()["status"] == "ok"
+        return str(answer.json()["scoring"])
+
+    assert scoring() == "ok"
+    put_submission(store, SigningKey.generate())
+    assert scoring() == "waiting"
+    claim = store.queue.claim("worker")
+    assert claim is not None
+    store.queue.fault(claim, "the sandbox does not start")
+    assert scoring() == "fault"
+    store.folder.log_entry(1).write_bytes(b"rotten")
+    assert scoring() == "fault"
+
+
+@pytest.mark.parametrize("program", [None, "#!/bin/sh\nexit 1\n"], ids=["missing", "broken"])
+def test_a_board_is_not_served_without_bubblewrap_unless_told(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str | None
+) -> None:
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    if program is not None:
+        (folder / "bwrap").write_text(program)
+        (folder / "bwrap").chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    isolation._bwrap.cache_clear()
+    with pytest.raises(BoardError, match=r"bubblewrap is .*--unsafe-no-sandbox"):
+        serve(store.folder.path, port=0)
+    app.create_app(store.folder.path, score_workers=0)
+    app.create_app(store.folder.path, score_workers=1, isolation="process")
 
 
 @pytest.mark.parametrize("metric", ["wd_regret", "ood_regret", "ood_decay"])
