@@ -59,17 +59,22 @@ CODES = {
 }
 
 
+_MAX_MESSAGE = 2000
+
+
 class Rejection(SMEError):
     """A submission or an artefact is rejected.
 
     Args:
       code: one of `CODES`.
-      message: field, value, what is allowed, what to do.
+      message: field, value, what is allowed, what to do; cut to 2,000 characters.
     """
 
     def __init__(self, code: str, message: str) -> None:
         if code not in CODES:
             raise ValueError(f"unknown code: {code!r}")
+        if len(message) > _MAX_MESSAGE:  # who sends a document may not choose the answer's length
+            message = message[: _MAX_MESSAGE - 1] + "…"
         super().__init__(f"{code}: {message}")
         self.code = code
         self.message = message

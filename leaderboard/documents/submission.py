@@ -9,9 +9,13 @@ A bundle is the submitted folder: `submission.json` (a `SignedSubmission`) and o
 from __future__ import annotations
 
 import datetime
+import hashlib
+import re
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+import rfc8785
+from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
 from leaderboard.errors import Rejection
@@ -30,6 +34,8 @@ FILE = "submission.json"
 ARTEFACTS = "artefacts"
 MAX_BYTES = 64 * 2**10
 MAX_ARTEFACT_BYTES = 8 * 2**20
+MAX_ENTRIES = 1000
+"""Most runs listed, and most classes counted."""
 MAX_RUNS = 1000
 """Largest total of `runs_started`."""
 
@@ -55,6 +61,13 @@ UtcTime = Annotated[
         description="a time in UTC, as in 2026-11-21T09:30:00Z",
     ),
 ]
+
+
+def _at_most_entries(value: Any) -> Any:
+    """Refuse a long list before each of its entries is validated, which takes longer."""
+    if isinstance(value, list | tuple | dict) and len(value) > MAX_ENTRIES:
+        raise ValueError(f"must have at most {MAX_ENTRIES:,} entries. List fewer.")
+    return value
 
 
 class SuiteReference(StrictModel):
@@ -143,8 +156,12 @@ class Submission(Document):
     code: _Link | None = None
     submitter: Submitter
     created: UtcTime
-    runs: Annotated[tuple[Run, ...], Field(min_length=1, max_length=1000, strict=False)]
-    runs_started: dict[Name, _Count]
+    runs: Annotated[
+        tuple[Run, ...],
+        Field(min_length=1, max_length=MAX_ENTRIES, strict=False),
+        BeforeValidator(_at_most_entries),
+    ]
+    runs_started: Annotated[dict[Name, _Count], BeforeValidator(_at_most_entries)]
     training: Training = Training()
     statement: _Text = ""
 
@@ -193,20 +210,7 @@ class SignedSubmission(_Signed):
         Raises:
           Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
         """
-        plain = _parse(text, FILE, "List fewer runs, or shorten the texts.")
-        if isinstance(plain, dict) and "signature" not in plain:
-            raise Rejection(
-                "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
-            )
-        signed = _validate(cls, plain, FILE)
-        if not signed.is_valid:
-            raise Rejection(
-                "bad_signature",
-                f"signature={signed.signature[:16]}…: invalid for this submission, its board and "
-                f"the key {signed.submission.submitter.key[:16]}…. Sign it again after the last "
-                "change.",
-            )
-        return signed
+        return Envelope.read(text).open()
 
     @property
     def is_valid(self) -> bool:
@@ -243,6 +247,102 @@ class SignedSubmission(_Signed):
     def to_bytes(self) -> bytes:
         """The bytes of the file."""
         return to_json(self.to_dict()).encode()
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """A submission whose signature is verified, and whose content is not validated yet.
+
+    Anyone can send a document, so what costs time, and answers at length, follows the signature.
+
+    Attributes:
+      id: of the submission: the digest of the content's canonical JSON.
+      key: the submitter's public key, which made the signature.
+      board: the public key of the board that the signature is for; None if it is for none.
+      plain: the whole document.
+    """
+
+    id: str
+    key: str
+    board: str | None
+    plain: dict[str, Any]
+
+    @classmethod
+    def read(cls, text: bytes) -> Envelope:
+        """Parse the bytes of a file and verify the signature.
+
+        Raises:
+          Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
+        """
+        plain = _parse(text, FILE, "List fewer runs, or shorten the texts.")
+        if isinstance(plain, dict) and "signature" not in plain:
+            raise Rejection(
+                "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
+            )
+        content, key, signature, board = _parts(plain)
+        id = _raw_digest(content)
+        if not verifies(key, signature, "submission", id, board):
+            raise Rejection(
+                "bad_signature",
+                f"signature={signature[:16]}…: invalid for this submission, its board and the key "
+                f"{key[:16]}…. Sign it again after the last change.",
+            )
+        return cls(id, key, board, plain)
+
+    def open(self) -> SignedSubmission:
+        """The validated document.
+
+        Raises:
+          Rejection: `schema`.
+        """
+        signed = _validate(SignedSubmission, self.plain, FILE)
+        if signed.id != self.id:
+            raise Rejection(
+                "schema",
+                f"{FILE}: the signature must cover every field of the submission, those at their "
+                "defaults included. Create it with `sme-leaderboard new`.",
+            )
+        return signed
+
+
+def _parts(plain: Any) -> tuple[dict[str, Any], str, str, str | None]:
+    """Content, public key, signature and board of a document that nothing has validated."""
+    match plain:
+        case {
+            "submission": {"submitter": {"key": str(key)}} as content,
+            "signature": str(signature),
+            **others,
+        }:
+            board: Any = others.pop("board", None)
+            keys = [key] if board is None else [key, board]
+            if not others and _is_hex(signature, 128) and all(_is_hex(each, 64) for each in keys):
+                return content, key, signature, board
+    raise Rejection(
+        "schema",
+        f"{FILE}: must have the fields submission, with the key of its submitter, signature, and "
+        "board unless it is signed for none: keys of 64 and a signature of 128 hex digits. Create "
+        "it with `sme-leaderboard new`.",
+    )
+
+
+def _is_hex(value: Any, digits: int) -> bool:
+    return isinstance(value, str) and re.fullmatch(rf"[0-9a-f]{{{digits}}}", value) is not None
+
+
+def _raw_digest(content: dict[str, Any]) -> str:
+    """The digest of a document's content as it arrived."""
+    try:
+        return "sha256:" + hashlib.sha256(rfc8785.dumps(content)).hexdigest()
+    except RecursionError:
+        raise Rejection(
+            "not_json", f"{FILE}: nested too deeply. Valid documents have at most ten levels."
+        ) from None
+    except ValueError:  # rfc8785's errors, and those of lone surrogates
+        raise Rejection(
+            "schema",
+            f"{FILE}: contains a number or a character that JSON cannot exchange (RFC 8785): "
+            "integers must be in [-(2^53 - 1), 2^53 - 1], and other numbers finite. Correct it.",
+        ) from None
 
 
 class Withdrawal(Document):

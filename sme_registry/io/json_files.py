@@ -27,7 +27,7 @@ def parse_json(text: str | bytes, source: str = "document") -> Any:
         for key, value in pairs:
             if key in mapping:
                 raise MalformedDocumentError(
-                    f"{source}: the key {key!r} occurs twice. Remove one of them."
+                    f"{source}: the key {key!r:.80} occurs twice. Remove one of them."
                 )
             mapping[key] = value
         return mapping

@@ -13,6 +13,9 @@ from pydantic_core import ErrorDetails
 from sme_registry.errors import SpecError, did_you_mean
 
 _MAX_REPR = 60
+_MAX_PATH = 120
+_MAX_FAULTS = 5
+_MAX_TEXT = 2000
 
 
 def short_repr(value: Any) -> str:
@@ -21,11 +24,18 @@ def short_repr(value: Any) -> str:
         text = repr(value)
     except RecursionError:
         text = f"a {type(value).__name__} nested too deeply"
-    return text if len(text) <= _MAX_REPR else text[: _MAX_REPR - 1] + "…"
+    return _shortened(text, _MAX_REPR)
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else text[: length - 1] + "…"
 
 
 def spec_error(error: ValidationError, source: str, schema: dict[str, Any]) -> SpecError:
-    """Pydantic's errors as a SpecError, one line each.
+    """The first of Pydantic's errors as a SpecError, one line each.
+
+    At most 5 faults and 2,000 characters, however many there are: a document from elsewhere chooses
+    how many faults it has, and its names and values.
 
     Args:
       error: what the validation of a document raised.
@@ -36,19 +46,24 @@ def spec_error(error: ValidationError, source: str, schema: dict[str, Any]) -> S
     parents = {line["loc"][:depth] for line in lines for depth in range(len(line["loc"]))}
     # Pydantic counts only valid entries: a list of one invalid entry is also "too short".
     lines = [line for line in lines if line["type"] != "too_short" or line["loc"] not in parents]
-    texts = [_explain(schema, line) for line in lines]
+    texts = [_explain(schema, line) for line in lines[:_MAX_FAULTS]]
+    if len(lines) > len(texts):
+        texts.append(f"… and {len(lines) - len(texts):,} more faults.")
     text = texts[0] if len(texts) == 1 else "".join(f"\n  {text}" for text in texts)
-    return SpecError(f"{source}: {text}")
+    return SpecError(_shortened(f"{source}: {text}", _MAX_TEXT))
 
 
 def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
     """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
     location, kind = line["loc"], line["type"]
-    path = ".".join(str(part) for part in location)
+    path = _shortened(".".join(str(part) for part in location), _MAX_PATH)
     value = short_repr(line["input"])
     if kind in ("extra_forbidden", "invalid_key"):
         known = _resolved(root, _schema_at(root, location[:-1])).get("properties", {})
-        hint = did_you_mean(str(location[-1]), known) or f" Known fields: {', '.join(known)}."
+        hint = (
+            did_you_mean(str(location[-1])[:_MAX_PATH], known)
+            or f" Known fields: {', '.join(known)}."
+        )
         if kind == "invalid_key":
             return f"{path}: field names must be strings.{hint}"
         return f"{path}={value}: unknown field.{hint} Rename or remove it."

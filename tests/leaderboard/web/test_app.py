@@ -528,7 +528,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
 
         withdrawn = uploaded(url, store, key, 2)
         assert post(url, withdrawn.to_bytes()).status_code == 202
-        store.withdraw(signed_withdrawal(withdrawn.id, key))
+        store.withdraw(signed_withdrawal(store, withdrawn.id, key))
         assert downloads(sha256(linear_onnx(2))) == unknown
 
         scored = boards.submit(store, key, "PPO", [0.2] * 6)

@@ -1,0 +1,150 @@
+"""Reading a signed submission: nothing is validated, or answered at length, without a signature."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import rfc8785
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import MAX_BYTES, MAX_ENTRIES, Envelope, SignedSubmission
+from leaderboard.errors import Rejection
+
+KEY, BOARD = SigningKey.generate(), "a" * 64
+DIGEST = "sha256:" + "0" * 64
+PLAIN: dict[str, Any] = {
+    "schema_version": 1,
+    "track": "open",
+    "suite": {"name": "x-v1", "digest": DIGEST},
+    "method": {"name": "x", "version": "1", "family": "x", "knowledge": "generic"},
+    "code": None,
+    "submitter": {"name": "x", "key": KEY.public},
+    "created": "2026-01-01T00:00:00Z",
+    "runs": [{"spec": DIGEST, "seed": 0, "steps": 1, "artefact": None}],
+    "runs_started": {"x": 1},
+    "training": {"library": "", "hyperparameters": "", "hardware": ""},
+    "statement": "",
+}
+
+
+def text(plain: dict[str, Any], *, signed: bool = True, **envelope: Any) -> bytes:
+    """A document with this content, whatever it is; without a right signature if not `signed`."""
+    signature = "0" * 128
+    if signed:
+        digest = "sha256:" + hashlib.sha256(rfc8785.dumps(plain)).hexdigest()
+        signature = KEY.sign("submission", digest, BOARD)
+    document = {"submission": plain, "signature": signature, "board": BOARD, **envelope}
+    return json.dumps(document, separators=(",", ":")).encode()
+
+
+def changed(**fields: Any) -> dict[str, Any]:
+    return {**copy.deepcopy(PLAIN), **fields}
+
+
+def rejection(data: bytes) -> Rejection:
+    with pytest.raises(Rejection) as caught:
+        SignedSubmission.read(data)
+    return caught.value
+
+
+HOSTILE = {
+    "empty runs": changed(runs=[{}] * 20_000),
+    "invalid runs": changed(runs=[{}] * MAX_ENTRIES),
+    "numbers": changed(runs=[0.1] * 15_000),
+    "unknown fields": changed(**{f"{number:x}": 1 for number in range(6000)}),
+    "a long name": changed(**{"k" * 60_000: 1}),
+    "long names": changed(**{"é" * 80 + str(number): "é" * 80 for number in range(50)}),
+    "classes": changed(runs_started={f"{number:x}!": [] for number in range(6000)}),
+    "a long text": changed(statement="é" * 10_000),
+    "nesting": changed(statement=json.loads("[" * 90 + "]" * 90)),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_the_signature_is_verified_before_the_content_is_validated(name: str) -> None:
+    data = text(HOSTILE[name], signed=False)
+    assert len(data) <= MAX_BYTES
+    refused = rejection(data)
+    assert (refused.code, len(refused.message) < 200) == ("bad_signature", True)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_signed_document_gets_a_short_answer(name: str) -> None:
+    refused = rejection(text(HOSTILE[name]))
+    assert refused.code == "schema"
+    assert len(refused.message.encode()) < 4000
+    assert refused.message.count("\n") <= 6  # five faults, and how many more there are
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"[]", "schema"),
+        (b"{}", "bad_signature"),
+        (b'{"submission": 1, "signature": "00"}', "schema"),
+        (text(PLAIN, signature="0" * 127), "schema"),
+        (text(PLAIN, signature=1), "schema"),
+        (text(PLAIN, board="0" * 63), "schema"),
+        (text(PLAIN, board=[]), "schema"),
+        (text(PLAIN, other=1), "schema"),
+        (text(PLAIN, **{"k" * 60_000: 1}), "schema"),
+        (text(changed(submitter={"name": "x"}), signed=False), "schema"),
+        (text(changed(submitter={"name": "x", "key": "0" * 63}), signed=False), "schema"),
+        (text(changed(submitter=[]), signed=False), "schema"),
+        (text(changed(statement="\ud800"), signed=False), "schema"),
+        (text(changed(**{"\ud800": 1}), signed=False), "schema"),
+        (text(changed(seed=2**53), signed=False), "schema"),
+        (text(changed(seed=10**4000), signed=False), "schema"),
+        (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":1e999'), "schema"),
+        (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":NaN'), "not_json"),
+        (text(PLAIN, signed=False).replace(b'"seed":0', b'"seed":' + b"9" * 5000), "not_json"),
+        (text(PLAIN).replace(b'"seed":0', b'"seed":0,"seed":0'), "not_json"),
+        (b'{"' + b"k" * 30_000 + b'":1,"' + b"k" * 30_000 + b'":1}', "not_json"),
+        (b"[" * 60_000, "not_json"),
+    ],
+)
+def test_what_is_no_signed_document_gets_a_short_answer(data: bytes, code: str) -> None:
+    refused = rejection(data)
+    assert refused.code == code
+    assert len(refused.message.encode()) < 500
+
+
+def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused() -> None:
+    depth = 1
+    while True:  # the parser's limit differs between versions of Python
+        data = text(PLAIN, signed=False).replace(
+            b'"seed":0', b'"seed":' + b"[" * depth + b"]" * depth
+        )
+        refused = rejection(data)
+        if refused.code == "not_json" or len(data) > MAX_BYTES // 2:
+            break
+        assert refused.code == "bad_signature"
+        depth *= 2
+
+
+def test_the_id_is_known_before_the_content_is_validated() -> None:
+    envelope = Envelope.read(text(PLAIN))
+    assert (envelope.key, envelope.board) == (KEY.public, BOARD)
+    assert envelope.open().id == envelope.id
+    assert envelope.open().to_bytes() == SignedSubmission.read(text(PLAIN)).to_bytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda plain: plain.pop("statement"),
+        lambda plain: plain["training"].pop("library"),
+        lambda plain: plain.pop("schema_version"),
+        lambda plain: plain["runs"][0].pop("artefact"),
+    ],
+)
+def test_a_signature_covers_every_field(change: Callable[[dict[str, Any]], Any]) -> None:
+    """The board keeps the whole document, which its signature must still fit."""
+    plain = changed()
+    change(plain)
+    assert rejection(text(plain)).code == "schema"
