@@ -40,6 +40,17 @@ MAX_FIELDS = 65_536
 MAX_NAME = 256
 MAX_RANK = 8
 
+# The first input of each operator that the format allows to be left out, with an empty name.
+_OPTIONAL_INPUTS = {
+    "Clip": 1,
+    "Gemm": 2,
+    "LayerNormalization": 2,
+    "Slice": 3,
+    "Split": 1,
+    "Squeeze": 1,
+    **{name: 1 for name in operators.FEED_FORWARD if name.startswith("Reduce")},
+}
+
 _ONNX_DOMAINS = (b"", b"ai.onnx")
 _STANDARD = "Export the network to standard operators only"
 _FLOAT = 1
@@ -97,6 +108,7 @@ class _Inspection:
         self._budget = Budget(MAX_FIELDS)
         self._attributes = 0
         self._tensors = 0
+        self._values: set[bytes] = set()
 
     def model(self, data: memoryview, observation_dim: int, action_dim: int) -> None:
         model = self._read(data, schema.MODEL, "model")
@@ -117,10 +129,10 @@ class _Inspection:
         for node in graph["node"]:
             self._node(node)
         for tensor in graph["initializer"]:
-            self._tensor(tensor)
+            self._define(self._tensor(tensor))
         for value in graph["value_info"]:
             self._value(value)
-        self._interface("input", graph["input"], observation_dim, exact=True)
+        self._define(self._interface("input", graph["input"], observation_dim, exact=True))
         self._interface("output", graph["output"], action_dim, exact=False)
 
     def _opset(self, imports: list[memoryview]) -> None:
@@ -161,12 +173,35 @@ class _Inspection:
                 "removes what it can and says how to rewrite the rest",
             )
         self._names("node", node.get("name", b""), *node["input"], *node["output"])
+        self._values_of(node, operator)
         self._attributes += len(node["attribute"])
         self._limit("attributes", self._attributes, MAX_ATTRIBUTES)
-        for attribute in node["attribute"]:
-            self._attribute(attribute, operator)
+        attributes = dict(self._attribute(each, operator) for each in node["attribute"])
+        if len(attributes) < len(node["attribute"]):
+            raise WireError(f"two attributes of one name in {operator}")
+        outputs = len(node["output"])
+        if operator == "Split" and attributes.get(b"num_outputs", outputs) != outputs:
+            raise WireError(f"Split with {outputs} outputs and another num_outputs")
 
-    def _attribute(self, message: memoryview, operator: str) -> None:
+    def _values_of(self, node: dict[str, Any], operator: str) -> None:
+        """Require a name for each value that is not optional, and one source of each value.
+
+        onnxruntime crashes at some of the others.
+        """
+        required = node["input"][: _OPTIONAL_INPUTS.get(operator)]
+        if b"" in required or not node["output"] or node["output"][0] == b"":
+            raise WireError(f"{operator} without a name of an input or output")
+        for name in node["output"]:
+            if name != b"":
+                self._define(bytes(name))
+
+    def _define(self, name: bytes) -> None:
+        if name == b"" or name in self._values:
+            raise WireError(f"a value {_text(name)!r} that has no name or two sources")
+        self._values.add(name)
+
+    def _attribute(self, message: memoryview, operator: str) -> tuple[bytes, int | None]:
+        """Check an attribute; return its name and, if it has one, its integer."""
         attribute = self._read(message, schema.ATTRIBUTE, "attribute")
         name = _text(attribute.get("name", b""))
         self._names("attribute", attribute.get("name", b""), *attribute["strings"])
@@ -184,8 +219,10 @@ class _Inspection:
             self._tensor(attribute["t"])
         if operator == "Cast" and name == "to" and attribute.get("i") not in schema.TYPES:
             _refuse_type("to", attribute.get("i"), "Cast")
+        return bytes(attribute.get("name", b"")), attribute.get("i")
 
-    def _tensor(self, message: memoryview) -> None:
+    def _tensor(self, message: memoryview) -> bytes:
+        """Check a tensor; return its name."""
         tensor = self._read(message, schema.TENSOR, "tensor")
         name = _text(tensor.get("name", b""))
         self._names("tensor", tensor.get("name", b""))
@@ -223,6 +260,7 @@ class _Inspection:
                 "Export it again",
             )
         self._tensors += 1
+        return bytes(tensor.get("name", b""))
 
     def _entries(self, tensor: dict[str, Any], type: schema.Type, name: str) -> int:
         """Number of entries in a tensor's data."""
@@ -246,7 +284,7 @@ class _Inspection:
             raise WireError(f"the data of tensor {name!r} end within an entry")
         return size
 
-    def _value(self, message: memoryview) -> tuple[str, int, list[int | None]] | None:
+    def _value(self, message: memoryview) -> tuple[bytes, int, list[int | None]] | None:
         """Name, element type and shape (open lengths are None) of a value; None if untyped."""
         value = self._read(message, schema.VALUE_INFO, "value")
         self._names("value", value.get("name", b""))
@@ -263,10 +301,13 @@ class _Inspection:
                 raise WireError("a dimension with a length and a symbol")
             length = signed(dim["dim_value"]) if "dim_value" in dim else None
             lengths.append(None if length == -1 else length)  # some exporters write -1 for "any"
-        return _text(value.get("name", b"")), tensor.get("elem_type", 0), lengths
+        return bytes(value.get("name", b"")), tensor.get("elem_type", 0), lengths
 
-    def _interface(self, what: str, values: list[memoryview], width: int, exact: bool) -> None:
-        """Require one float32 `[batch, width]`; unless `exact`, the width may be open."""
+    def _interface(self, what: str, values: list[memoryview], width: int, exact: bool) -> bytes:
+        """Require one float32 `[batch, width]`; unless `exact`, the width may be open.
+
+        It returns the name.
+        """
         remedy = f"Export the actor with one {what}, its batch a dynamic axis, for this task"
         allowed = f"must be one float32 {what} [batch, {width}]"
         if len(values) != 1:
@@ -279,7 +320,10 @@ class _Inspection:
         if type != _FLOAT or len(shape) != 2 or shape[0] is not None or shape[1] not in widths:
             type_name = schema.TYPES[type].name if type in schema.TYPES else f"type {type}"
             lengths = ", ".join("any" if length is None else str(length) for length in shape)
-            _refuse("onnx_interface", f"{what} {name!r}={type_name} [{lengths}]", allowed, remedy)
+            _refuse(
+                "onnx_interface", f"{what} {_text(name)!r}={type_name} [{lengths}]", allowed, remedy
+            )
+        return name
 
     def _read(self, message: memoryview, known: schema.Schema, where: str) -> dict[str, Any]:
         """The fields of a message by name; a list if they may repeat, else absent if missing."""

@@ -8,6 +8,8 @@ from pathlib import Path
 
 RESERVED_BYTES = 256 * 2**20  # for the scorer itself and the child's libraries
 
+_PROC = Path("/proc")
+_MEMBERSHIP = Path("/proc/self/cgroup")
 _CGROUPS = Path("/sys/fs/cgroup")
 
 
@@ -35,13 +37,13 @@ def spare_memory() -> int:
 
 
 def _meminfo() -> dict[str, int]:
-    lines = Path("/proc/meminfo").read_text().splitlines()
+    lines = (_PROC / "meminfo").read_text().splitlines()
     return {line.partition(":")[0]: int(line.split()[1]) for line in lines}
 
 
 def _cgroup_memory() -> Iterator[tuple[int, int]]:
     """Limit and use, in bytes, of each control group with a limit that this process is in."""
-    for line in Path("/proc/self/cgroup").read_text().splitlines():
+    for line in _MEMBERSHIP.read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         if not controllers:  # version 2
             root, names = _CGROUPS, ("memory.max", "memory.current", "inactive_file")

@@ -95,6 +95,12 @@ def linear_with(*tensors):
     return model([node("MatMul", "o W", "a")], [weights(), *tensors])
 
 
+def test_optional_inputs_may_be_empty_and_outputs_announced():
+    bounded = [node_with("Clip", ["y", "", "high"], ["c"]), node("Tanh", "c", "a")]
+    accepted(squashed(bounded, [tensor("high", np.float32(1))]))
+    accepted(split(2, num_outputs=2))
+
+
 @pytest.fixture(scope="module")
 def torch():
     return pytest.importorskip("torch")
@@ -204,6 +210,24 @@ def sparse():
     return found
 
 
+def node_with(operator, inputs, outputs=("a",), **attributes):
+    """A node whose names may be empty."""
+    return helper.make_node(operator, inputs, outputs, **attributes)
+
+
+def split(outputs, **attributes):
+    names = [f"part{i}" for i in range(outputs)]
+    nodes = [node_with("Split", ["y"], names, axis=1, **attributes), node("Tanh", "y", "a")]
+    return squashed(nodes, opsets=[("", 18)])
+
+
+def twice_attributed():
+    found = squashed([node("Flatten", "y", "a", axis=1)])
+    flatten = found.graph.node[1]
+    flatten.attribute.append(flatten.attribute[0])
+    return found
+
+
 GRAPH = helper.make_graph([], "empty", [], [])
 VERSION_14 = linear(ir_version=14)
 
@@ -269,6 +293,28 @@ BAD = {
     "a tensor of complex numbers": (linear_with(tensor("x", np.ones(2, np.complex64))),
                                     "onnx_tensor"),
     "a cast to text": (squashed([node("Cast", "y", "a", to=TensorProto.STRING)]), "onnx_tensor"),
+    **{
+        f"an empty input of {operator}": (squashed([node_with(operator, ["y", "", "y"])]),
+                                          "onnx_malformed")
+        for operator in ("Sum", "Mean", "Min", "Max", "Concat", "Where")
+    },
+    "a first input that is empty": (squashed([node_with("Clip", ["", "y"])]), "onnx_malformed"),
+    "an empty output": (squashed([node("Tanh", "y", "a"), node_with("Tanh", ["y"], [""])]),
+                        "onnx_malformed"),
+    "no output": (squashed([node("Tanh", "y", "a"), node_with("Tanh", ["y"], [])]),
+                  "onnx_malformed"),
+    "fewer outputs announced than there are": (split(3, num_outputs=2), "onnx_malformed"),
+    "more outputs announced than there are": (split(3, num_outputs=4), "onnx_malformed"),
+    "an attribute given twice": (twice_attributed(), "onnx_malformed"),
+    "a value computed twice": (squashed([node("Tanh", "y", "a"), node("Tanh", "y", "a")]),
+                               "onnx_malformed"),
+    "a value computed and stored": (
+        squashed([node("Tanh", "y", "a")], [tensor("y", np.ones((1, 2), np.float32))]),
+        "onnx_malformed",
+    ),
+    "a value stored twice": (linear_with(weights()), "onnx_malformed"),
+    "a tensor without a name": (linear_with(weights("")), "onnx_malformed"),
+    "observations that are stored": (linear_with(weights("o")), "onnx_malformed"),
     "too many nodes": (many_nodes(MAX_NODES + 1), "onnx_too_many_nodes"),
     "too many tensors": (
         linear_with(*(tensor(f"x{i}", np.float32(0)) for i in range(4096))), "onnx_too_many_nodes"

@@ -245,6 +245,75 @@ def test_a_row_that_reads_another_is_detected_in_reverse_order():
     assert code_of(found, rows=100) == "run_batch_dependent"
 
 
+def test_an_action_that_depends_on_both_neighbours_is_rejected():
+    # In reverse order both neighbours are the same; in random order they are not.
+    found = squashed(
+        [
+            node("Slice", "y one end", "after"),
+            node("Slice", "y zero last", "before"),
+            node("Slice", "y zero one", "first"),
+            node("Slice", "y last end", "final"),
+            node("Concat", "after first", "next", axis=0),
+            node("Concat", "final before", "previous", axis=0),
+            node("Sum", "y next previous", "a"),
+        ],
+        [
+            tensor("zero", np.int64([0])),
+            tensor("one", np.int64([1])),
+            tensor("last", np.int64([-1])),
+            tensor("end", np.int64([2**31])),
+        ],
+    )
+    with opened(found) as policy, pytest.raises(Rejection, match="run_batch_dependent"):
+        policy.check_rows(observations(100), rows=[])
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The batches of all calls."""
+    batches = []
+    call = Sandbox.__call__
+
+    def recorded(self, seen):
+        batches.append(seen)
+        return call(self, seen)
+
+    monkeypatch.setattr(Sandbox, "__call__", recorded)
+    return batches
+
+
+def test_the_rows_to_check_may_be_given(asked):
+    seen = observations(100)
+    with opened(linear()) as policy:
+        policy.check_rows(seen, rows=[50, 3, 99])
+    np.testing.assert_array_equal(np.concatenate(asked[-3:]), seen[[50, 3, 99]])
+
+
+def test_rows_are_drawn_at_random(asked):
+    with opened(linear()) as policy:
+        policy.check_rows(observations(1000), rows=5)
+        policy.check_rows(observations(1000), rows=5)
+    assert len({rows.tobytes() for rows in asked if len(rows) == 1}) >= 8  # of 5 and 5
+    assert not np.array_equal(asked[1], asked[9])
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_small_batches_can_be_checked(rows):
+    with opened(linear()) as policy:
+        policy.check_rows(observations(rows))
+
+
+def test_the_process_reports_its_runtime_before_it_reads_the_model(isolation, monkeypatch):
+    import onnxruntime
+
+    with opened(linear()) as policy:
+        assert policy.runtime == onnxruntime.__version__
+    acting_as(STARTED + "os.read(0, 1); say(1, 0)", monkeypatch)
+    monkeypatch.setattr(sandbox.Sandbox, "_load", lambda self, *rest: None)
+    with opened(linear()) as policy:
+        assert policy.runtime == "1.0"
+
+
 def test_random_actions_are_rejected(ungated):
     found = squashed([node("RandomUniformLike", "y", "a")])
     assert code_of(found) == "run_batch_dependent"
@@ -259,10 +328,69 @@ def test_a_small_file_that_takes_gigabytes_is_stopped_without_the_gate(isolation
     assert peak <= max(begun, 3 * 2**20)  # KiB
 
 
+@pytest.fixture
+def short_of_memory(monkeypatch):
+    """A machine with 300 MiB to spare."""
+    monkeypatch.setattr(sandbox, "spare_memory", lambda: 300 * 2**20)
+
+
+def test_a_machine_short_of_memory_does_not_reject_the_model(isolation, short_of_memory):
+    for found in (models.doubling(40), models.doubling(24)):
+        with pytest.raises(ScoringFault, match="the machine had 300 MiB to spare"):
+            run(found, LIMITS, 8)
+
+
+def test_a_machine_short_of_memory_runs_and_judges_small_models(isolation, short_of_memory):
+    with opened(linear()) as policy:
+        policy.check_rows(observations(100))
+    assert code_of(models.doubling(40), SandboxLimits(memory_bytes=200 * 2**20)) == "run_memory"
+
+
+def test_a_process_that_crashes_with_too_little_memory_does_not_reject_the_model(
+    monkeypatch, unconfined
+):
+    scarce = STARTED.replace("2**31", "2**20")
+    acting_as(scarce + "say(0, 0); os.abort()", monkeypatch)
+    with opened(linear()) as policy, pytest.raises(ScoringFault, match="1 MiB to spare"):
+        policy(observations(8))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_limit_of_the_scorer_itself_lowers_the_memory_and_judges_nobody():
+    script = (
+        "import resource\n"
+        "from tests.leaderboard.artefact import models\n"
+        "from tests.leaderboard.artefact.test_sandbox import LIMITS, run\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29, resource.RLIM_INFINITY))\n"
+        "run(models.linear(), LIMITS, 8)\n"
+        "try: run(models.doubling(40), LIMITS, 8)\n"
+        "except Exception as error: print(type(error).__name__)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "ScoringFault\n", done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_system_ends_the_process_before_the_scorer(isolation):
+    with opened(linear()) as policy:
+        last = policy._process.pid
+        while below := Path(f"/proc/{last}/task/{last}/children").read_text().split():
+            (last,) = below
+        assert Path(f"/proc/{last}/oom_score_adj").read_text() == "1000\n"
+
+
 def test_an_endless_loop_is_stopped_without_the_gate(isolation, ungated):
     begun = time.monotonic()
     assert code_of(models.looping(), SHORT) == "run_time"
     assert time.monotonic() - begun < 60.0  # it ends; how soon is the machine's business
+
+
+def test_the_time_of_a_policy_follows_from_states_agents_and_file():
+    small = SandboxLimits.for_policy(5_000, 300_000).cpu_seconds
+    assert 30 <= small <= 60
+    assert SandboxLimits.for_policy(5_000, 12_000).cpu_seconds <= 12
+    assert 250 <= SandboxLimits.for_policy(2**23, 300_000).cpu_seconds <= 300
+    assert SandboxLimits.for_policy(5_000, 300_000, agents=3).cpu_seconds > 2 * small
 
 
 def test_an_answer_that_takes_too_long_is_rejected(ungated, monkeypatch):

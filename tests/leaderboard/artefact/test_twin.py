@@ -1,0 +1,452 @@
+"""The twin: rounding errors that reach the actions are found, and honest policies pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from onnx import TensorProto
+
+from leaderboard.artefact import twin
+from leaderboard.artefact.gate import inspect, widths
+from leaderboard.artefact.reference import constant_onnx, optimal_onnx
+from leaderboard.artefact.sandbox import MAX_ROUNDING, Sandbox
+from leaderboard.errors import Rejection
+from sme_registry import SMESpec, materialize
+from sme_registry.export import operators
+from tests.leaderboard.artefact.models import (
+    ACTION,
+    OBSERVATION,
+    model,
+    network,
+    node,
+    tensor,
+    value,
+    weights,
+)
+
+ROWS = 500
+f32 = np.float32
+RNG = np.random.default_rng(0)
+
+
+def rounding(found, dims=(OBSERVATION, ACTION), isolation="process"):
+    """Mean |Δ action| of a model, or of its bytes."""
+    data = found if isinstance(found, bytes) else found.SerializeToString()
+    observations = np.random.default_rng(1).random((ROWS, dims[0]), f32)
+    with Sandbox(data, *dims, isolation=isolation) as policy:
+        change = policy.rounding(observations)
+    assert change.shape == (ROWS,)
+    assert change.dtype == np.float64
+    return change.mean()
+
+
+def policy(*nodes, opset=17, **tensors):
+    """A model from `o` to `a`; every tensor in single precision, if not given as an array."""
+    found = [
+        tensor(name, each if isinstance(each, np.ndarray) else f32(each))
+        for name, each in tensors.items()
+    ]
+    return model(list(nodes), [*found, weights()], opsets=[("", opset)])
+
+
+def amplified(*nodes, factor, **tensors):
+    """½ + factor · `d`, where the nodes compute `d` from `y` = o W."""
+    return policy(
+        node("MatMul", "o W", "y"),
+        *nodes,
+        node("Mul", "d factor", "amplified"),
+        node("Add", "amplified half", "a"),
+        factor=factor,
+        half=0.5,
+        opset=20,
+        **tensors,
+    )
+
+
+def last_bits(operator):
+    """The last bits of a function of the observation."""
+    return policy(
+        node("MatMul", "o W", "y"),
+        node("Abs", "y", "x"),
+        node("Add", "x one", "z"),
+        node(operator, "z", "f"),
+        node("Mul", "f scale", "g"),
+        node("Floor", "g", "h"),
+        node("Sub", "g h", "a"),
+        one=1.0,
+        scale=2.0**21,
+        opset=20,
+    )
+
+
+def repeated(weights_of_copies):
+    """A sum of copies of one channel whose exact value is 0."""
+    columns = np.repeat(RNG.permutation(weights_of_copies)[:, None], ACTION, axis=1)
+    return np.zeros(len(columns), np.int64), columns
+
+
+def logistic_map(times, dtype=f32):
+    """A chaotic map, iterated: each step doubles an error."""
+    steps = []
+    for i in range(times):
+        steps += [node("Sub", f"one x{i}", f"s{i}"), node("Mul", f"x{i} s{i}", f"p{i}")]
+        steps += [node("Mul", f"p{i} r", f"x{i + 1}")]
+    type = TensorProto.FLOAT if dtype is f32 else TensorProto.DOUBLE
+    return policy(
+        node("MatMul", "o W", "y"),
+        node("Sigmoid", "y", "start"),
+        node("Cast", "start", "x0", to=type),
+        *steps,
+        node("Cast", f"x{times}", "a", to=TensorProto.FLOAT),
+        one=np.array(1.0, dtype),
+        r=np.array(3.99, dtype),
+    )
+
+
+def tail(operator, at, factor):
+    """The tail of a function, where a kernel may round to 0."""
+    return amplified(
+        node("Abs", "y", "x"),
+        node("Sub", "at x", "z"),
+        node(operator, "z", "d"),
+        at=at,
+        factor=factor,
+    )
+
+
+def first_channel(*nodes, **tensors):
+    """A function of the first channel alone, `x`, into both actions by `z ones`."""
+    return policy(
+        node("Gather", "o zero", "x", axis=1),
+        *nodes,
+        node("MatMul", "z ones", "a"),
+        zero=np.int64([0]),
+        ones=np.ones((1, ACTION), f32),
+        **tensors,
+    )
+
+
+def rare():
+    """x² − x·x, amplified, only in a hundredth of the states."""
+    return policy(
+        node("MatMul", "o W", "y"),
+        node("Pow", "y two", "p"),
+        node("Mul", "y y", "m"),
+        node("Sub", "p m", "d"),
+        node("Mul", "d factor", "z"),
+        node("Gather", "o zero", "x", axis=1),
+        node("Greater", "x edge", "there"),
+        node("Where", "there z half", "a"),
+        two=2.0,
+        factor=1e10,
+        half=0.5,
+        edge=0.99,
+        zero=np.int64([0]),
+    )
+
+
+SUMS = {"W64": RNG.normal(size=(OBSERVATION, 64)).astype(f32), "ones": np.ones((64, ACTION), f32)}
+COPIES, CANCELLING = repeated([0.1] * 30 + [-0.1] * 30)
+
+SENSITIVE = {
+    "x² − x·x": amplified(
+        node("Pow", "y two", "p"), node("Mul", "y y", "m"), node("Sub", "p m", "d"),
+        two=2.0, factor=1e10,
+    ),
+    "two identical columns of a product": amplified(
+        node("MatMul", "o WW", "u"), node("Split", "u", "v w", axis=1, num_outputs=2),
+        node("Sub", "v w", "d"), factor=1e8,
+        WW=np.repeat(RNG.normal(size=(OBSERVATION, 1)).astype(f32), 2 * ACTION, axis=1),
+    ),
+    "copies that cancel inside a product": amplified(
+        node("Gather", "o copies", "c", axis=1), node("MatMul", "c V", "d"),
+        copies=COPIES, V=CANCELLING.astype(f32), factor=1e7,
+    ),
+    "copies that cancel in double precision": amplified(
+        node("Gather", "o copies", "c", axis=1), node("Cast", "c", "x", to=TensorProto.DOUBLE),
+        node("MatMul", "x V", "e"), node("Mul", "e large", "l"),
+        node("Cast", "l", "d", to=TensorProto.FLOAT),
+        copies=COPIES, V=CANCELLING, large=np.array(1e16), factor=1.0,
+    ),
+    "a sum in two orders": amplified(
+        node("MatMul", "o W64", "h"), node("ReduceSum", "h last", "s"),
+        node("MatMul", "h ones", "t"), node("Sub", "s t", "d"),
+        last=np.int64([1]), factor=1e6, **SUMS,
+    ),
+    "1 − erf": amplified(
+        node("Abs", "y", "x"), node("Add", "x far", "z2"), node("Erf", "z2", "e"),
+        node("Sub", "one e", "d"), far=3.8, one=1.0, factor=1e7,
+    ),
+    "the tail of a sigmoid": tail("Sigmoid", -17.0, 1e7),
+    "the tail of a GELU": tail("Gelu", -5.0, 1e6),
+    "a logarithm of a probability": amplified(
+        node("Mul", "y apart", "z2"), node("LogSoftmax", "z2", "d", axis=1),
+        apart=f32([20.0, -20.0]), factor=1e7,
+    ),
+    "a hundredth of the states": rare(),
+    "the last bits of the observation": first_channel(
+        node("Mul", "x scale", "g"), node("Floor", "g", "h"), node("Sub", "g h", "z"),
+        scale=2.0**22,
+    ),
+    "a hash of the observation in integers": first_channel(
+        node("Mul", "x scale", "g"), node("Cast", "g", "i", to=TensorProto.INT64),
+        node("Mod", "i prime", "r"), node("Cast", "r", "q", to=TensorProto.FLOAT),
+        node("Mul", "q small", "z"),
+        scale=2.0**24, prime=np.array(97), small=1 / 97,
+    ),
+    "a chaotic map": logistic_map(60),
+    "a chaotic map in double precision": logistic_map(80, np.float64),
+    "a cast to integers that overflows": amplified(
+        node("Mul", "y huge", "h"), node("Cast", "h", "i", to=TensorProto.INT32),
+        node("Cast", "i", "d", to=TensorProto.FLOAT), huge=1e12, factor=2.0**-31,
+    ),
+    **{f"the last bits of {name}": last_bits(name)
+       for name in ("Exp", "Sin", "Cos", "Erf", "Tanh", "Log", "Sqrt", "Softplus", "Elu", "Mish")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SENSITIVE)
+def test_a_policy_that_amplifies_rounding_errors_is_refused(kind):
+    data = SENSITIVE[kind].SerializeToString()
+    inspect(data, OBSERVATION, ACTION)
+    observations = np.random.default_rng(1).random((ROWS, OBSERVATION), f32)
+    opened = Sandbox(data, OBSERVATION, ACTION, isolation="process")
+    with opened, pytest.raises(Rejection, match="run_rounding"):
+        opened.check_rounding(observations)
+
+
+def tree(depth):
+    """Random thresholds of random channels, as Greater and Where."""
+    nodes, tensors = [], {}
+
+    def branch(name, depth):
+        if depth == 0:
+            tensors[name] = RNG.random((1, ACTION)).astype(f32)
+            return
+        tensors[f"{name}i"] = RNG.integers(OBSERVATION, size=1)
+        tensors[f"{name}t"] = RNG.random()
+        for side in "lr":
+            branch(name + side, depth - 1)
+        nodes.append(node("Gather", f"o {name}i", f"{name}x", axis=1))
+        nodes.append(node("Greater", f"{name}x {name}t", f"{name}c"))
+        nodes.append(node("Where", f"{name}c {name}l {name}r", name if depth < 4 else "a"))
+
+    branch("n", depth)
+    return policy(*nodes, **tensors)
+
+
+def tree_of_products():
+    """A tree as products: which conditions hold, how many of each leaf, and so which leaf."""
+    leaves = np.arange(8)
+    signs, satisfied = np.zeros((7, 8), f32), np.zeros(8, f32)
+    for leaf in leaves:
+        at = 0
+        for level in (2, 1, 0):
+            right = leaf >> level & 1
+            signs[at, leaf] = -1.0 if right else 1.0
+            satisfied[leaf] += not right
+            at = 2 * at + 1 + right
+    return policy(
+        node("MatMul", "o A", "x"),
+        node("Less", "x B", "c"),
+        node("Cast", "c", "t", to=TensorProto.FLOAT),
+        node("MatMul", "t C", "s"),
+        node("Equal", "s D", "e"),
+        node("Cast", "e", "l", to=TensorProto.FLOAT),
+        node("MatMul", "l E", "a"),
+        A=np.eye(OBSERVATION, dtype=f32)[RNG.integers(OBSERVATION, size=7)].T.copy(),
+        B=RNG.random(7).astype(f32),
+        C=signs,
+        D=satisfied,
+        E=RNG.random((8, ACTION)).astype(f32),
+    )
+
+
+def table():
+    """A table of 10⁴ cells; the cell's index is a sum of floating-point integers."""
+    return policy(
+        node("Mul", "o ten", "g"),
+        node("Floor", "g", "h"),
+        node("Clip", "h low high", "c"),
+        node("MatMul", "c strides", "j"),
+        node("Cast", "j", "i", to=TensorProto.INT64),
+        node("Squeeze", "i last", "k"),
+        node("Gather", "table k", "a", axis=0),
+        ten=10.0,
+        low=0.0,
+        high=9.0,
+        strides=f32([[1000], [100], [10], [1]]),
+        last=np.int64([1]),
+        table=RNG.random((10_000, ACTION)).astype(f32),
+    )
+
+
+def deep(layers, gain, width=64):
+    """A random network; each layer amplifies by the gain where its tanh is not saturated."""
+    nodes, tensors, x, columns = [], {}, "o", OBSERVATION
+    for i in range(layers):
+        W = RNG.normal(size=(columns, width)) * gain / np.sqrt(columns)
+        tensors[f"W{i}"] = W.astype(f32)
+        nodes += [node("MatMul", f"{x} W{i}", f"y{i}"), node("Tanh", f"y{i}", f"x{i}")]
+        x, columns = f"x{i}", width
+    tensors["last"] = RNG.normal(size=(width, ACTION)).astype(f32)
+    return policy(*nodes, node("MatMul", f"{x} last", "y"), node("Sigmoid", "y", "a"), **tensors)
+
+
+INSENSITIVE = {
+    "a network": (network(64), 1e-6),
+    "20 layers of gain 2": (deep(20, 2.0), 3e-5),
+    "a tree": (tree(4), 0.0),
+    "a tree of products": (tree_of_products(), 1e-6),
+    "a table": (table(), 0.0),
+    "the best of 20 actions": (
+        policy(
+            node("MatMul", "o Q", "q"), node("ArgMax", "q", "i", axis=1, keepdims=0),
+            node("Gather", "actions i", "a", axis=0),
+            Q=RNG.normal(size=(OBSERVATION, 20)).astype(f32),
+            actions=RNG.random((20, ACTION)).astype(f32),
+        ),
+        1e-5,
+    ),
+    "one of two actions": (
+        amplified(node("Sign", "y", "d"), factor=0.5), 1e-6
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", INSENSITIVE)
+def test_an_honest_policy_changes_far_less_than_the_limit(kind):
+    found, most = INSENSITIVE[kind]
+    assert rounding(found) <= most
+    assert most < MAX_ROUNDING / 3.0
+
+
+@pytest.mark.parametrize("team", [False, True])
+def test_the_reference_policies_change_far_less_than_the_limit(team):
+    agents = {"team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]}} if team else {}
+    spec = SMESpec(state_dim=3, action_dim=2, complexity=20, **agents)
+    assert rounding(optimal_onnx(spec), widths(spec)) <= 1e-6
+    assert rounding(constant_onnx(spec), widths(spec)) <= 1e-6
+
+
+def test_the_optimal_policy_in_single_precision_passes_at_the_highest_complexity():
+    spec = SMESpec(state_dim=2, action_dim=1, complexity=50)
+    nodes, tensors, x = [], [tensor("one", f32(1)), tensor("half", f32(0.5))], "states"
+    for i, (W, b) in enumerate(materialize(spec).policies[0]):
+        root2 = np.sqrt(2.0)
+        tensors += [tensor(f"W{i}", (W.T / root2).astype(f32))]
+        tensors += [tensor(f"b{i}", (b / root2).astype(f32))]
+        nodes += [node("Gemm", f"{x} W{i} b{i}", f"g{i}"), node("Erf", f"g{i}", f"e{i}")]
+        nodes += [node("Add", f"e{i} one", f"p{i}"), node("Mul", f"p{i} half", f"x{i}")]
+        x = f"x{i}"
+    tensors.append(tensor("channels", np.int64([0, 1])))
+    found = model(
+        [node("Gather", "o channels", "states", axis=1), *nodes, node("Identity", x, "a")],
+        tensors,
+        inputs=[value("o", "batch", 4)],
+        outputs=[value("a", "batch", 1)],
+    )
+    assert 1e-6 < rounding(found, (4, 1)) < MAX_ROUNDING / 2.0
+
+
+def test_errors_are_drawn_anew_in_each_run_and_reach_every_row():
+    observations = np.random.default_rng(1).random((ROWS, OBSERVATION), f32)
+    with Sandbox(deep(2, 1.0).SerializeToString(), OBSERVATION, ACTION) as opened:
+        first, second = opened.rounding(observations), opened.rounding(observations)
+        assert (opened(observations) == opened(observations)).all()
+    assert (first != second).mean() > 0.7
+    assert (first > 0.0).mean() > 0.7
+
+
+@pytest.mark.parametrize("opset", [13, 17, 21, 23])
+def test_every_opset_has_a_twin(opset):
+    found = network(8)
+    found.opset_import[0].version = opset
+    assert 0.0 < rounding(found, isolation=None) < 1e-5
+
+
+def test_an_action_that_becomes_no_number_counts_as_changed():
+    # 0 · (1 ± δ) is 0 and its reciprocal infinite, but x − x is 0 only without errors.
+    found = policy(
+        node("MatMul", "o W", "y"),
+        node("Mul", "y y", "s"),
+        node("Pow", "y two", "t"),
+        node("Sub", "s t", "d"),
+        node("Abs", "d", "e"),
+        node("Sub", "e tiny", "f"),
+        node("Neg", "f", "g"),
+        node("Sqrt", "g", "h"),
+        node("Mul", "h zero", "a"),
+        two=2.0,
+        tiny=1e-12,
+        zero=0.0,
+    )
+    assert rounding(found) > 0.5
+
+
+def test_nodes_may_stand_in_any_order():
+    found = network(8)
+    nodes = list(found.graph.node)
+    del found.graph.node[:]
+    found.graph.node.extend(reversed(nodes))
+    inspect(found.SerializeToString(), OBSERVATION, ACTION)
+    assert twin.rounding_twin(found.SerializeToString())
+
+
+def test_every_operator_that_boards_accept_has_a_rule():
+    listed = twin.EXACT | twin.SUMS | twin.FLOORS.keys()
+    assert listed <= operators.FEED_FORWARD
+    assert twin.EXACT.isdisjoint(twin.SUMS | twin.FLOORS.keys())
+    arithmetic = "Add Cosh Div LeakyRelu Mul PRelu Reciprocal Sqrt Sub"
+    assert operators.FEED_FORWARD - listed == set(arithmetic.split())  # errors of their size only
+
+
+def counted(*nodes, **tensors):
+    """Copies of a value `h`, which the nodes compute from y = o W, in a sum that should be 0."""
+    return amplified(
+        *nodes,
+        node("Gather", "h copies", "c", axis=1),
+        node("MatMul", "c V", "d"),
+        copies=COPIES,
+        V=np.round(2.0**12 * CANCELLING).astype(f32),
+        factor=1.0,
+        **tensors,
+    )
+
+
+NOT_SMALL_INTEGERS = {
+    "a floor without bounds": counted(
+        node("Mul", "y scale", "g"), node("Floor", "g", "h"), scale=2.0**20
+    ),
+    "a floor with a lower bound": counted(
+        node("Mul", "y scale", "g"), node("Floor", "g", "f"), node("Clip", "f low", "h"),
+        scale=2.0**20, low=0.0,
+    ),
+    "a floor with bounds that are no integers": counted(
+        node("Mul", "y scale", "g"), node("Floor", "g", "f"), node("Clip", "f low high", "h0"),
+        node("Mul", "h0 scale", "h"), scale=2.0**20, low=0.3, high=0.7,
+    ),
+    "a floor with large bounds": counted(
+        node("Mul", "y scale", "g"), node("Floor", "g", "f"), node("Clip", "f low high", "h"),
+        scale=2.0**20, low=-(2.0**20), high=2.0**20,
+    ),
+    "the product of two of them": counted(
+        node("Sign", "y", "s"), node("Mul", "s many", "h"), many=2.0**20 + 1.0
+    ),
+    "one of which is no integer": counted(
+        node("Sign", "y", "s"), node("Max", "s y", "t"), node("Mul", "t many", "h"), many=2.0**16
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NOT_SMALL_INTEGERS)
+def test_only_sums_of_small_integers_are_exact(kind):
+    assert rounding(NOT_SMALL_INTEGERS[kind]) > MAX_ROUNDING
+
+
+def test_sums_of_small_integers_are_exact():
+    small = counted(
+        node("Mul", "y ten", "g"), node("Round", "g", "f"), node("Clip", "f low high", "h"),
+        ten=10.0, low=-9.0, high=9.0,
+    )  # fmt: skip
+    assert rounding(small) < 1e-6  # of the last two nodes, on ½
