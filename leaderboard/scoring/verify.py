@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import random
 import re
 from dataclasses import dataclass
@@ -44,6 +45,10 @@ EXACT = 1e-9
 RESCORED = 1e-5
 """Tolerance for new scores of the same policy: another machine or version of onnxruntime changes
 its float32 actions by about 1e-7, and similar actions are divided by a regret as small as 0.1."""
+
+
+# An index that is larger than its log can explain is not copied into memory.
+_INDEX_BYTES, _INDEX_BYTES_OF_ENTRY = 2**26, 2**17
 
 
 @dataclass(frozen=True)
@@ -233,9 +238,10 @@ class _Verifier:
     def check_index(self) -> int:
         """Compare the board's index with the rebuilt one, row by row; returns the rows."""
         try:
-            index = Index.open(self.folder, self.document, in_memory=True)
+            limit = _INDEX_BYTES + _INDEX_BYTES_OF_ENTRY * (self.index.head.sequence + 1)
+            index = Index.open(self.folder, self.document, in_memory=True, limit=limit)
         except IndexUnusable as error:
-            if not self.folder.index.exists():
+            if not os.path.lexists(self.folder.index):
                 return 0
             _refuse_index("index.sqlite", str(error))
         rows = 0

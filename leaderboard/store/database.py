@@ -35,7 +35,8 @@ class Database:
 
     Args:
       path: the board's folder.
-      read_only: write nothing, not even the index, which is then held in memory.
+      read_only: write nothing, and read nothing but log and documents: the index, which is then
+        held in memory, is built from them.
     """
 
     def __init__(self, path: str | Path, *, read_only: bool) -> None:
@@ -69,10 +70,13 @@ class Database:
                 "read-only."
             )
         with self.locked():
-            self._connect(rebuild=reindex)
+            # Without the key, nothing was ever written here: the index is somebody else's.
+            self._connect(rebuild=reindex or not self.folder.key.is_file())
         try:
             self._refresh()
         except TamperedError:  # passes with a rebuilt index if only the index was altered
+            if self.read_only:
+                raise
             with self.locked():
                 self._connect(rebuild=True)
             self._refresh()
@@ -224,14 +228,15 @@ class Database:
         previous, self._index = self._index, None
         if previous is not None:
             previous.close()
+        if self.read_only:
+            self._index = Index.empty(self.folder, self.document)
+            return
         if not rebuild:
             with contextlib.suppress(IndexUnusable):
-                self._index = Index.open(self.folder, self.document, in_memory=self.read_only)
+                self._index = Index.open(self.folder, self.document, in_memory=False)
         if self._index is not None:
             self._inode = _inode(self.folder.index)
             self._refuse_lost_log(self._index.head)
-        elif self.read_only:
-            self._index = Index.empty(self.folder, self.document)
         else:
             self._rebuild()
 
@@ -276,7 +281,7 @@ class Database:
                 self._index.close()
                 self._index = None
             # In this order: no database may ever lie next to another one's write-ahead log.
-            for suffix in ("", "-wal", "-shm"):
+            for suffix in ("", "-wal", "-shm", "-journal"):
                 path.with_name(path.name + suffix).unlink(missing_ok=True)
             os.replace(temporary, path)
             sync_folder(path.parent)

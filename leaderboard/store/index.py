@@ -11,9 +11,12 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import os
 import shutil
 import sqlite3
+import stat
 import tempfile
+import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -71,6 +74,11 @@ CREATE TABLE upload (
 ) STRICT, WITHOUT ROWID;
 """
 VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
+
+
+MAX_BYTES = 2**32
+CHECK_SECONDS = 60.0
+"""Of an index that is opened, and for the checks of it."""
 
 
 class IndexUnusable(Exception):
@@ -181,27 +189,41 @@ class Index:
         self.document = document
 
     @classmethod
-    def open(cls, folder: Folder, document: BoardDocument, *, in_memory: bool) -> Index:
+    def open(
+        cls,
+        folder: Folder,
+        document: BoardDocument,
+        *,
+        in_memory: bool,
+        limit: int = MAX_BYTES,
+    ) -> Index:
         """Open a board's index, or a copy in memory, which writes nothing into the folder.
+
+        A stranger may have prepared the file: only regular files with exactly this schema are
+        accepted, and no view, trigger or hot journal has any effect. Its rows may still be wrong.
+
+        Args:
+          folder, document: the board's.
+          in_memory: whether to open a copy.
+          limit: size of the file and its write-ahead log, in bytes.
 
         Raises:
           IndexUnusable: it must be rebuilt.
         """
-        if not folder.index.is_file():
-            raise IndexUnusable("is missing")
+        _refuse_unusable_files(folder.index, limit)
         try:
             connection = _connect(":memory:" if in_memory else _uri(folder.index, "rw"))
             try:
                 if in_memory:
                     _copy_index(folder.index, connection)
-                else:
+                _refuse_unusable(connection, document)
+                if not in_memory:
                     connection.execute("PRAGMA journal_mode = WAL")
                     connection.execute("PRAGMA synchronous = FULL")
-                _refuse_unusable(connection, document)
             except BaseException:
                 connection.close()
                 raise
-        except (sqlite3.DatabaseError, OSError) as error:
+        except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
             raise IndexUnusable(str(error)) from None
         return cls(connection, folder, document)
 
@@ -391,9 +413,32 @@ def _backup(path: Path, memory: sqlite3.Connection) -> None:
         source.backup(memory)
 
 
+def _refuse_unusable_files(path: Path, limit: int) -> None:
+    size = 0
+    for end in ("", "-wal", "-shm", "-journal"):
+        part = path.with_name(path.name + end)
+        try:
+            status = os.lstat(part)
+        except FileNotFoundError:
+            if part == path:
+                raise IndexUnusable("is missing") from None
+            continue
+        if end == "-journal":  # from which SQLite would restore, and delete, what it names
+            raise IndexUnusable(f"{part.name} exists, which a board never writes")
+        if not stat.S_ISREG(status.st_mode):
+            raise IndexUnusable(f"{part.name} is not a regular file")
+        size += status.st_size
+    if size > limit:
+        raise IndexUnusable(f"has more than {limit:,} bytes")
+
+
 def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) -> None:
+    deadline = time.monotonic() + CHECK_SECONDS
+    connection.set_progress_handler(lambda: time.monotonic() > deadline, 10_000)
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version != VERSION:
+    if version != VERSION or _schema_of(connection) != _schema():
         raise IndexUnusable("has another schema")
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
@@ -401,6 +446,22 @@ def _refuse_unusable(connection: sqlite3.Connection, document: BoardDocument) ->
     head = connection.execute("SELECT board FROM head").fetchone()
     if head is None or head[0] != document.digest:
         raise IndexUnusable("belongs to another board")
+    connection.set_progress_handler(None, 0)
+
+
+def _schema_of(connection: sqlite3.Connection) -> list[tuple[Any, ...]]:
+    """The definitions of all tables, indices, views and triggers, or the first hundred of them."""
+    return connection.execute(
+        "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY type, name"
+    ).fetchmany(100)
+
+
+@functools.cache
+def _schema() -> list[tuple[Any, ...]]:
+    """`_schema_of` an index of this version."""
+    with contextlib.closing(_connect(":memory:")) as connection:
+        connection.executescript(SCHEMA)
+        return _schema_of(connection)
 
 
 def _contradiction(entry: LogEntry, message: str) -> TamperedError:

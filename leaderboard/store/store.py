@@ -94,7 +94,8 @@ class Store(Database):
 
         Args:
           path: the board's folder.
-          read_only: write nothing, not even the index, which is then held in memory.
+          read_only: write nothing, and read nothing but log and documents: the index, which is
+            then held in memory, is built from them. For copies of boards, whose index may lie.
           reindex: rebuild the index and ignore what the old one recorded of the log.
 
         Raises:

@@ -1,0 +1,275 @@
+"""Copies of boards that a stranger has prepared: readers neither hang nor believe the index."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from leaderboard.documents.board import Folder
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.reading import is_regular, open_regular, read_regular
+from leaderboard.errors import BoardError, TamperedError
+from leaderboard.scoring.verify import verify
+from leaderboard.store import EntryRow, Store
+from sme_registry.errors import SMEError
+from tests.leaderboard.conftest import put_submission, tiny_board
+from tests.leaderboard.store.synthetic import synthetic_result
+
+SECONDS = 60  # far more than reading takes; a reader that hangs fails its test
+
+
+@pytest.fixture(autouse=True)
+def alarm() -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise AssertionError(f"still reading after {SECONDS} s")
+
+    previous = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(SECONDS)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scored submissions, and one that waits."""
+    path, key = tmp_path_factory.mktemp("hostile") / "board", SigningKey.generate()
+    with tiny_board(path) as store:
+        for number in range(2):
+            put_submission(store, key, number)
+            claim = store.queue.claim("worker")
+            assert claim is not None
+            store.queue.finish(claim, synthetic_result(store, claim.id, level=0.5 - 0.1 * number))
+        put_submission(store, key, 2)
+    return path
+
+
+@pytest.fixture
+def board(whole: Path, tmp_path: Path) -> Path:
+    """A copy without the private key, as a stranger publishes it."""
+    copy = shutil.copytree(whole, tmp_path / "board")
+    (copy / "board.key").unlink()
+    return copy
+
+
+@pytest.fixture
+def rows(whole: Path) -> list[EntryRow]:
+    return rows_of(whole)
+
+
+def rows_of(board: Path, *, read_only: bool = True) -> list[EntryRow]:
+    with Store.open(board, read_only=read_only) as store:
+        return store.entries()
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless_link(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def link_to_a_copy(path: Path) -> None:
+    elsewhere = path.with_name("elsewhere")
+    elsewhere.write_bytes(b"{}")
+    path.symlink_to(elsewhere)
+
+
+def terabyte(path: Path) -> None:
+    with open(path, "wb") as stream:
+        stream.truncate(2**40)
+
+
+def deaf_socket(path: Path) -> None:
+    home = Path.cwd()
+    os.chdir(path.parent)  # the address of a socket has at most 107 characters
+    try:
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(path.name)
+    finally:
+        os.chdir(home)
+
+
+HARMS = (pipe, endless_link, link_to_a_copy, terabyte, deaf_socket, Path.mkdir)
+harmed = pytest.mark.parametrize("harm", HARMS, ids=lambda harm: harm.__name__)
+
+
+def replace(path: Path, harm: Callable[[Path], object]) -> None:
+    path.unlink(missing_ok=True)
+    harm(path)
+
+
+@harmed
+def test_only_regular_files_of_limited_size_are_read(tmp_path, harm):
+    (tmp_path / "plain").write_bytes(b"abc")
+    assert read_regular(tmp_path / "plain", 3) == b"abc"
+    with pytest.raises(OSError, match="has more than 2 bytes"):
+        read_regular(tmp_path / "plain", 2)
+    assert is_regular(tmp_path / "plain")
+    harm(tmp_path / "odd")
+    with pytest.raises(OSError, match=r"regular file|has more than") as refused:
+        read_regular(tmp_path / "odd", 10)
+    assert refused.value.strerror
+    assert is_regular(tmp_path / "odd") == (harm is terabyte)
+    if harm is not terabyte:
+        with pytest.raises(OSError, match="regular file"):
+            open_regular(tmp_path / "odd")
+
+
+@harmed
+@pytest.mark.parametrize("file", ["board", "log", "submission", "result", "object", "next log"])
+def test_readers_refuse_what_is_no_plain_file(board, harm, file):
+    folder = Folder(board)
+    with Store.open(board, read_only=True) as store:
+        row, last = store.entries()[0], store.head.sequence
+        artefact = store.submission(row.id).submission.runs[0].artefact
+    path = {
+        "board": folder.board,
+        "log": folder.log_entry(1),
+        "submission": folder.submission(row.id),
+        "result": folder.result(row.id),
+        "object": folder.object(artefact.sha256),
+        "next log": folder.log_entry(last + 1),
+    }[file]
+    replace(path, harm)
+    with pytest.raises(SMEError) as refused:
+        verify(board)
+    assert path.name in str(refused.value)
+    for read_only in (True, False):
+        if file != "object":
+            with pytest.raises((BoardError, TamperedError)):
+                rows_of(board, read_only=read_only)
+        else:
+            with (
+                Store.open(board, read_only=read_only) as store,
+                pytest.raises((BoardError, TamperedError)),
+            ):
+                store.objects.read(artefact.sha256)
+
+
+@harmed
+@pytest.mark.parametrize("suffix", ["", "-wal", "-shm", "-journal"])
+def test_no_reader_needs_the_index_and_a_writer_rebuilds_it(whole, tmp_path, rows, harm, suffix):
+    board = shutil.copytree(whole, tmp_path / "board")
+    path = board / f"index.sqlite{suffix}"
+    replace(path, harm)
+    assert rows_of(board) == rows
+    with pytest.raises(TamperedError) as tampered:
+        verify(board)
+    assert tampered.value.where == "index.sqlite"
+    if harm is Path.mkdir:  # never removed, as files may lie in it
+        with pytest.raises(BoardError, match=r"index\.sqlite"):
+            rows_of(board, read_only=False)
+    else:
+        assert rows_of(board, read_only=False) == rows
+        verify(board)
+
+
+ENDLESS = """
+WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS zero, 'x' AS board,
+i AS sequence, 'x' AS digest, 'x' AS time FROM n
+"""
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        f"DROP TABLE head; CREATE VIEW head AS {ENDLESS};",
+        "ALTER TABLE entry RENAME TO entries; CREATE VIEW entry AS SELECT * FROM entries;",
+        "CREATE TRIGGER t AFTER INSERT ON entry BEGIN DELETE FROM entry; END;",
+        "CREATE TABLE more (a); CREATE INDEX later ON entry (time('now'));",
+        "CREATE VIRTUAL TABLE more USING fts5(a);",
+    ],
+    ids=["endless view", "view", "trigger", "table", "virtual table"],
+)
+def test_an_index_with_another_schema_has_no_effect(whole, tmp_path, rows, change):
+    board = shutil.copytree(whole, tmp_path / "board")
+    with contextlib.closing(sqlite3.connect(board / "index.sqlite")) as connection:
+        with contextlib.suppress(sqlite3.OperationalError):  # an index on what changes
+            connection.executescript(change)
+        connection.commit()
+    assert rows_of(board) == rows
+    with pytest.raises(TamperedError) as tampered:
+        verify(board)
+    assert tampered.value.where == "index.sqlite"
+    assert rows_of(board, read_only=False) == rows
+    verify(board)
+
+
+LIE = "UPDATE entry SET submitter = 'Somebody', scores = replace(scores, '0.', '0.0')"
+
+
+def test_no_reader_believes_an_index_that_lies(board, rows):
+    with contextlib.closing(sqlite3.connect(board / "index.sqlite")) as connection:
+        connection.execute(LIE)
+        connection.commit()
+    assert rows_of(board) == rows
+    with pytest.raises(TamperedError, match="reindex"):
+        verify(board)
+    assert rows_of(board, read_only=False) == rows
+    verify(board)
+
+
+def test_reindexing_repairs_the_index_of_ones_own_board(whole, tmp_path, rows):
+    board = shutil.copytree(whole, tmp_path / "board")
+    with contextlib.closing(sqlite3.connect(board / "index.sqlite")) as connection:
+        connection.execute(LIE)
+        connection.commit()
+    with Store.open(board, reindex=True) as store:
+        assert store.entries() == rows
+
+
+def test_a_database_whose_pages_form_a_circle_is_refused(whole, tmp_path, rows):
+    """Every page of the index is the root of the largest table: without checks, read for ever."""
+    board = shutil.copytree(whole, tmp_path / "board")
+    path = board / "index.sqlite"
+    data = bytearray(path.read_bytes())
+    size = int.from_bytes(data[16:18], "big")
+    page = bytearray(size)  # an interior page of a table, whose children are itself
+    page[0], page[3:5], page[5:7] = 5, (1).to_bytes(2, "big"), (size - 8).to_bytes(2, "big")
+    for number in range(2, len(data) // size + 1):
+        page[8:12] = number.to_bytes(4, "big")
+        page[12:14] = (size - 8).to_bytes(2, "big")
+        page[size - 8 : size - 4] = number.to_bytes(4, "big")
+        data[(number - 1) * size : number * size] = page
+    path.write_bytes(data)
+    with pytest.raises(TamperedError):
+        verify(board)
+    assert rows_of(board, read_only=False) == rows
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"draws": 10**7}, "draws"),
+        ({"seeds": list(range(1001))}, "1,001 instances"),
+        ({"seeds": list(range(9000)), "classes": 30}, "bytes|instances"),
+        ({"title": "x" * 2**21}, "bytes"),
+        ({"runs_to_rank": 10**9}, "runs_to_rank"),
+    ],
+    ids=lambda each: "" if isinstance(each, str) else next(iter(each)),
+)
+def test_a_board_of_excessive_numbers_is_refused_at_once(board, change, reason):
+    path = Folder(board).board
+    plain = json.loads(path.read_text())
+    for name, value in change.items():
+        if name == "seeds":
+            plain["suite"]["classes"][0]["seeds"] = value
+        elif name == "classes":
+            member = plain["suite"]["classes"][0]
+            plain["suite"]["classes"] = [{**member, "name": f"C{n}"} for n in range(value)]
+        else:
+            plain[name] = value
+    path.write_text(json.dumps(plain, indent=2))
+    with pytest.raises(BoardError, match=reason):
+        rows_of(board)
