@@ -108,6 +108,7 @@ class _Inspection:
         self._budget = Budget(MAX_FIELDS)
         self._attributes = 0
         self._tensors = 0
+        self._opset_version = 0
         self._values: set[bytes] = set()
 
     def model(self, data: memoryview, observation_dim: int, action_dim: int) -> None:
@@ -120,7 +121,7 @@ class _Inspection:
                 f"must be in [{IR_VERSIONS[0]}, {IR_VERSIONS[-1]}]",
                 "Export it with an opset from 13 to 23 and the matching IR version",
             )
-        self._opset(model["opset_import"])
+        self._opset_version = self._opset(model["opset_import"])
         if "graph" not in model:
             raise WireError("no graph")
         graph = self._read(model["graph"], schema.GRAPH, "graph")
@@ -135,7 +136,7 @@ class _Inspection:
         self._define(self._interface("input", graph["input"], observation_dim, exact=True))
         self._interface("output", graph["output"], action_dim, exact=False)
 
-    def _opset(self, imports: list[memoryview]) -> None:
+    def _opset(self, imports: list[memoryview]) -> int:
         opsets = [self._read(each, schema.OPSET, "opset_import") for each in imports]
         domains = [bytes(each.get("domain", b"")) for each in opsets]
         if len(opsets) != 1 or domains[0] not in _ONNX_DOMAINS:
@@ -153,6 +154,7 @@ class _Inspection:
                 f"must be in [{OPSETS[0]}, {OPSETS[-1]}]",
                 "Export it with opset_version=17",
             )
+        return version
 
     def _node(self, message: memoryview) -> None:
         node = self._read(message, schema.NODE, "node")
@@ -179,9 +181,17 @@ class _Inspection:
         attributes = dict(self._attribute(each, operator) for each in node["attribute"])
         if len(attributes) < len(node["attribute"]):
             raise WireError(f"two attributes of one name in {operator}")
-        outputs = len(node["output"])
-        if operator == "Split" and attributes.get(b"num_outputs", outputs) != outputs:
-            raise WireError(f"Split with {outputs} outputs and another num_outputs")
+        if operator == "Split":
+            self._split(node, attributes.get(b"num_outputs"))
+
+    def _split(self, node: dict[str, Any], announced: int | None) -> None:
+        """Require that a Split says how many outputs it has, which onnxruntime does not check."""
+        outputs, has_lengths = len(node["output"]), node["input"][1:] not in ([], [b""])
+        # Before opset 18 the attribute does not exist, and onnxruntime counts the outputs.
+        if (announced is not None and announced != outputs) or (
+            announced is None and not has_lengths and self._opset_version >= 18
+        ):
+            raise WireError(f"Split with {outputs} outputs and num_outputs={announced}")
 
     def _values_of(self, node: dict[str, Any], operator: str) -> None:
         """Require a name for each value that is not optional, and one source of each value.

@@ -99,6 +99,9 @@ def test_optional_inputs_may_be_empty_and_outputs_announced():
     bounded = [node_with("Clip", ["y", "", "high"], ["c"]), node("Tanh", "c", "a")]
     accepted(squashed(bounded, [tensor("high", np.float32(1))]))
     accepted(split(2, num_outputs=2))
+    accepted(changed(split(2), lambda m: setattr(m.opset_import[0], "version", 17)))
+    lengths = [node_with("Split", ["y", "s"], ["a", "b"], axis=1)]
+    accepted(squashed(lengths, [tensor("s", np.int64([1, 1]))], opsets=[("", 18)]))
 
 
 @pytest.fixture(scope="module")
@@ -305,6 +308,7 @@ BAD = {
                   "onnx_malformed"),
     "fewer outputs announced than there are": (split(3, num_outputs=2), "onnx_malformed"),
     "more outputs announced than there are": (split(3, num_outputs=4), "onnx_malformed"),
+    "outputs that nothing announces": (split(3), "onnx_malformed"),
     "an attribute given twice": (twice_attributed(), "onnx_malformed"),
     "a value computed twice": (squashed([node("Tanh", "y", "a"), node("Tanh", "y", "a")]),
                                "onnx_malformed"),
