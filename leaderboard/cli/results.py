@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -283,9 +283,15 @@ def find_entry(store: Store, id: str) -> EntryRow:
 def verify(
     board: BoardFolder = Path("board"),
     rescore: Annotated[
-        int, typer.Option(min=0, help="Number of random submissions to score again.")
-    ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of that random choice.")] = 0,
+        str,
+        typer.Option(metavar="N|all", help="Number of random submissions to score again, or all."),
+    ] = "0",
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Seed of that choice, to repeat one; default the system's randomness."
+        ),
+    ] = None,
     contains: Annotated[
         str | None,
         typer.Option(metavar="DIGEST", help="Digest that an earlier `verify` printed."),
@@ -294,8 +300,11 @@ def verify(
 ) -> None:
     """Check every signature, hash, log entry and score, and name the first altered row.
 
-    The exit code is 3 if a row was altered. Entries cut off the end of the log leave no trace in
-    it: keep the printed digest and pass it to --contains next time.
+    The exit code is 3 if a row was altered. --rescore draws from all results and prints its seed.
+    Differences that prove nothing, such as other versions, are listed as notes.
+
+    Entries cut off the end of the log leave no trace in it: keep the printed digest and pass it to
+    --contains next time.
 
     Examples:
 
@@ -309,12 +318,31 @@ def verify(
 
     with Progress("verifying", 1, console=err(), unit="rows", enabled=not json) as progress:
         report = verify_board(
-            board, rescore=rescore, seed=seed, contains=contains, progress=progress.update_of
+            board,
+            rescore=_rescore_count(rescore),
+            seed=seed,
+            contains=contains,
+            progress=progress.update_of,
         )
     pairs = asdict(report)
     if json:
         print_json(pairs)
         return
     last, digest = pairs.pop("log_sequence"), pairs.pop("log_digest")
+    notes = pairs.pop("notes")
+    if not report.rescored:
+        del pairs["rescore_seed"], pairs["tolerance"]
     print_pairs("[green]Verified[/]: no row was altered.", pairs)
+    for note in notes:
+        line = f"note: {note['submission']}: {note['kind']}: {note['where']}: "
+        line += f"recorded {note['recorded'] or 'nothing'}, here {note['here']}"
+        out().print(escape(_printable(line)), soft_wrap=True)
     out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)
+
+
+def _rescore_count(text: str) -> int | Literal["all"]:
+    if text == "all":
+        return "all"
+    if not text.isdecimal():
+        raise OptionError(f"rescore={text!r}: must be 'all' or a number of at least 0.")
+    return int(text)

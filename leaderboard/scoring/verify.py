@@ -13,19 +13,20 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import random
 import re
+import secrets
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 from leaderboard.documents.board import BoardDocument, Folder, hex_of
-from leaderboard.documents.result import Result
+from leaderboard.documents.result import Result, RunScore
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
-from leaderboard.scoring.score import Progress, agent_names, evaluation_seed, score_submission
+from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw, rescore
+from leaderboard.scoring.score import Progress, agent_names, evaluation_seed
 from leaderboard.store import (
     Index,
     IndexUnusable,
@@ -41,10 +42,6 @@ from sme_registry.io import TEMPORARY, integer_in
 
 EXACT = 1e-9
 """Tolerance for numbers recomputed from the same runs: another machine may sum in another order."""
-
-RESCORED = 1e-5
-"""Tolerance for new scores of the same policy: another machine or version of onnxruntime changes
-its float32 actions by about 1e-7, and similar actions are divided by a regret as small as 0.1."""
 
 
 # An index that is larger than its log can explain is not copied into memory.
@@ -64,6 +61,9 @@ class VerifyReport:
         the board does not show them.
       rows: number of index rows, equal to those of a rebuilt index; 0 if there is no index.
       rescored: number of submissions scored again.
+      rescore_seed: of their draw, which repeats it; None if none was scored again.
+      tolerance: of their new numbers, where no note states a larger one.
+      notes: differences that prove no tampering.
     """
 
     entries: int
@@ -75,14 +75,17 @@ class VerifyReport:
     objects: int
     unlogged: int
     rows: int
-    rescored: int
+    rescored: int = 0
+    rescore_seed: int | None = None
+    tolerance: float = RESCORED
+    notes: tuple[RescoreNote, ...] = ()
 
 
 def verify(
     path: str | Path,
     *,
-    rescore: int = 0,
-    seed: int = 0,
+    rescore: int | Literal["all"] = 0,
+    seed: int | None = None,
     contains: str | None = None,
     progress: Progress | None = None,
 ) -> VerifyReport:
@@ -90,8 +93,8 @@ def verify(
 
     Args:
       path: the board's folder.
-      rescore: number of scored submissions, drawn at random, to score again.
-      seed: of that draw.
+      rescore: number of results, drawn at random, whose submissions to score again; or "all".
+      seed: of that draw, to repeat one; None for the system's randomness, which nobody predicts.
       contains: digest of an entry that the log once had; None to skip this check.
       progress: called with the rows done and the rows in all.
 
@@ -101,9 +104,12 @@ def verify(
     Raises:
       TamperedError: names the first altered row, such as `results/….json`.
       BoardError: the folder holds no board.
-      OptionError: `rescore` is negative, or `contains` is not a digest.
+      ScoringFault: this machine cannot score a submission again.
+      OptionError: `rescore` or `seed` is negative, or `contains` is not a digest.
     """
-    integer_in("rescore", rescore, 0, advice="Leave it out for none.")
+    if rescore != "all":
+        integer_in("rescore", rescore, 0, advice="Leave it out for none.")
+    seed = secrets.randbits(53) if seed is None else integer_in("seed", seed, 0)
     digest = None if contains is None else _entry_digest(contains)
     folder = Folder(path)
     folder.read()
@@ -122,7 +128,8 @@ def verify(
             verifier.check_signatures()
             objects = verifier.check_objects()
             results = verifier.check_numbers(store)
-            rescored = verifier.rescore(store, rescore, seed)
+            drawn = draw(verifier.scored_ids(), rescore, seed)
+            notes = [note for id in drawn for note in verifier.rescore(store, id)]
         entries, head = index.entries(), index.head
     return VerifyReport(
         entries=head.sequence + 1,
@@ -134,7 +141,9 @@ def verify(
         objects=objects,
         unlogged=unlogged,
         rows=rows,
-        rescored=rescored,
+        rescored=len(drawn),
+        rescore_seed=seed if drawn else None,
+        notes=tuple(notes),
     )
 
 
@@ -151,7 +160,9 @@ def _entry_digest(text: str) -> str:
 class _Verifier:
     """The checks of one board; `follow_log` fills its empty index from the log."""
 
-    def __init__(self, index: Index, rescore: int, progress: Progress | None) -> None:
+    def __init__(
+        self, index: Index, rescore: int | Literal["all"], progress: Progress | None
+    ) -> None:
         self.index = index
         self.folder, self.document = index.folder, index.document
         self.log = Log(self.folder, self.document.key)
@@ -159,8 +170,9 @@ class _Verifier:
         self.digests: set[str] = set()
         self._progress = progress
         self._done = 0
-        self._total = rescore + sum(1 for _ in self.objects.paths())
-        self._total += len(_names(self.folder.log)) + len(_names(self.folder.results))
+        results = len(_names(self.folder.results))
+        self._total = sum(1 for _ in self.objects.paths()) + len(_names(self.folder.log)) + results
+        self._total += results if rescore == "all" else min(rescore, results)
 
     def count_row(self) -> None:
         """Report one more row as done; the total is an estimate."""
@@ -306,12 +318,17 @@ class _Verifier:
                 self._refuse(self.folder.object(digest), "is missing")
         return count
 
+    def scored_ids(self) -> list[str]:
+        """The submissions with a result, rejections too, in the order of submission."""
+        rows = self.index.connection.execute(
+            "SELECT id FROM entry WHERE result IS NOT NULL ORDER BY sequence"
+        )
+        return [id for (id,) in rows]
+
     def check_numbers(self, store: Store) -> int:
         """Check that the scores of each result follow from its runs; returns their number."""
-        ids = self.index.connection.execute(
-            "SELECT id FROM entry WHERE result IS NOT NULL ORDER BY sequence"
-        ).fetchall()
-        for (id,) in ids:
+        ids = self.scored_ids()
+        for id in ids:
             result = store.result(id)
             assert result is not None
             if result.status == "scored":
@@ -320,14 +337,11 @@ class _Verifier:
             self.count_row()
         return len(ids)
 
-    def rescore(self, store: Store, count: int, seed: int) -> int:
-        """Score random submissions again and compare; returns their number."""
-        scored = [entry.id for entry in self.index.entries() if entry.status == "scored"]
-        drawn = random.Random(seed).sample(scored, min(count, len(scored)))
-        for id in drawn:
-            _rescore(store, id)
-            self.count_row()
-        return len(drawn)
+    def rescore(self, store: Store, id: str) -> list[RescoreNote]:
+        """Score a submission again and compare."""
+        notes = rescore(store, id)
+        self.count_row()
+        return notes
 
     def _refuse(self, path: Path, message: str) -> NoReturn:
         raise TamperedError(path.relative_to(self.folder.path).as_posix(), message)
@@ -355,6 +369,7 @@ def _check_runs(store: Store, result: Result) -> None:
     """Check that the scores are of the submitted runs on their own states; failed runs score 1."""
     document, instances = store.document, store.document.instances
     submission = store.submission(result.submission).submission
+    regions = len(document.protocol.edges)
     listed = result.runs[: len(submission.runs)]
     for number, (run, score) in enumerate(itertools.zip_longest(submission.runs, listed)):
         if score is None:
@@ -368,8 +383,15 @@ def _check_runs(store: Store, result: Result) -> None:
             matches = (score.spec, score.class_name, score.artefact, score.evaluation_seed) == (
                 *(run.spec, class_name, digest, seed),
             ) and [agent.name for agent in score.agents] == agent_names(spec)
+            matches = matches and all(len(each) == regions for each in _by_region(score))
         if not matches:
             _refuse_result(result.submission, f"runs.{number}: does not match the submitted run")
+
+
+def _by_region(run: RunScore) -> list[tuple[float, ...]]:
+    """The lists of numbers of a run with a policy that have one for each region."""
+    agents = [agent.normalised_regret for agent in run.agents]
+    return [run.normalised_regret, run.similarity or (), *agents]
 
 
 def _check_scores(store: Store, result: Result) -> None:
@@ -398,21 +420,6 @@ def _check_scores(store: Store, result: Result) -> None:
     )
     if not _close(expected.to_dict(), result.to_dict(), EXACT):
         _refuse_result(result.submission, "its runs or scores do not follow from its submission")
-
-
-def _rescore(store: Store, id: str) -> None:
-    """Score a submission's policies again, through gate, sandbox and evaluation."""
-    stored = store.result(id)
-    assert stored is not None
-    again = score_submission(store.document, store.submission(id).submission, store.objects.read)
-    if again.status != stored.status:
-        _refuse_result(id, f"scored again, it is rejected: {again.code}: {again.message}")
-    for number, (new, old) in enumerate(zip(again.runs, stored.runs, strict=True)):
-        for name in ("normalised_regret", "similarity", "agents"):
-            if not _close(new.to_dict()[name], old.to_dict()[name], RESCORED):
-                _refuse_result(
-                    id, f"runs.{number}.{name}: scored again, it differs by more than {RESCORED}"
-                )
 
 
 def _close(one: Any, other: Any, tolerance: float) -> bool:
