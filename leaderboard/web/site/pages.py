@@ -4,7 +4,7 @@
     submissions/<64 hex>.html, .json    every submission; results/<64 hex>.json
     compare.html, board-data.js         comparison of chosen entries, drawn by static/board.js
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
-    method.html                         the formulas
+    method.html, suite.html             the formulas; the tasks
     suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
@@ -229,6 +229,16 @@ class Pages:
         regions = charts.region_labels(self.document.protocol.edges)
         return self._render("method.html", here="method.html", title="Method", regions=regions)
 
+    def suite(self) -> str:
+        """The page of the tasks."""
+        return self._render(
+            "suite.html",
+            here="suite.html",
+            title="Suite",
+            classes=rows.task_rows(self.document),
+            seeds=self._overview["seeds"],
+        )
+
     def data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
 
@@ -292,6 +302,7 @@ class Pages:
             "board-data.js": self.data_js,
             "log.html": self.log,
             "method.html": self.method,
+            "suite.html": self.suite,
             "compare.html": self.compare,
             **{
                 f"{tab.stem}.{kind}": partial(self._export, tab.key, kind)

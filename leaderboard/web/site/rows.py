@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.checks import skeleton
 from leaderboard.documents.result import Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
 from leaderboard.scoring.ranking import REFERENCES
 from leaderboard.store import EntryRow
+from sme_registry import SMESpec
 from sme_registry.statistics import iqm
 
+_INSTANCES = 100  # of a class, on the page of the suite
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
 
 
@@ -43,6 +47,38 @@ MARKS = {
     "not_learned": "not learned",
 }
 """Short names of the reasons in `ranking.REASONS`."""
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """A class of the suite, as the page of the suite shows it."""
+
+    name: str
+    setting: str  # the fields that differ from a spec's defaults
+    runs: int  # that a rank needs
+    instances: list[tuple[int | str, str]]  # seed and digest of the first ones
+    more: int  # instances that are not listed
+
+
+def task_rows(document: BoardDocument) -> list[TaskRow]:
+    """The classes of a board's suite."""
+    defaults = SMESpec().to_dict()
+    rows = []
+    for member in document.suite.classes:
+        fields = member.setting.to_dict().items()
+        changed = [f"{k}={json.dumps(v)}" for k, v in fields if v != defaults.get(k)]
+        count, listed = len(member.seeds), member.instances[:_INSTANCES]
+        rows.append(
+            TaskRow(
+                name=member.name,
+                setting=", ".join(changed) or "the defaults",
+                runs=count * document.runs_on_each(count),
+                instances=[(spec.seed, spec.digest) for spec in listed],
+                more=count - len(listed),
+            )
+        )
+    return rows
+
 
 RunRow = tuple[str, Run | None, RunScore | None]
 """Class name, the run as submitted, and as scored."""

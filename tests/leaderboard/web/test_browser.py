@@ -104,6 +104,7 @@ def all_pages(ids):
         "ood_regret.html",
         "ood_decay.html",
         "method.html",
+        "suite.html",
         "log.html",
         "compare.html",
     )

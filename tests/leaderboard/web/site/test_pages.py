@@ -93,7 +93,7 @@ def pages(site):
     found = {
         path.relative_to(site).as_posix(): Page(path.read_text()) for path in site.rglob("*.html")
     }
-    assert len(found) == 19
+    assert len(found) == 20
     return found
 
 
@@ -243,6 +243,16 @@ def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
     assert rank == "–"
     assert ">not learned</span>" in row
     assert rows["SAC"][0] == "2–4"
+
+
+def test_the_page_of_the_suite_has_every_instance_and_what_a_rank_needs(board, pages):
+    document = board[0].document
+    words = pages["suite.html"].words
+    for digest, (member, spec) in document.instances.items():
+        assert f"{spec.seed} {hex_of(digest)[:12]}" in words
+        assert member in words
+    assert "state_dim=2" in words
+    assert f"--seeds {document.runs_to_rank} " in words
 
 
 def test_the_decay_page_ranks_by_the_floored_value_and_shows_the_entrys_own(tmp_path):
