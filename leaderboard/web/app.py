@@ -17,7 +17,6 @@ server keeps no sessions and sets no cookies; every request that changes the boa
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import os
 import re
@@ -25,6 +24,7 @@ import tempfile
 from collections.abc import AsyncIterator, Callable
 from typing import IO, Any, NamedTuple, get_args
 
+import anyio
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
@@ -51,6 +51,8 @@ METRICS: tuple[Metric, ...] = get_args(Metric)
 PAGES_KEPT = 256
 _Render = Callable[[Pages, str], bytes]
 _CHUNK = 2**18  # bytes
+_BYTES_KEPT = 2**26
+_HEALTH_SECONDS = 5.0
 _LOG_ENTRIES = 100
 _DOCUMENTS = 64  # signed documents to verify at the same time
 _ADMISSIONS = 16  # keys with a submission to check at the same time
@@ -154,20 +156,20 @@ class _Routes:
         self._downloads = Downloads(store)
 
     async def health(self) -> Response:
-        return JSONResponse(
-            {
-                "status": "ok",
-                "scoring": await to_thread.run_sync(self._scoring, limiter=self._health),
-            }
-        )
+        scoring = "fault"  # also if the board cannot be read in time
+        with anyio.move_on_after(_HEALTH_SECONDS):
+            scoring = await to_thread.run_sync(
+                self._scoring, limiter=self._health, abandon_on_cancel=True
+            )
+        return JSONResponse({"status": "ok", "scoring": scoring})
 
     def _scoring(self) -> str:
         """Whether scoring works: "ok", "waiting" for its turn, or "fault"."""
+        queue = self._store.queue
         try:
-            waiting = [entry for entry in self._store.entries() if entry.status == "waiting"]
+            return "fault" if queue.faults() else "waiting" if queue.waiting() else "ok"
         except SMEError:
             return "fault"
-        return "fault" if any(entry.faults for entry in waiting) else "waiting" if waiting else "ok"
 
     async def put_object(self, request: Request, digits: str) -> Response:
         digest = _digest(digits)
@@ -209,16 +211,8 @@ class _Routes:
         url = f"/api/submissions/{hex_of(id)}"
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 
-    async def get_submission(self, digits: str) -> Response:
-        id = _digest(digits)
-
-        def view() -> dict[str, Any]:
-            entry = self._store.entry(id)
-            if entry is None:
-                raise unknown_submission(id)
-            return public_view(self._store, entry).to_dict()
-
-        return JSONResponse(await to_thread.run_sync(view))
+    async def get_submission(self, request: Request, digits: str) -> Response:
+        return await self._cached(request, _view, _digest(digits), "application/json")
 
     async def post_withdrawal(self, request: Request) -> Response:
         text = await limits.read_document(request, "withdrawal")
@@ -243,14 +237,7 @@ class _Routes:
         text = request.query_params.get("start", "0")
         if not re.fullmatch(r"\d{1,8}", text, re.ASCII):
             raise RequestError("bad_request", f"start={text!r:.80}: must be in [0, 99999999].")
-        start = int(text)
-        entries = await to_thread.run_sync(self._store.log, start, _LOG_ENTRIES)
-        return JSONResponse(
-            {
-                "entries": [entry.to_dict() for entry in entries],
-                "next": start + len(entries) if len(entries) == _LOG_ENTRIES else None,
-            }
-        )
+        return await self._cached(request, _log_part, text, "application/json")
 
     async def get_page(self, request: Request, name: str) -> Response:
         name = name or "index"
@@ -281,10 +268,11 @@ class _CachedFile(NamedTuple):
 
 
 class _PageCache:
-    """Rendered files, at most `kept`, discarded when the log grows or a scoring fails.
+    """Rendered files, discarded when the log grows or a scoring fails.
 
-    One thread uses it at a time: rendering is bound by Python, and clients that ask at once for a
-    page that is not cached wait for one rendering of it.
+    At most `kept` files of together 64 MiB are kept, those that were used last. One thread uses it
+    at a time: rendering is bound by Python, and clients that ask at once for a page that is not
+    cached wait for one rendering of it.
     """
 
     def __init__(self, store: Store, kept: int, url: str) -> None:
@@ -293,14 +281,23 @@ class _PageCache:
         # A copy without its key accepts no submissions.
         self._address = url if store.folder.key.is_file() else None
         self._head: tuple[Head, int] | None = None
+        self._files: dict[tuple[_Render, str], _CachedFile] = {}  # in the order of their last use
 
     def get(self, render: _Render, name: str) -> _CachedFile:
         """The file of this name, rendered if it is not cached."""
         head = self._store.head, self._store.queue.faults()
         if head != self._head:
-            rendered = functools.partial(_rendered, Pages(self._store, self._address))
-            self._head, self._file = head, functools.lru_cache(self._kept)(rendered)
-        return self._file(render, name)
+            self._head, self._pages = head, Pages(self._store, self._address)
+            self._files.clear()
+        file = self._files.pop((render, name), None) or _rendered(self._pages, render, name)
+        self._files[render, name] = file
+        while len(self._files) > self._kept or self._bytes > _BYTES_KEPT:
+            del self._files[next(iter(self._files))]
+        return file
+
+    @property
+    def _bytes(self) -> int:
+        return sum(len(file.content) for file in self._files.values())
 
 
 def _rendered(pages: Pages, render: _Render, name: str) -> _CachedFile:
@@ -311,6 +308,29 @@ def _rendered(pages: Pages, render: _Render, name: str) -> _CachedFile:
 def _ranking(pages: Pages, metric: Any) -> bytes:
     rows = ranking.ranking(pages.entries, metric)
     return exports.to_json(rows, metric, pages.document, pages.store.head[:2]).encode()
+
+
+def _view(pages: Pages, id: str) -> bytes:
+    entry = pages.store.entry(id)
+    if entry is None:
+        raise unknown_submission(id)
+    return _json(public_view(pages.store, entry).to_dict())
+
+
+def _log_part(pages: Pages, start: str) -> bytes:
+    first = int(start)
+    entries = pages.store.log(first, _LOG_ENTRIES)
+    more = len(entries) == _LOG_ENTRIES
+    return _json(
+        {
+            "entries": [entry.to_dict() for entry in entries],
+            "next": first + len(entries) if more else None,
+        }
+    )
+
+
+def _json(content: Any) -> bytes:
+    return bytes(JSONResponse(content).body)
 
 
 def _page(pages: Pages, name: str) -> bytes:

@@ -4,6 +4,7 @@ import contextlib
 import datetime
 import hashlib
 import json
+import os
 import re
 import signal
 import socket
@@ -535,7 +536,7 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
         policy = b"PPO 1.0 plane1 0"  # whose digest the submission names
         store.put_object(sha256(policy), [policy], by=key.public)
         assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
-        store.withdraw(signed_withdrawal(scored, key))
+        store.withdraw(signed_withdrawal(store, scored, key))
         assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
 
 
@@ -990,6 +991,25 @@ def test_serve_runs_scorers_and_stops_cleanly(
         while [child for child in children if _is_alive(child)] and time.monotonic() < deadline:
             time.sleep(0.05)
         assert not [child for child in children if _is_alive(child)]
+
+
+def test_serving_outlives_its_scorers(tmp_path: Path) -> None:
+    with tiny_board(tmp_path / "board") as store:
+        intake.submit_references(store)
+        with serving_process(store.folder.path, workers=1) as (url, process):
+            killed, deadline = 0, time.monotonic() + 60
+            while store.queue.waiting() and time.monotonic() < deadline:
+                if killed < 3 and store.queue.claimed():
+                    for child in _children(process.pid):
+                        with contextlib.suppress(ProcessLookupError):
+                            os.kill(child, signal.SIGKILL)
+                    killed += 1
+                health = HTTP.get(f"{url}/healthz")
+                assert health.status_code == 200
+                assert health.json()["scoring"] in ("waiting", "fault", "ok")
+            assert killed == 3
+            assert HTTP.get(f"{url}/healthz").json()["scoring"] == "ok"
+            assert HTTP.get(url).status_code == 200
 
 
 def _children(pid: int) -> list[int]:
