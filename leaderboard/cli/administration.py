@@ -17,6 +17,7 @@ from leaderboard.cli.options import (
     SuiteName,
     complete_protocol,
     find_suite,
+    open_board,
 )
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json, templates
@@ -166,11 +167,10 @@ def site(
 
       sme-leaderboard site board --out public
     """
-    from leaderboard.store import Store
     from leaderboard.web.site import write_site
 
     target = board / "site" if out_folder is None else out_folder
-    with Store.open(board, read_only=True) as store:
+    with open_board(board) as store:
         total = len(store.entries())
         with Progress("writing", total, console=err(), unit="pages") as progress:
             index = write_site(store, target, progress=progress.update_of)

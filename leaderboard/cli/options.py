@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,10 @@ from leaderboard.documents.board import FILE, BoardDocument, Folder
 from sme_registry.errors import OptionError
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
+if TYPE_CHECKING:
+    from leaderboard.store import Store
+
+_LONG_LOG = 2000  # entries, read in two seconds or so
 _HOST = re.compile(r"[A-Za-z0-9.-]+:\d+(/.*)?|localhost(/.*)?|[A-Za-z0-9-]+(\.[A-Za-z0-9-]+)+/.*")
 
 
@@ -50,6 +54,23 @@ def board_folder(board: str | Path) -> Path:
         f"{name!r}: no such folder. Correct it, or create a board with "
         f"`sme-leaderboard init {name}`."
     )
+
+
+def open_board(board: Path) -> Store:
+    """Open a board read-only; a bar shows the progress if its log is long.
+
+    Raises:
+      BoardError, TamperedError: as `Store.open`.
+    """
+    from leaderboard.store import Store
+    from sme_registry.terminal import Progress, err
+
+    log = Folder(board).log
+    entries = sum(1 for _ in os.scandir(log)) if log.is_dir() else 0
+    with Progress(
+        "reading", entries, console=err(), unit="log entries", enabled=entries > _LONG_LOG
+    ) as progress:
+        return Store.open(board, read_only=True, progress=progress.update)
 
 
 def new_board_folder(board: str | Path) -> Path:

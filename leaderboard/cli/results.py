@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.markup import escape
 
-from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url
+from leaderboard.cli.options import BoardFolder, BoardOrUrl, Json, is_url, open_board
 from leaderboard.documents.result import Metric
 from leaderboard.errors import BoardError
 from sme_registry.errors import OptionError
@@ -61,11 +61,10 @@ def rank(
     """
     from leaderboard import exports
     from leaderboard.scoring import ranking
-    from leaderboard.store import Store
 
     if json + csv + latex > 1:
         raise OptionError("--json, --csv, --latex: give at most one of them.")
-    with Store.open(board, read_only=True) as store:
+    with open_board(Path(board)) as store:
         entries = store.entries()
         ranking.refuse_unpublishable(entries)
         rows = ranking.ranking(entries, metric)
@@ -188,12 +187,11 @@ def show(
 def _public_view(board: str, id: str) -> PublicView:
     """What a board's folder or a served board publishes about a submission."""
     from leaderboard.public_view import PublicView, public_view
-    from leaderboard.store import Store
     from leaderboard.web import client
 
     if is_url(board):
         return PublicView.from_dict(client.status(board, id))
-    with Store.open(board, read_only=True) as store:
+    with open_board(Path(board)) as store:
         return public_view(store, find_entry(store, id))
 
 

@@ -18,6 +18,7 @@ import rfc8785
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifies
+from leaderboard.documents.plain import PlainDocument
 from leaderboard.errors import Rejection
 from sme_registry.errors import MalformedDocumentError, SpecError
 from sme_registry.io import parse_json, to_json
@@ -137,7 +138,7 @@ class Training(StrictModel):
     hardware: Annotated[str, Field(max_length=200)] = ""
 
 
-class Submission(Document):
+class Submission(PlainDocument):
     """The signed content.
 
     Attributes:

@@ -12,7 +12,7 @@ import datetime
 import os
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Self
 
@@ -47,6 +47,7 @@ class Database:
         self._log = Log(self.folder, self.document.key)
         self._thread_lock = threading.RLock()
         self._in_transaction = False
+        self._progress: Callable[[int], None] | None = None
         self._key: SigningKey | None = None
         self._index: Index | None = None
         self._inode = (0, 0)
@@ -54,16 +55,18 @@ class Database:
             raise TamperedError("log/00000000.json", "is missing; every log starts with it")
         self._lock = FolderLock(self.folder.log)
 
-    def connect(self, *, reindex: bool) -> None:
+    def connect(self, *, reindex: bool, progress: Callable[[int], None] | None = None) -> None:
         """Connect to the index and bring it up to date; rebuild it if it is unusable.
 
         Args:
           reindex: rebuild the index and ignore what the old one recorded of the log.
+          progress: called with the number of each log entry that is read.
 
         Raises:
           BoardError: the index cannot be written.
           TamperedError: log, documents and index disagree; names the first altered row.
         """
+        self._progress = progress
         if not self.read_only and not os.access(self.folder.path, os.W_OK):
             raise BoardError(
                 f"{self.folder.path}: is not writable. Get write permission, or open the board "
@@ -80,6 +83,7 @@ class Database:
             with self.locked():
                 self._connect(rebuild=True)
             self._refresh()
+        self._progress = None
 
     def close(self) -> None:
         """Close the index and the lock; closing twice does nothing."""
@@ -207,7 +211,9 @@ class Database:
         """Apply what other processes have logged; two file-system calls show whether they have."""
         index = self._connected
         if self.read_only:
-            self._catch_up(index)
+            if self._log.has(index.head.sequence + 1):
+                with index.transaction():
+                    self._catch_up(index)
         elif self._replaced() or self._log.has(index.head.sequence + 1):
             with self.transaction():
                 pass
@@ -218,6 +224,8 @@ class Database:
             entry = self._log.read_after(head)
             index.apply(entry)
             head = entry.head
+            if self._progress is not None:
+                self._progress(head.sequence)
 
     def _connect(self, *, rebuild: bool = False) -> None:
         """Connect to the index, rebuilt if necessary, while the board is locked.

@@ -187,6 +187,7 @@ class Index:
         self.connection = connection
         self.folder = folder
         self.document = document
+        self._board = document.digest
 
     @classmethod
     def open(
@@ -228,8 +229,11 @@ class Index:
         return cls(connection, folder, document)
 
     @classmethod
-    def empty(cls, folder: Folder, document: BoardDocument, path: str | Path = ":memory:") -> Index:
-        """Create an empty index in memory or in a new file; `apply` fills it."""
+    def empty(cls, folder: Folder, document: BoardDocument, path: str | Path = "") -> Index:
+        """Create an empty index in a new file, or in memory; `apply` fills it.
+
+        A large one in memory moves to a temporary file, which no other process sees.
+        """
         connection = _connect(str(path))
         connection.executescript(f"PRAGMA user_version = {VERSION}; BEGIN; {SCHEMA} COMMIT;")
         return cls(connection, folder, document)
@@ -275,7 +279,7 @@ class Index:
                 self._withdrawn(entry)
         self.connection.execute(
             "REPLACE INTO head VALUES (0, ?, ?, ?, ?)",
-            (self.document.digest, entry.sequence, entry.digest, entry.time),
+            (self._board, entry.sequence, entry.digest, entry.time),
         )
 
     def _received(self, entry: LogEntry) -> None:

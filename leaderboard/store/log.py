@@ -14,15 +14,15 @@ import functools
 import hashlib
 from typing import Annotated, Any, Literal, NamedTuple
 
-import rfc8785
 from pydantic import Field, field_validator
 
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import Signature, SigningKey, verifies
+from leaderboard.documents.plain import PlainDocument, plain_json
 from leaderboard.documents.submission import UtcTime, now
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
-from sme_registry.spec import Digest, Document, Integer, SchemaVersion
+from sme_registry.spec import Digest, Integer, SchemaVersion
 
 Event = Literal["opened", "received", "result", "withdrawn"]
 NOTHING = "sha256:" + "0" * 64
@@ -45,7 +45,7 @@ class Head(NamedTuple):
 EMPTY = Head(-1, NOTHING, "")
 
 
-class LogEntry(Document):
+class LogEntry(PlainDocument):
     """One event.
 
     Attributes:
@@ -171,4 +171,4 @@ class Log:
 
 
 def _digest(fields: dict[str, Any]) -> str:
-    return "sha256:" + hashlib.sha256(rfc8785.dumps(fields)).hexdigest()
+    return "sha256:" + hashlib.sha256(plain_json(fields)).hexdigest()

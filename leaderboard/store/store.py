@@ -89,7 +89,14 @@ class Store(Database):
         return cls.open(path)
 
     @classmethod
-    def open(cls, path: str | Path, *, read_only: bool = False, reindex: bool = False) -> Store:
+    def open(
+        cls,
+        path: str | Path,
+        *,
+        read_only: bool = False,
+        reindex: bool = False,
+        progress: Callable[[int], None] | None = None,
+    ) -> Store:
         """Open a board and bring its index up to date; an unusable index is rebuilt.
 
         Args:
@@ -97,6 +104,7 @@ class Store(Database):
           read_only: write nothing, and read nothing but log and documents: the index, which is
             then held in memory, is built from them. For copies of boards, whose index may lie.
           reindex: rebuild the index and ignore what the old one recorded of the log.
+          progress: called with the number of each log entry that is read.
 
         Raises:
           BoardError: the folder holds no board, or the index cannot be written.
@@ -104,7 +112,7 @@ class Store(Database):
         """
         store = cls(path, read_only=read_only)
         try:
-            store.connect(reindex=reindex)
+            store.connect(reindex=reindex, progress=progress)
             if not read_only:
                 store._remove_unlogged_results()
         except BaseException:
