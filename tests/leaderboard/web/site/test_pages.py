@@ -7,6 +7,7 @@ import shutil
 import time
 from collections import Counter
 from html.parser import HTMLParser
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -21,6 +22,7 @@ from leaderboard.web.site import pages as site_pages
 from sme_registry.errors import OptionError
 from tests.leaderboard.web.site import boards
 
+EXAMPLE = Path(__file__).resolve().parents[4] / "examples" / "board"  # of rules 1
 VOID = {"meta", "link", "input", "br", "img"}
 ELEMENTS = """
 html head meta title link script body a header footer main nav div section p span strong em small
@@ -243,6 +245,21 @@ def test_an_entry_that_has_not_learned_has_no_rank_by_ood_decay(site):
     assert rank == "–"
     assert ">not learned</span>" in row
     assert rows["SAC"][0] == "2–4"
+
+
+def test_a_board_says_how_to_submit_and_its_limits_unless_it_accepts_nothing(pages):
+    words = pages["index.html"].words.split("How to submit")[1]
+    for text in (
+        "sme train --suite",
+        "sme-leaderboard new",
+        "20 submissions and 1,024 MiB",
+        "8 MiB",
+    ):
+        assert text in words
+    with Store.open(EXAMPLE, read_only=True) as store:
+        words = Page(Pages(store).board("wd_regret")).words.split("How to submit")[1]
+    assert "accepts no submissions" in words
+    assert "sme-leaderboard new" not in words
 
 
 def test_the_page_of_the_suite_has_every_instance_and_what_a_rank_needs(board, pages):
