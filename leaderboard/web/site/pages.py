@@ -184,7 +184,7 @@ class Pages:
             codes=CODES,
             chart=chart,
             classes=classes,
-            agents=[] if result is None else rows.agent_rows(result),
+            agents=[] if result is None else rows.agent_rows(self.document, submission, result),
             regions=charts.region_labels(edges),
             runs=rows.run_rows(submission, result, self._class_of),
         )

@@ -11,10 +11,10 @@ from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.checks import skeleton
 from leaderboard.documents.result import Metric, Result, RunScore
 from leaderboard.documents.submission import Run, Submission
+from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed
 from leaderboard.scoring.ranking import REFERENCES
 from leaderboard.store import EntryRow
 from sme_registry import SMESpec
-from sme_registry.statistics import iqm
 
 _INSTANCES = 100  # of a class, on the page of the suite
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
@@ -115,7 +115,7 @@ def run_rows(
 
 @dataclass(frozen=True)
 class AgentRow:
-    """One agent of a class of teams: interquartile means over the runs of the class."""
+    """One agent of a class of teams, over the runs of the class as for its score."""
 
     class_name: str
     agent: str
@@ -124,22 +124,22 @@ class AgentRow:
     normalised_regret: tuple[float, ...]  # of each region, WD first
 
 
-def agent_rows(result: Result) -> list[AgentRow]:
+def agent_rows(board: BoardDocument, submission: Submission, result: Result) -> list[AgentRow]:
     """The agents of each class of teams; a run without a policy counts as 1 for each of them."""
+    listed = result.runs[: len(submission.runs)]
+    if not any(run.agents for run in listed):
+        return []
     rows = []
-    for name, runs in itertools.groupby(
-        sorted(result.runs, key=lambda run: run.class_name), key=lambda run: run.class_name
-    ):
-        members = list(runs)
-        agents = next((run.agents for run in members if run.agents), ())
+    for name, members in groups_of(board, [*listed, *never_listed(board, submission)]).items():
+        agents = next((run.agents for run in listed if run.agents and run.class_name == name), ())
         for index, agent in enumerate(agents):
-            regrets = [
-                run.agents[index].normalised_regret if run.agents else run.normalised_regret
-                for run in members
-            ]
-            ood = [sum(regret[1:]) / len(regret[1:]) for regret in regrets]
-            means = tuple(iqm(regrets).tolist())
-            rows.append(AgentRow(name, agent.name, means[0], float(iqm(ood)), means))
+
+            def regrets(run: RunScore, index: int = index) -> list[float]:
+                own = run.agents[index].normalised_regret if run.agents else run.normalised_regret
+                return [*own, sum(own[1:]) / len(own[1:])]
+
+            *means, ood = class_mean(members, regrets).tolist()
+            rows.append(AgentRow(name, agent.name, means[0], ood, tuple(means)))
     return rows
 
 

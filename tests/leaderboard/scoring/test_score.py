@@ -16,13 +16,14 @@ from onnx import ModelProto, numpy_helper
 
 from leaderboard.artefact.isolation import available_isolation
 from leaderboard.artefact.reference import constant_onnx, optimal_onnx
-from leaderboard.artefact.sandbox import MAX_ROUNDING
+from leaderboard.artefact.sandbox import MAX_ROUNDING, Observations
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import METRICS, Result
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import BoardError
-from leaderboard.scoring.score import evaluation_seed, score_submission
+from leaderboard.scoring import score as score_module
+from leaderboard.scoring.score import ROUNDING_STATES, evaluation_seed, score_submission
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
 from sme_registry.spec import Suite
 from tests.leaderboard.artefact import models
@@ -67,6 +68,7 @@ def score(
     progress: Callable[[int, int], None] | None = None,
     specs: list[str] | None = None,
     opened: list[str] | None = None,
+    board: BoardDocument = BOARD,
     **fields: Any,
 ) -> Result:
     """Score these policies on the suite's instances in order, again from the first one on."""
@@ -105,7 +107,7 @@ def score(
             opened.append(digest)
         return data[digest]
 
-    return score_submission(BOARD, submission, artefact_of, progress)
+    return score_submission(board, submission, artefact_of, progress)
 
 
 LINEAR = as_bytes(models.linear())
@@ -275,6 +277,117 @@ def test_dependence_on_the_batch_in_an_outer_region_is_detected() -> None:
     result = score(policy, None, None)
 
     assert (result.status, result.code) == ("rejected", "run_batch_dependent")
+
+
+class Recorder:
+    """The checks that a `_CheckedPolicy` asks a sandbox for, without a sandbox."""
+
+    def __init__(self) -> None:
+        self.checked: list[Observations] = []
+        self.rounded: list[Observations] = []
+
+    def __call__(self, observations: Observations) -> Observations:
+        return observations[:, :1]
+
+    def check_rows(self, observations: Observations) -> None:
+        self.checked.append(observations)
+
+    def check_rounding(self, observations: Observations) -> float:
+        self.rounded.append(observations)
+        return float(len(self.rounded))
+
+
+def checks(regions: int, batches: list[int], agents: int = 1) -> Recorder:
+    """What is checked in regions of these batches; a row has its region, agent and number."""
+    recorder = Recorder()
+    policy = score_module._CheckedPolicy(recorder, sum(batches), agents)
+    for region in range(regions):
+        first = 0
+        for rows in batches:
+            for agent in range(agents):
+                numbers = np.arange(first, first + rows)
+                policy(np.stack(np.broadcast_arrays(region, agent, numbers), axis=1))
+            first += rows
+    assert policy.rounding == [float(number) for number in range(1, regions + 1)]
+    return recorder
+
+
+def test_a_random_batch_and_the_last_of_each_region_are_checked() -> None:
+    chosen = [
+        (int(rows[0, 0]), int(rows[0, 2])) for rows in checks(40, [800, 800, 800, 100]).checked
+    ]
+
+    assert {region for region, first in chosen if first == 2400} == set(range(40))
+    others = [first for _, first in chosen if first != 2400]
+    assert set(others) == {0, 800, 1600}
+    assert 30 <= len(others) <= 40
+    assert chosen != [
+        (int(rows[0, 0]), int(rows[0, 2])) for rows in checks(40, [800, 800, 800, 100]).checked
+    ]
+
+
+def test_rounding_is_measured_in_random_states_of_each_region() -> None:
+    regions = checks(3, [800, 800, 800, 100]).rounded
+
+    assert [sorted({*rows[:, 0].tolist()}) for rows in regions] == [[0], [1], [2]]
+    numbers = [set(rows[:, 2].tolist()) for rows in regions]
+    assert [len(each) for each in numbers] == [ROUNDING_STATES] * 3
+    assert len(set.union(*numbers)) > 1.5 * ROUNDING_STATES
+    assert all(max(each) >= 2400 for each in numbers)
+
+
+def test_every_agent_is_checked_in_the_same_states() -> None:
+    recorder = checks(2, [600, 600, 50], agents=2)
+
+    for rows in recorder.rounded:
+        first, second = (rows[rows[:, 1] == agent, 2] for agent in (0, 1))
+        np.testing.assert_array_equal(first, second)
+        assert len(first) == ROUNDING_STATES
+    pairs = [recorder.checked[i : i + 2] for i in range(0, len(recorder.checked), 2)]
+    assert all([int(rows[0, 1]) for rows in pair] == [0, 1] for pair in pairs)
+
+
+def test_dependence_on_the_batch_in_the_last_one_alone_is_detected() -> None:
+    # The rows of the last batch of 8,192 + 500 states: only they see each other.
+    rows = models.tensor("rows", np.float32(500.0))
+    policy = as_bytes(
+        models.squashed(
+            [
+                models.node("Mul", "y zero", "none"),
+                models.node("Add", "none one", "ones"),
+                models.node("ReduceSum", "ones axis", "count", keepdims=1),
+                models.node("Equal", "count rows", "is_last"),
+                models.node("ReduceMean", "y", "mean", axes=[0], keepdims=1),
+                models.node("Sub", "y mean", "other"),
+                models.node("Where", "is_last other y", "a"),
+            ],
+            [
+                rows,
+                models.tensor("zero", np.float32(0.0)),
+                models.tensor("one", np.float32(1.0)),
+                models.tensor("axis", np.array([0], np.int64)),
+            ],
+        )
+    )
+    board = BOARD.model_copy(update={"protocol": EvaluationProtocol(states_per_region=8692)})
+
+    result = score(policy, None, None, board=board)
+
+    assert (result.status, result.code) == ("rejected", "run_batch_dependent")
+
+
+def test_a_policy_that_amplifies_rounding_is_rejected() -> None:
+    large = models.tensor("large", np.float32(10_000.0))
+    policy = as_bytes(
+        models.squashed(
+            [models.node("Add", "y large", "shifted"), models.node("Sub", "shifted large", "a")],
+            [large],
+        )
+    )
+
+    result = score(LINEAR, policy, LINEAR)
+
+    assert (result.status, result.code) == ("rejected", "run_rounding")
 
 
 def test_an_instance_of_another_suite_is_refused() -> None:

@@ -82,12 +82,10 @@ def test_a_fault_leaves_its_submission_waiting_and_others_are_scored(
     real = score_submission
     monkeypatch.setattr("leaderboard.store.queue._uptime", lambda: ("boot", 1000.0))
 
-    def fails(document, submission, *arguments):
-        return (
+    def fails(document, submission, *arguments, **options):
+        if submission.digest == broken.id:
             _raise(error)
-            if submission.digest == broken.id
-            else real(document, submission, *arguments)
-        )
+        return real(document, submission, *arguments, **options)
 
     with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
         patch.setattr(scorer, "score_submission", fails)
@@ -154,6 +152,10 @@ def test_a_disk_that_stays_full_is_reported_and_no_fault_of_the_entry(store, sub
     assert run_scorer(store.folder.path) == 1
 
 
+def by_zero(*arguments, **options):
+    raise ZeroDivisionError("by 0")
+
+
 def _raise(error: Exception) -> None:
     raise error
 
@@ -162,12 +164,12 @@ def test_heartbeats_keep_a_claim_for_as_long_as_it_is_scored(store, submit, monk
     submit()
     real, claims = score_submission, []
 
-    def slow(*arguments):
+    def slow(*arguments, **options):
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
             claims.append(store.queue.claim("other"))
             threading.Event().wait(0.05)
-        return real(*arguments)
+        return real(*arguments, **options)
 
     monkeypatch.setattr(scorer, "score_submission", slow)
     assert run_scorer(store.folder.path, lease_seconds=0.8) == 1
@@ -288,7 +290,7 @@ def test_a_missing_onnxruntime_ends_the_scorer_and_is_no_fault(store, submit, mo
     submit()
     error = MissingDependencyError("onnxruntime is not installed")
     with monkeypatch.context() as patch:
-        patch.setattr(scorer, "score_submission", lambda *_: _raise(error))
+        patch.setattr(scorer, "score_submission", lambda *_, **__: _raise(error))
         with pytest.raises(MissingDependencyError):
             run_scorer(store.folder.path)
     assert store.entries()[0].faults == 0
@@ -298,7 +300,7 @@ def test_a_missing_onnxruntime_ends_the_scorer_and_is_no_fault(store, submit, mo
 def test_reference_rows_are_scored_once_the_fault_is_repaired(store, monkeypatch):
     references = intake.submit_references(store)
     with monkeypatch.context() as patch:
-        patch.setattr(scorer, "score_submission", lambda *_: _raise(ZeroDivisionError("by 0")))
+        patch.setattr(scorer, "score_submission", by_zero)
         for _ in range(6):
             assert run_scorer(store.folder.path) == 0
     rows = [store.entry(id) for id in references]
