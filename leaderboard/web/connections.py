@@ -24,6 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from leaderboard.web.limits import LOOPBACK, Network, counted_address
 
 _HEAD_BYTES = 2**14
+_ENDING_SECONDS = 2.0  # before uvicorn cancels requests, which would log each as an error
 _TINY_CHUNKS, _CHUNK_BYTES = 1000, 256  # a chunked body has larger chunks, but for some
 
 _Phase = Literal["waiting", "working", "writing"]
@@ -214,6 +215,11 @@ class Connection(H11Protocol):
         """Go on after the client has read everything."""
         super().resume_writing()
         self._update()
+
+    def shutdown(self) -> None:
+        """Let the client finish its exchange, for a moment."""
+        super().shutdown()
+        self.loop.call_later(_ENDING_SECONDS, self.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Free the slot."""

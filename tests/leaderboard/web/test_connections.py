@@ -238,6 +238,18 @@ def test_a_patient_reader_gets_everything(path: Path) -> None:
         assert rest(connection).endswith(LARGE)
 
 
+def test_slow_clients_do_not_disturb_the_end_of_the_server(path: Path) -> None:
+    with serving_process(path) as (url, process):
+        body = connect(url, BODY + b" ")
+        reader = connect(url, large() + b"\r\n", buffer=4096)
+        assert reader.recv(12, socket.MSG_WAITALL) == b"HTTP/1.1 200"
+        process.terminate()
+        _, err = process.communicate(timeout=PATIENCE)
+        body.close()
+        reader.close()
+    assert (process.returncode, err) == (0, "")
+
+
 # Memory and time.
 
 
