@@ -23,6 +23,7 @@ from leaderboard.web.errors import HTTP_CODES, RequestError, error_answer
 REQUESTS_OF_ADDRESS = 32
 UPLOAD_SECONDS = 300.0
 _DOCUMENT_SECONDS = 30.0
+_START_SECONDS, _LEAST_RATE = 30.0, 2**15  # bytes a second, after a slow start
 _DRAIN_SECONDS = 30.0
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
@@ -161,22 +162,26 @@ async def read_document(request: Request, name: str) -> bytes:
 async def body_chunks(
     request: Request, limit: int, seconds: float, name: str = "object"
 ) -> AsyncIterator[bytes]:
-    """Read a body as it arrives, up to a size and a time.
+    """Read a body as it arrives, up to a size and a time, and not slower than 32 KiB a second.
 
     Raises:
       Rejection: `too_large`.
       RequestError: `too_slow` or `broken_off`.
     """
     size = 0
-    deadline = anyio.current_time() + seconds
+    start = anyio.current_time()
     stream = request.stream()
     while True:
+        # A body that hardly moves holds room in the quotas no longer than it must.
+        allowed = min(seconds, _START_SECONDS + size / _LEAST_RATE)
         try:
-            with anyio.fail_after(deadline - anyio.current_time()):
+            with anyio.fail_after(start + allowed - anyio.current_time()):
                 chunk = await anext(stream, b"")
         except TimeoutError:
             raise RequestError(
-                "too_slow", f"{name}: did not arrive within {seconds:g} seconds. Send it again."
+                "too_slow",
+                f"{name}: {size:,} bytes arrived within {allowed:.0f} seconds, and the rest did "
+                "not. Send it again.",
             ) from None
         except ClientDisconnect:
             raise RequestError("broken_off", f"{name}: {HTTP_CODES['broken_off']}.") from None

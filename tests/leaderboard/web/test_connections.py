@@ -23,7 +23,7 @@ from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
 from leaderboard.store import Store
-from leaderboard.web import serve
+from leaderboard.web import limits, serve
 from leaderboard.web.connections import ConnectionLimits, Connections
 from leaderboard.web.downloads import PIECE
 from leaderboard.web.errors import RequestError
@@ -186,7 +186,7 @@ def test_clients_are_counted_by_ipv4_address_or_ipv6_network(host: str, counted:
 def test_slots_leave_files_for_everything_else() -> None:
     program = """
 import resource
-from leaderboard.web import serve
+from leaderboard.web import limits, serve
 for hard in 9000, 1024:
     resource.setrlimit(resource.RLIMIT_NOFILE, (128, hard))
     print(serve._connections(), resource.getrlimit(resource.RLIMIT_NOFILE)[0])
@@ -214,6 +214,23 @@ def test_a_request_head_has_a_deadline(path: Path, first: bytes, drips: bool) ->
 def test_a_body_that_nobody_waits_for_has_a_deadline(path: Path) -> None:
     with serving(path, limited(head_seconds=0.2)) as url:
         drip(connect(url, HEAD + b"Content-Length: 1000000\r\n\r\n"))
+
+
+def test_a_body_that_hardly_moves_is_refused(
+    path: Path, key: SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "_START_SECONDS", 0.3)
+    with Store.open(path, read_only=True) as store:
+        board = store.document.key
+    digest = hashlib.sha256(b"x").hexdigest()
+    head = (
+        f"PUT /api/objects/{digest} HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n"
+        f"Authorization: {intake.upload_header(key, f'sha256:{digest}', board=board)}\r\n\r\n"
+    )
+    with serving(path) as url:
+        answer = rest(connect(url, head.encode() + b"x" * 2000))
+    assert answer.startswith(b"HTTP/1.1 408 ")
+    assert b"2,000 bytes" in answer
 
 
 @pytest.mark.parametrize(
