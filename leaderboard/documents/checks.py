@@ -129,7 +129,7 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
         ("submitter.name", submission.submitter.name, THE_BOARD),
         ("method.family", method.family, REFERENCE_FAMILY),
     ):
-        if _folded(name) == reserved and submission.submitter.key != board_key:
+        if skeleton(name) == skeleton(reserved) and submission.submitter.key != board_key:
             raise Rejection(
                 "unsafe_name",
                 f"{field}={name!a}: reserved for the board's own reference rows. Rename it.",
@@ -169,11 +169,6 @@ def skeleton(name: str) -> str:
     folded = unicodedata.normalize("NFKC", name).casefold()
     letters = "".join(letter for letter in folded if letter.isalnum())
     return letters.translate(_LOOK_ALIKE).replace("rn", "m").replace("vv", "w")
-
-
-def _folded(name: str) -> str:
-    """A name normalised for comparison: case, width of letters and spaces do not matter."""
-    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def check_runs(

@@ -1,6 +1,6 @@
 """Submissions: read, checked against the board and its quotas, then stored.
 
-    read → for this board? → known? → document → quotas → artefacts present → gate → store
+    read → for this board? → known? → document → name → quotas → artefacts present → gate → store
 
 The order is fixed with cheap steps first, so that one fault always has one code, and megabytes
 are read only after everything declared about them has passed.
@@ -10,19 +10,65 @@ from __future__ import annotations
 
 import datetime
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from leaderboard.artefact.gate import inspect, widths
 from leaderboard.bundle import Bundle
 from leaderboard.documents.checks import check_board, check_submission
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import Artefact, SignedSubmission, Submission, shifted, utc
+from leaderboard.documents.submission import (
+    Artefact,
+    Envelope,
+    SignedSubmission,
+    Submission,
+    Submitter,
+    shifted,
+    utc,
+)
 from leaderboard.errors import Rejection
+from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.uploads import quota_window
 from leaderboard.store import Store
 
 _DAY = datetime.timedelta(days=1)
+_VERDICTS_KEPT = 10_000
 ReadArtefact = Callable[[str], bytes]
+
+_verdicts: dict[tuple[str, int, int], tuple[str, str] | None] = {}
+"""The gate's code and message, or None, by digest and widths."""
+
+
+def receive(
+    store: Store,
+    envelope: Envelope,
+    refusals: Refusals,
+    at: datetime.datetime | None = None,
+) -> bool:
+    """Admit a submission that a server received; if it is refused, that counts for its key.
+
+    Args:
+      store: the board.
+      envelope: the submission, its signature verified and its content not validated.
+      refusals: of the server.
+      at: time of arrival; now by default.
+
+    Returns:
+      True if it is new, False if the board already has it.
+
+    Raises:
+      Rejection: with the code of the first fault.
+    """
+    check_board(store.document, envelope.board)
+    moment = at or datetime.datetime.now(datetime.UTC)
+    refused = refusals.times(envelope.key, moment)
+    if store.entry(envelope.id) is None:
+        refusals.repeat(envelope.id)
+        _check_quotas(store, envelope.key, moment, refused)
+    try:
+        return admit(store, envelope.open(), moment, refused=refused)
+    except Rejection as rejection:
+        refusals.add(envelope, rejection, moment)
+        raise
 
 
 def admit(
@@ -30,6 +76,7 @@ def admit(
     signed: SignedSubmission,
     at: datetime.datetime | None = None,
     artefact: ReadArtefact | None = None,
+    refused: Sequence[str] = (),
 ) -> bool:
     """Check a submission and store it.
 
@@ -38,7 +85,8 @@ def admit(
       signed: the submission, its signature verified.
       at: time of arrival; now by default.
       artefact: returns an artefact's bytes by digest, of the size in the submission; they are
-        stored with the submission. By default the board already has all artefacts.
+        stored with the submission. By default the submitter's key has uploaded them.
+      refused: when other submissions of the key were refused; they count for its quota.
 
     Returns:
       True if it is new, False if the board already has it.
@@ -60,16 +108,17 @@ def admit(
     submission = signed.submission
     key = submission.submitter.key
     check_submission(store.document, submission, moment)
-    _check_quotas(store, key, moment)
+    _check_name(store, submission.submitter)
+    _check_quotas(store, key, moment, refused)
     _check_artefacts(store, submission, artefact)
     if artefact is not None:
         for digest in _artefacts(submission):
-            if not store.objects.has(digest):
-                store.put_object(digest, [artefact(digest)], by=key)
-    with store.transaction():  # no other submission can use the quota in between
-        _check_quotas(store, key, moment)
-        for digest, declared in _artefacts(submission).items():  # nor can `gc` take an artefact
-            _check_stored(store, digest, declared.size)
+            store.put_object(digest, [artefact(digest)], by=key)
+    with store.transaction():  # no other submission can use the quota or the name in between
+        _check_name(store, submission.submitter)
+        _check_quotas(store, key, moment, refused)
+        for declared in _artefacts(submission).values():  # nor can `gc` take an artefact
+            _check_stored(store, key, declared)
         return store.receive(signed)
 
 
@@ -95,7 +144,20 @@ def submit_bundle(
     return signed.id
 
 
-def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
+def _check_name(store: Store, submitter: Submitter) -> None:
+    holder = store.holder_of_name(submitter.name)
+    if holder not in (None, submitter.key):
+        raise Rejection(
+            "name_taken",
+            f"submitter.name={submitter.name!a}: on this board it belongs to the key "
+            f"{holder[:16]}…, which was the first to use it, or a name that looks like it. Choose "
+            "another name, or sign with that key.",
+        )
+
+
+def _check_quotas(
+    store: Store, key: str, moment: datetime.datetime, refused: Sequence[str]
+) -> None:
     """Reject one more submission of a key if its quota, or the queue, is full.
 
     The board's own key has no quota, because nothing is shown without the reference rows.
@@ -103,14 +165,15 @@ def _check_quotas(store: Store, key: str, moment: datetime.datetime) -> None:
     limits = store.document.limits
     if key == store.document.key:
         return
-    times = store.submission_times(key, *quota_window(moment))
+    times = sorted([*store.submission_times(key, *quota_window(moment)), *refused])
     if len(times) >= limits.submissions_per_day:
         first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
         free = shifted(first, _DAY)
         raise Rejection(
             "quota",
             f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
-            f"within 24 hours. Send the next one after {utc(free)}.",
+            f"within 24 hours, {len(refused)} of them refused. Send the next one after "
+            f"{utc(free)}.",
         )
     waiting = store.queue.waiting()
     if waiting >= limits.waiting_submissions:
@@ -129,29 +192,47 @@ def _artefacts(submission: Submission) -> dict[str, Artefact]:
 def _check_artefacts(store: Store, submission: Submission, artefact: ReadArtefact | None) -> None:
     """Check that all are present with the declared sizes; then inspect one after the other."""
     if artefact is None:
-        for digest, declared in _artefacts(submission).items():
-            _check_stored(store, digest, declared.size)
+        for declared in _artefacts(submission).values():
+            _check_stored(store, submission.submitter.key, declared)
     instances = store.document.instances
     dimensions: dict[str, set[tuple[int, int]]] = {}
     for run in submission.runs:
         if run.artefact:
             dimensions.setdefault(run.artefact.sha256, set()).add(widths(instances[run.spec][1]))
     for digest, pairs in dimensions.items():
-        data = artefact(digest) if artefact else store.objects.read(digest)
         for observation_dim, action_dim in sorted(pairs):
-            inspect(data, observation_dim, action_dim)
+            _inspect(artefact or store.objects.read, digest, observation_dim, action_dim)
 
 
-def _check_stored(store: Store, digest: str, declared: int) -> None:
-    if not store.objects.has(digest):
+def _inspect(read: ReadArtefact, digest: str, observation_dim: int, action_dim: int) -> None:
+    """The gate's verdict, which depends on the bytes and the widths only, and is kept."""
+    case = (digest, observation_dim, action_dim)
+    if case not in _verdicts:
+        verdict = None
+        try:
+            inspect(read(digest), observation_dim, action_dim)
+        except Rejection as rejection:
+            verdict = (rejection.code, rejection.message)
+        if len(_verdicts) >= _VERDICTS_KEPT:
+            _verdicts.clear()
+        _verdicts[case] = verdict
+    if (verdict := _verdicts[case]) is not None:
+        raise Rejection(*verdict)
+
+
+def _check_stored(store: Store, key: str, declared: Artefact) -> None:
+    """Check that the key has uploaded an artefact; if not, say nothing about it."""
+    digest = declared.sha256
+    if not (store.possesses(key, digest) and store.objects.has(digest)):
         raise Rejection(
             "artefact_missing",
-            f"artefact={digest}: is not on the board. Upload it before the submission.",
+            f"artefact={digest}: the submission's key has not uploaded it. Upload it before the "
+            "submission.",
         )
     size = store.folder.object(digest).stat().st_size
-    if size != declared:
+    if size != declared.size:
         raise Rejection(
             "artefact_digest",
-            f"artefact={digest}: has {size:,} bytes, but the submission declares {declared:,}. "
-            "Recreate the bundle with `sme-leaderboard new`.",
+            f"artefact={digest}: has {size:,} bytes, but the submission declares "
+            f"{declared.size:,}. Recreate the bundle with `sme-leaderboard new`.",
         )

@@ -70,7 +70,8 @@ CREATE TABLE lease (
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE turn (key TEXT PRIMARY KEY, time REAL NOT NULL) STRICT, WITHOUT ROWID;
 CREATE TABLE upload (
-  digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL
+  digest TEXT NOT NULL, size INTEGER NOT NULL, key TEXT NOT NULL, time TEXT NOT NULL,
+  PRIMARY KEY (digest, key)
 ) STRICT, WITHOUT ROWID;
 """
 VERSION = zlib.crc32(SCHEMA.encode()) & 0x7FFFFFFF  # changes with the schema's text
@@ -316,7 +317,8 @@ class Index:
                     (run.artefact.sha256, run.artefact.size, submitter.key, entry.time),
                 )
                 self.connection.execute(
-                    "DELETE FROM upload WHERE digest = ?", (run.artefact.sha256,)
+                    "DELETE FROM upload WHERE digest = ? AND key IN (?, '')",
+                    (run.artefact.sha256, submitter.key),
                 )
                 self.connection.execute(
                     "INSERT OR IGNORE INTO artefact VALUES (?, ?)",

@@ -20,36 +20,21 @@ class Objects:
     def __init__(self, folder: Folder) -> None:
         self.folder = folder
 
-    def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> int | None:
+    def put(self, digest: str, chunks: Iterable[bytes], limit: int) -> int:
         """Write an artefact of at most `limit` bytes; it exists only once all of it is verified.
 
-        Arguments and errors as for `Store.put_object`.
+        If it exists, its bytes are verified, too, but not written. Arguments and errors as for
+        `Store.put_object`.
 
         Returns:
-          Its size in bytes if it is new, otherwise None.
+          Its size in bytes.
         """
-        path = self.folder.object(digest)
         if self.touch(digest):
-            return None
-        sha256, size = hashlib.sha256(), 0
-        with durable_file(path) as stream:
-            for chunk in chunks:
-                size += len(chunk)
-                if size > limit:
-                    raise Rejection(
-                        "too_large",
-                        f"artefact={digest[:19]}…: has more than {limit:,} bytes. "
-                        "Submit a smaller policy.",
-                    )
-                sha256.update(chunk)
-                stream.write(chunk)
-            actual = "sha256:" + sha256.hexdigest()
-            if actual != digest:
-                raise Rejection(
-                    "artefact_digest",
-                    f"artefact={digest[:19]}…: the bytes have the digest {actual[:19]}…. "
-                    "Upload the file that was hashed.",
-                )
+            return sum(len(chunk) for chunk in _verified(digest, chunks, limit))
+        size = 0
+        with durable_file(self.folder.object(digest)) as stream:
+            for chunk in _verified(digest, chunks, limit):
+                size += stream.write(chunk)
         return size
 
     def has(self, digest: str) -> bool:
@@ -100,3 +85,24 @@ class Objects:
             for path in sorted(shelf.iterdir()):
                 if not path.name.startswith("."):
                     yield f"sha256:{shelf.name}{path.name}", path
+
+
+def _verified(digest: str, chunks: Iterable[bytes], limit: int) -> Iterator[bytes]:
+    """The bytes as they arrive; raises at the end if they are not the artefact of this digest."""
+    sha256, size = hashlib.sha256(), 0
+    for chunk in chunks:
+        size += len(chunk)
+        if size > limit:
+            raise Rejection(
+                "too_large",
+                f"artefact={digest[:19]}…: has more than {limit:,} bytes. Submit a smaller policy.",
+            )
+        sha256.update(chunk)
+        yield chunk
+    actual = "sha256:" + sha256.hexdigest()
+    if actual != digest:
+        raise Rejection(
+            "artefact_digest",
+            f"artefact={digest[:19]}…: the bytes have the digest {actual[:19]}…. "
+            "Upload the file that was hashed.",
+        )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from leaderboard.documents.board import RULES, BoardDocument, Folder
-from leaderboard.documents.checks import check_board, check_text, refuse_unsubmittable
+from leaderboard.documents.checks import check_board, check_text, refuse_unsubmittable, skeleton
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
@@ -133,13 +133,16 @@ class Store(Database):
     def put_object(self, digest: str, chunks: Iterable[bytes], *, by: str) -> bool:
         """Store an artefact while its bytes arrive, up to the board's size limit.
 
+        The bytes are read and verified even if the board has them: they show that the uploader has
+        the artefact, too, and not only its digest. See `possesses`.
+
         Args:
           digest: the artefact's expected digest.
-          chunks: the bytes; not read if the board already has the artefact.
-          by: the uploader's public key, for the quotas.
+          chunks: the bytes.
+          by: the uploader's public key, for the quotas and `possesses`.
 
         Returns:
-          True if it is new.
+          True if this key has neither uploaded nor submitted it before.
 
         Raises:
           Rejection: `too_large` or `artefact_digest`.
@@ -147,19 +150,43 @@ class Store(Database):
         """
         self.refuse_read_only()
         self.signing_key()  # without it no submission could follow
-        while True:
-            size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
-            with self.transaction() as index:
-                if not self.objects.touch(digest):  # `gc` has just removed an old artefact
-                    if size is None:
-                        continue  # the chunks are unread
-                    raise BoardError(f"artefact={digest}: was removed meanwhile. Upload it again.")
-                if size and index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None:
-                    index.connection.execute(
-                        "INSERT OR IGNORE INTO upload VALUES (?, ?, ?, ?)",
-                        (digest, size, by, now()),
-                    )
-            return size is not None
+        with self.transaction():  # so that `gc` does not remove it while its bytes arrive
+            self.objects.touch(digest)
+        size = self.objects.put(digest, chunks, self.document.limits.artefact_bytes)
+        with self.transaction() as index:
+            if not self.objects.touch(digest):
+                raise BoardError(f"artefact={digest}: was removed meanwhile. Upload it again.")
+            if self.possesses(by, digest):
+                return False
+            index.connection.execute(
+                "INSERT INTO upload VALUES (?, ?, ?, ?)", (digest, size, by, now())
+            )
+        return True
+
+    def possesses(self, key: str, digest: str) -> bool:
+        """Whether a key has uploaded an artefact, and so has its bytes.
+
+        A submission may name only these: digests are public before the artefacts are.
+        """
+        with self.reading() as index:
+            return (
+                index.one(
+                    "SELECT 1 FROM upload WHERE digest = ?1 AND key = ?2 UNION "
+                    "SELECT 1 FROM artefact JOIN entry ON id = submission "
+                    "WHERE digest = ?1 AND key = ?2",
+                    *(digest, key),
+                )
+                is not None
+            )
+
+    def holder_of_name(self, name: str) -> str | None:
+        """The key that was first to use a submitter's name, or one that looks like it."""
+        with self.reading() as index:
+            rows = index.connection.execute(
+                "SELECT submitter, key FROM entry GROUP BY submitter, key ORDER BY min(sequence)"
+            )
+            alike = skeleton(name)
+            return next((key for submitter, key in rows if skeleton(submitter) == alike), None)
 
     def receive(self, signed: SignedSubmission) -> bool:
         """Add a submission, which `intake` has checked, to the queue.
@@ -278,8 +305,8 @@ class Store(Database):
         """Bytes of all artefacts."""
         with self.reading() as index:
             return index.number(
-                "SELECT (SELECT coalesce(sum(size), 0) FROM object)"
-                " + (SELECT coalesce(sum(size), 0) FROM upload)"
+                "SELECT coalesce(sum(size), 0) FROM "
+                "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload)"
             )
 
     def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:

@@ -34,7 +34,7 @@ from leaderboard import exports, intake
 from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Metric
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
+from leaderboard.documents.submission import Envelope, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
@@ -149,6 +149,7 @@ class _Routes:
         self._upload_seconds = upload_seconds
         self._documents = limits.Turns(_DOCUMENTS)
         self._admissions = limits.Turns(_ADMISSIONS)
+        self._refusals = intake.Refusals()
         self._reservations = limits.UploadReservations(store)
         self._rendering = CapacityLimiter(1)
         self._health = CapacityLimiter(1)
@@ -205,9 +206,11 @@ class _Routes:
         text = await limits.read_document(request, "submission")
 
         # Garbage without a valid signature never waits with submissions, whose check is longer.
-        signed = await self._documents.run(lambda: SignedSubmission.read(text))
-        id, key = signed.id, signed.submission.submitter.key
-        new = await self._admissions.run(lambda: intake.admit(self._store, signed), key)
+        envelope = await self._documents.run(lambda: Envelope.read(text))
+        id = envelope.id
+        new = await self._admissions.run(
+            lambda: intake.receive(self._store, envelope, self._refusals), envelope.key
+        )
         url = f"/api/submissions/{hex_of(id)}"
         return JSONResponse({"id": id, "url": url}, 202 if new else 200, headers={"Location": url})
 

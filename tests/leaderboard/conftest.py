@@ -96,7 +96,7 @@ def tiny_submission(
             "family": "linear",
             "knowledge": "generic",
         },
-        "submitter": {"name": "A tester", "key": key.public},
+        "submitter": {"name": f"Tester {key.public[:8]}", "key": key.public},
         "created": now(),
         "runs": [
             {

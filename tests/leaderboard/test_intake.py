@@ -12,9 +12,9 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, utc
+from leaderboard.documents.submission import Envelope, SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import Rejection
-from leaderboard.intake import references
+from leaderboard.intake import admission, references
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
@@ -102,6 +102,170 @@ def test_an_old_submission_is_rejected(store: Store, key: SigningKey) -> None:
 def test_a_missing_artefact_is_rejected(store: Store, key: SigningKey) -> None:
     signed, _ = tiny_submission(store, key)
     assert code_of(lambda: receive(store, signed)) == "artefact_missing"
+
+
+def test_an_artefact_that_another_key_uploaded_is_missing(store: Store, key: SigningKey) -> None:
+    """Its digest is public as soon as a submission names it, its bytes only later."""
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    copier = SigningKey.generate()
+    copy, _ = tiny_submission(store, copier)
+    before = code_of(lambda: receive(store, copy))
+    receive(store, signed)
+    assert (before, code_of(lambda: receive(store, copy))) == ("artefact_missing",) * 2
+    other, _ = tiny_submission(store, copier, 7)
+    with pytest.raises(Rejection) as of_nothing:
+        receive(store, other)
+    with pytest.raises(Rejection) as of_another:
+        receive(store, copy)
+    one, two = (
+        each.value.message.partition(": ")[2] for each in (of_nothing, of_another)
+    )  # nothing shows whether the board has it
+    assert one == two
+    assert [entry.id for entry in store.entries()] == [signed.id]
+    put(store, copier, artefacts)  # who has its bytes may submit it, and is marked as a copy
+    assert receive(store, copy) == copy.id
+
+
+def test_a_key_submits_its_artefact_again_without_another_upload(
+    store: Store, key: SigningKey
+) -> None:
+    first, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    receive(store, first)
+    again, _ = tiny_submission(store, key, statement="revised")
+    store.reindex()  # forgets who uploaded what was not submitted
+    assert receive(store, again) == again.id
+
+
+def test_an_upload_without_the_bytes_is_no_upload(store: Store, key: SigningKey) -> None:
+    signed, artefacts = tiny_submission(store, key)
+    put(store, key, artefacts)
+    receive(store, signed)
+    copier = SigningKey.generate()
+    (digest,) = artefacts
+    assert code_of(lambda: store.put_object(digest, [], by=copier.public)) == "artefact_digest"
+    assert not store.possesses(copier.public, digest)
+
+
+@pytest.mark.parametrize("name", ["A Lab", "a lab", "A.Lab", "A-L-A-B", "A 1ab", "A Iab"])
+def test_a_name_belongs_to_the_first_key_that_uses_it(
+    store: Store, key: SigningKey, name: str
+) -> None:
+    lab = {"name": "A Lab", "key": key.public}
+    put_submission(store, key, 1, submitter=lab)
+    other = SigningKey.generate()
+    imitation, artefacts = tiny_submission(
+        store, other, 2, submitter={"name": name, "key": other.public}
+    )
+    put(store, other, artefacts)
+    assert code_of(lambda: receive(store, imitation)) == "name_taken"
+    mine, artefacts = tiny_submission(store, key, 3, submitter={"name": name, "key": key.public})
+    put(store, key, artefacts)
+    assert receive(store, mine) == mine.id
+
+
+def test_two_keys_that_send_a_name_at_once_do_not_share_it(
+    store: Store, key: SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = (key, SigningKey.generate())
+    named = [
+        tiny_submission(store, each, n, submitter={"name": "A Lab", "key": each.public})
+        for n, each in enumerate(keys)
+    ]
+    for each, (_, artefacts) in zip(keys, named, strict=True):
+        put(store, each, artefacts)
+    real = admission._check_artefacts
+
+    def meanwhile(*arguments: Any) -> None:
+        real(*arguments)
+        store.receive(named[0][0])
+
+    monkeypatch.setattr(admission, "_check_artefacts", meanwhile)
+    assert code_of(lambda: receive(store, named[1][0])) == "name_taken"
+
+
+# Refusals.
+
+
+def envelope(signed: SignedSubmission) -> Envelope:
+    return Envelope.read(signed.to_bytes())
+
+
+def test_refused_submissions_count_for_their_key(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 3}) as store:
+        refusals = intake.Refusals()
+        put_submission(store, key, 1)
+        for number in (2, 3):
+            missing, _ = tiny_submission(store, key, number)
+            call = partial(intake.receive, store, envelope(missing), refusals)
+            assert code_of(call) == "artefact_missing"
+        signed, artefacts = tiny_submission(store, key, 4)
+        put(store, key, artefacts)
+        assert code_of(lambda: intake.receive(store, envelope(signed), refusals)) == "quota"
+        tomorrow = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=1, seconds=2)
+        assert intake.receive(store, envelope(signed), refusals, tomorrow)
+        other = SigningKey.generate()
+        signed, artefacts = tiny_submission(store, other, 5)
+        put(store, other, artefacts)
+        assert intake.receive(store, envelope(signed), refusals)
+        assert not intake.receive(store, envelope(signed), refusals)
+
+
+def test_what_strangers_can_send_again_counts_for_nobody(tmp_path: Path, key: SigningKey) -> None:
+    """Submissions to other boards and withdrawn ones are public, with their signatures."""
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
+        refusals = intake.Refusals()
+        gone = put_submission(store, key, 1)
+        store.withdraw(signed_withdrawal(store, gone.id, key))
+        elsewhere = gone.submission.signed(key, "a" * 64)
+        for _ in range(3):
+            for signed, code in ((gone, "withdrawn"), (elsewhere, "wrong_board")):
+                call = partial(intake.receive, store, envelope(signed), refusals)
+                assert code_of(call) == code
+        signed, artefacts = tiny_submission(store, key, 2)
+        put(store, key, artefacts)
+        assert intake.receive(store, envelope(signed), refusals)
+
+
+def test_a_refusal_for_good_is_repeated_and_counted_once(tmp_path: Path, key: SigningKey) -> None:
+    with tiny_board(tmp_path / "b", limits={"submissions_per_day": 2}) as store:
+        refusals = intake.Refusals()
+        broken = with_artefact(store, key, b"not a model")
+        for _ in range(5):
+            call = partial(intake.receive, store, envelope(broken), refusals)
+            assert code_of(call) == "onnx_malformed"
+        signed, artefacts = tiny_submission(store, key, 2)
+        put(store, key, artefacts)
+        assert intake.receive(store, envelope(signed), refusals)
+
+
+def test_no_more_refusals_are_kept_than_stated(store: Store, key: SigningKey) -> None:
+    refusals, now = intake.Refusals(kept=3), datetime.datetime.now(datetime.UTC)
+    for number in range(5):
+        signed, _ = tiny_submission(store, key, number)
+        refusals.add(envelope(signed), Rejection("schema", f"number {number}."), now)
+    assert len(refusals.times(key.public, now)) == 3
+    first, _ = tiny_submission(store, key, 0)
+    refusals.repeat(first.id)
+    last, _ = tiny_submission(store, key, 4)
+    assert code_of(lambda: refusals.repeat(last.id)) == "schema"
+
+
+def test_an_artefact_is_inspected_once_for_its_widths(
+    store: Store, key: SigningKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+    real = admission.inspect
+    monkeypatch.setattr(admission, "inspect", lambda *each: (seen.append(1), real(*each)))
+    for statement in ("one", "two"):
+        signed, artefacts = tiny_submission(store, key, 987, statement=statement)
+        put(store, key, artefacts)
+        assert receive(store, signed) == signed.id
+    broken = with_artefact(store, key, linear_onnx(986, observation_dim=5))
+    for _ in range(2):
+        assert code_of(lambda: receive(store, broken)) == "onnx_interface"
+    assert len(seen) == 2
 
 
 def test_an_artefact_of_another_size_is_refused(store: Store, key: SigningKey) -> None:

@@ -131,6 +131,12 @@ def test_a_plain_name_passes(field, name):
     [
         ("submitter__name", "the board"),
         ("submitter__name", "The Board"),
+        ("submitter__name", "the-board"),
+        ("submitter__name", "the board."),
+        ("submitter__name", "T H E.board"),
+        ("submitter__name", "the b0ard"),
+        ("method__family", "Reference."),
+        ("method__family", "re-ference"),
         ("method__family", "reference"),
         ("method__family", "REFERENCE"),
     ],

@@ -113,22 +113,19 @@ def test_gc_between_check_and_log_entry_refuses_the_submission(store, key, monke
 
 
 def test_gc_takes_no_artefact_that_was_just_uploaded_again(store, key, monkeypatch):
-    """Another process collects just after the upload has found an old artefact in place."""
+    """Another process collects while the upload finds an old artefact in place."""
     data = b"old, and uploaded again"
     digest = put(store, key, data)
     age(store.folder.object(digest), DAY + 60)
     real, collected = Objects.put, []
 
-    def put_then_collected(*arguments):
-        size = real(*arguments)
-        if not collected:
-            age(store.folder.object(digest), DAY + 60)
-            with Store.open(store.folder.path) as other:
-                collected.append(collect_garbage(other).objects)
-        return size
+    def collect_then_put(*arguments):
+        with Store.open(store.folder.path) as other:
+            collected.append(collect_garbage(other).objects)
+        return real(*arguments)
 
-    monkeypatch.setattr(Objects, "put", put_then_collected)
+    monkeypatch.setattr(Objects, "put", collect_then_put)
     assert put(store, key, data) == digest
-    assert collected == [1]
+    assert collected == [0]
     assert store.objects.read(digest) == data
     assert collect_garbage(store).objects == 0
