@@ -2,8 +2,10 @@
 
     python -m benchmarks.interval_coverage [repetitions]
 
-Coverage is measured against two true values for each distribution of runs: θ in the limit of many
-runs, and the mean of θ over samples of this size. The two differ for skewed distributions.
+Each class has ten runs: all on one instance, five on each of two, or one on each of ten. Instances
+differ in difficulty. Coverage is measured against two true values for each distribution of runs: θ
+in the limit of many runs, and the mean of θ over samples of this size. The two differ for skewed
+distributions.
 """
 
 from __future__ import annotations
@@ -15,9 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sme_registry.statistics import Array, iqm
+from sme_registry.statistics import mean as average
 from sme_registry.statistics import stratified_bootstrap as bootstrap
 
 RUNS, CLASSES = 10, 6
+INSTANCES = (1, 2, 10)
+SPREAD = 0.1  # of the difficulties of instances: the hardest is worse by twice this
 Draw = Callable[[np.random.Generator, tuple[int, ...]], Array]
 
 
@@ -76,20 +81,32 @@ class Coverage:
         )
 
 
-def simulate(draw: Draw, repetitions: int, draws: int = 2000, batch: int = 200) -> Coverage:
+def simulate(
+    draw: Draw, repetitions: int, draws: int = 2000, batch: int = 200, instances: int = 1
+) -> Coverage:
     """Simulate equal methods and compute the interval of each.
 
-    The columns that `bootstrap` treats as metrics are independent methods here.
+    The columns that `bootstrap` treats as metrics are independent methods here. The strata are
+    those of `leaderboard.scoring.aggregation`.
     """
     rng = np.random.default_rng(0)
+    runs = RUNS // instances
+    harder = SPREAD * np.linspace(-1.0, 1.0, instances) if instances > 1 else np.zeros(1)
     truth = iqm(draw(rng, (1_000_000,)))
-    mean = iqm(draw(rng, (RUNS, 100_000))).mean()
+    mean = iqm(draw(rng, (runs, 100_000))).mean()
     low, high = (np.empty(repetitions) for _ in range(2))
     for first in range(0, repetitions, batch):
         count = min(batch, repetitions - first)
-        methods = {str(index): draw(rng, (RUNS, count)) for index in range(CLASSES)}
+        strata: dict[str, Array] = {}
+        for index in range(CLASSES):
+            of_class = draw(rng, (instances, runs, count)) + harder[:, None, None]
+            groups = of_class if runs > 1 else of_class.reshape(1, instances, count)
+            strata |= {
+                f"{index} {number}": np.sort(each, axis=0) for number, each in enumerate(groups)
+            }
         part = slice(first, first + count)
-        low[part], high[part] = bootstrap(methods, draws, seed=f"{first}")
+        statistic = iqm if runs > 1 else average
+        low[part], high[part] = bootstrap(strata, draws, f"{first}", statistic)
     half = repetitions // 2
     one, other = slice(0, half), slice(half, 2 * half)
     return Coverage(
@@ -104,4 +121,6 @@ def simulate(draw: Draw, repetitions: int, draws: int = 2000, batch: int = 200) 
 if __name__ == "__main__":
     repetitions = int(sys.argv[1]) if len(sys.argv) > 1 else 4000
     for name, draw in DISTRIBUTIONS.items():
-        print(f"{name:16} {simulate(draw, repetitions)}", flush=True)
+        for instances in INSTANCES:
+            coverage = simulate(draw, repetitions, instances=instances)
+            print(f"{name:16} {instances:2} × {RUNS // instances:2} runs: {coverage}", flush=True)

@@ -177,17 +177,25 @@ def test_an_interval_contains_its_score() -> None:
         assert (theta(classes) <= high).all()
 
 
-@pytest.mark.parametrize("name", ["normal", "lognormal(1)", "two humps 80:20", "20 % failed"])
+@pytest.mark.parametrize(
+    ("name", "instances"),
+    [
+        *[(name, 1) for name in ("normal", "lognormal(1)", "two humps 80:20", "20 % failed")],
+        *[(name, instances) for name in ("normal", "20 % failed") for instances in (2, 10)],
+    ],
+)
 def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
-    name: str, capsys: pytest.CaptureFixture[str]
+    name: str, instances: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000)
+    actual = simulate(DISTRIBUTIONS[name], repetitions=400, draws=1000, instances=instances)
 
     with capsys.disabled():
-        print(f"\n{name}, {RUNS} runs in {CLASSES} classes: {actual}")
+        print(f"\n{name}, {RUNS} runs on {instances} instances in {CLASSES} classes: {actual}")
     # Three standard errors of what 400 methods, or 200 pairs of them, can show.
     slack = 3 * math.sqrt(0.93 * 0.07 / 400)
-    assert min(actual.coverage, actual.coverage_of_mean) >= 0.93 - slack
+    assert actual.coverage_of_mean >= 0.93 - slack
+    if instances == 1:  # few runs on an instance are trimmed less, so their θ has another limit
+        assert actual.coverage >= 0.93 - slack
     assert actual.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
 
 
