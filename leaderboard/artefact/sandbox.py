@@ -64,7 +64,7 @@ At the 300,000 states of `paper-v1`, in seconds of one core (AMD EPYC, onnxrunti
 
 So honest networks have a margin of at least 2 on such a core, and usually of more than 10.
 """
-TWIN_ROWS = 1024  # of one message to the twin, whose nodes take several times the memory
+TWIN_ROWS = 128  # of one message to the twin: each draws new errors of the weights, too
 MAX_ROUNDING = 1e-4
 """Largest mean |Δ action| over the states of a region if all rounding errors are drawn anew.
 
