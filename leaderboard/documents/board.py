@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from leaderboard.documents.keys import PublicKey, SigningKey
-from leaderboard.documents.reading import is_regular, read_regular
+from leaderboard.documents.reading import read_regular
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError
 from sme_registry.errors import SMEError
@@ -220,8 +220,12 @@ class Folder:
         Raises:
           BoardError: it is missing, or is not a regular file.
         """
-        if os.path.lexists(self.key) and not is_regular(self.key):
-            raise BoardError(f"{self.key}: is not a regular file. Restore the board's key.")
+        try:
+            read_regular(self.key, 4096)
+        except OSError as error:
+            raise BoardError(
+                f"{self.key}: cannot be read: {error.strerror}. Restore the board's key."
+            ) from None
         return SigningKey.read(self.key)
 
     def submission(self, id: str) -> Path:

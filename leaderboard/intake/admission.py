@@ -175,7 +175,7 @@ def _check_quotas(
             f"within 24 hours, {len(refused)} of them refused. Send the next one after "
             f"{utc(free)}.",
         )
-    waiting = store.queue.waiting()
+    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
     if waiting >= limits.waiting_submissions:
         raise Rejection(
             "quota",

@@ -119,7 +119,7 @@ def _score(
     except Exception as error:
         _log.warning("%s: attempt %d: %r", claim.id, claim.attempt, error, exc_info=True)
         text = str(error) if isinstance(error, SMEError) else f"{type(error).__name__}: {error}"
-        store.queue.fault(claim, text)
+        store.queue.fault(claim, text.replace(f"{store.folder.path}{os.sep}", ""))
         return None
 
 

@@ -53,7 +53,7 @@ def collect_garbage(
     now = time.time()
 
     def is_older(path: Path, seconds: float) -> bool:
-        return path.stat().st_mtime <= now - seconds
+        return path.lstat().st_mtime <= now - seconds
 
     with store.transaction() as index:
         temporary = [
@@ -68,7 +68,7 @@ def collect_garbage(
             and index.one("SELECT 1 FROM object WHERE digest = ?", digest) is None
         }
         paths = [*temporary, *objects.values()]
-        size = sum(path.stat().st_size for path in paths)
+        size = sum(path.lstat().st_size for path in paths)
         if not dry_run:
             for path in paths:
                 try:

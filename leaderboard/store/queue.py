@@ -195,6 +195,13 @@ class Queue:
         """Number of submissions with neither a result nor a withdrawal."""
         return self._count("FROM entry WHERE status = 'waiting'")
 
+    def queued(self) -> int:
+        """Number of waiting submissions that no fault has stopped so far."""
+        return self._count(
+            "FROM entry LEFT JOIN lease ON submission = id "
+            "WHERE status = 'waiting' AND coalesce(faults, 0) = 0"
+        )
+
     def done(self) -> int:
         """Number of submissions with a result or a withdrawal."""
         return self._count("FROM entry WHERE status <> 'waiting'")

@@ -356,6 +356,30 @@ def test_a_board_whose_references_wait_shows_nothing() -> None:
     assert not Path("board/site/index.html").exists()
 
 
+def test_score_lists_what_it_could_not_score_and_why() -> None:
+    good("keygen")
+    make_board()
+    id = make_bundle()
+    good("submit", "bundle", "board")
+    with Store.open("board", read_only=True) as store:
+        run = next(run for run in store.submission(id).submission.runs if run.artefact)
+        path = store.folder.object(run.artefact.sha256)
+    artefact = path.read_bytes()
+    path.write_bytes(b"damaged")
+    for attempts in (2, 3):
+        result = board_command("score", "board")
+        assert result.exit_code == 1
+        (line,) = [line for line in result.stderr.splitlines() if id in line]
+        assert f"{attempts} attempts" in line
+        assert f"objects/{path.parent.name}/{path.name}" in line
+        assert str(Path.cwd()) not in line
+        assert "1 waiting" in result.stdout
+    assert "optimal" in good("rank", "board")  # the others were scored
+    path.write_bytes(artefact)
+    assert "1 scored" in good("score", "board")
+    assert "No submission is waiting" in good("score", "board")
+
+
 def test_show_withholds_scores_until_the_references_are_right_with_the_reason() -> None:
     good("keygen")
     make_board()

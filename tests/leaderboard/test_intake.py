@@ -391,6 +391,20 @@ def test_a_submission_is_for_one_board(tmp_path: Path, store: Store, key: Signin
     assert store.entries() == []
 
 
+def test_submissions_that_faults_have_stopped_do_not_fill_the_queue(
+    tmp_path: Path, key: SigningKey
+) -> None:
+    with tiny_board(tmp_path / "b", limits={"waiting_submissions": 1}) as store:
+        put_submission(store, key, 1)
+        claim = store.queue.claim("worker")
+        assert claim is not None
+        store.queue.fault(claim, "no memory")
+        signed, artefacts = tiny_submission(store, key, 2)
+        put(store, key, artefacts)
+        assert receive(store, signed) == signed.id
+        assert (store.queue.waiting(), store.queue.queued()) == (2, 1)
+
+
 # Bundles.
 
 
