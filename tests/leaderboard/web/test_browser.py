@@ -10,8 +10,12 @@ import threading
 import pytest
 from playwright.sync_api import expect, sync_playwright
 
+from leaderboard import intake
 from leaderboard.documents.board import hex_of
+from leaderboard.scoring.worker import run_scorer
 from leaderboard.web.site import write_site
+from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
 
 CHROMIUM = shutil.which("chromium")
@@ -304,3 +308,13 @@ def test_a_hostile_name_is_a_name_in_the_comparison_too(served, opened, written)
     page = opened(f"{served}compare.html?id={written[1]['hostile']}")
     expect(page.locator("[data-legend] a")).to_contain_text("x<b>y <script>alert(1)")
     assert page.evaluate("document.querySelectorAll('b, img').length") == 0
+
+
+def test_a_fresh_board_says_that_it_prepares_and_then_shows_its_rows(opened, tmp_path):
+    with tiny_board(tmp_path / "board") as store, serving(store.folder.path) as url:
+        intake.submit_references(store)
+        page = opened(url)
+        expect(page.get_by_text("Preparing.")).to_be_visible()
+        run_scorer(store.folder.path)
+        expect(page.get_by_role("row", name=re.compile("optimal"))).to_be_visible()  # by itself
+        expect(page.get_by_text("Preparing.")).to_have_count(0)
