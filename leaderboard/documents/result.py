@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from leaderboard.documents.sketch import TEXT
 from leaderboard.errors import CODES
 from sme_registry.spec import (
     Digest,
@@ -62,6 +63,8 @@ class RunScore(StrictModel):
         where there is no policy.
       rounding: mean |Δa| on random states if the arithmetic is rounded at random; null where there
         is no policy, and in results of rules 1.
+      sketch: of what the policy does, to find copies, in base64; see `documents.sketch`. Empty
+        where there is no policy or it hardly varies, and in results of rules 1.
     """
 
     spec: Digest | None
@@ -77,12 +80,15 @@ class RunScore(StrictModel):
     similarity_loss: Real
     agents: Annotated[tuple[AgentScore, ...], Field(strict=False)] = ()
     rounding: Real | None = None
+    sketch: Annotated[str, Field(pattern=TEXT)] = ""
 
     @model_serializer(mode="wrap")
     def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
         if self.rounding is None:
             del plain["rounding"]
+        if not self.sketch:
+            del plain["sketch"]
         return plain
 
 

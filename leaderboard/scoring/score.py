@@ -13,9 +13,11 @@ behave well only where it is checked. Memory holds one artefact and one batch of
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,6 +31,7 @@ from leaderboard.documents.result import AgentScore, Result, RunScore
 from leaderboard.documents.submission import Submission
 from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import never_listed, result_of
+from leaderboard.scoring.behaviour import PROBES, Behaviours
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from sme_registry import SMESpec, evaluate
 from sme_registry.errors import PolicyError, SMEError
@@ -124,6 +127,7 @@ def _score_runs(
     instances = board.instances
     states = board.protocol.states_per_region * len(board.protocol.edges)
     policies = sum(run.artefact is not None for run in submission.runs)
+    behaviours = Behaviours(board.protocol, submission.digest)
     runs: list[RunScore] = []
     evaluated = 0
     for index, run in enumerate(submission.runs):
@@ -137,8 +141,10 @@ def _score_runs(
                 progress(before + done, states * policies)
 
         digest = run.artefact.sha256
+        observe = functools.partial(behaviours.observe, f"runs.{index}", spec)
         try:
-            report, rounding = _evaluate(board, spec, artefact(digest), digest, advanced, machine)
+            data = artefact(digest)
+            evaluation = _evaluate(board, spec, data, digest, advanced, machine, observe)
         except Rejection as error:
             raise Rejection(
                 error.code,
@@ -146,7 +152,7 @@ def _score_runs(
                 f"{error.message}",
             ) from None
         evaluated += 1
-        runs.append(_run_score(board, class_name, report, digest, rounding))
+        runs.append(_run_score(board, class_name, digest, *evaluation))
     return runs
 
 
@@ -162,18 +168,22 @@ def _evaluate(
     digest: str,
     progress: Progress,
     machine: _Machine,
-) -> tuple[EvaluationReport, float]:
-    """Evaluate a policy in the sandbox on the states of its own seed; and its rounding."""
+    observe: Callable[[Sandbox], str],
+) -> tuple[EvaluationReport, float, str]:
+    """Evaluate a policy in the sandbox on the states of its own seed; its rounding and sketch."""
     agents = max(1, len(agent_names(spec)))
     states = board.protocol.states_per_region
-    limits = SandboxLimits.for_policy(len(data), states * len(board.protocol.edges), agents)
+    rows = states * len(board.protocol.edges) + PROBES
+    limits = SandboxLimits.for_policy(len(data), rows, agents)
     with Sandbox(data, *widths(spec), limits, isolation=machine.isolation) as sandbox:
         machine.versions["onnxruntime"] = sandbox.runtime
         policy = _CheckedPolicy(sandbox, states, agents)
         report = _report(board, spec, policy, digest, progress)
+        with _sandbox_errors():
+            sketch = observe(sandbox) if board.rules > 1 else ""
     used = {name: version for name, version in report.versions.items() if name not in _UNUSED}
     machine.versions = {**used, "onnxruntime": sandbox.runtime}
-    return report, float(np.mean(policy.rounding))
+    return report, float(np.mean(policy.rounding)), sketch
 
 
 def rounding_by_region(
@@ -224,10 +234,16 @@ def _report(
     """The evaluation of a sandboxed policy, whose errors it passes on as they are."""
     seed = evaluation_seed(board.protocol.digest, spec.digest, digest)
     protocol = board.protocol.model_copy(update={"seed": seed})
-    try:
+    with _sandbox_errors():
         return evaluate(policy, spec, protocol, action_range="unit", name=digest, progress=progress)
+
+
+@contextlib.contextmanager
+def _sandbox_errors() -> Iterator[None]:
+    """Raise the sandbox's errors, which policies wrap like those of any callable, as they are."""
+    try:
+        yield
     except PolicyError as error:
-        # `evaluate` wraps the sandbox's errors like those of any callable.
         if isinstance(error.__cause__, SMEError):
             raise error.__cause__ from None
         raise
@@ -273,7 +289,12 @@ class _CheckedPolicy:
 
 
 def _run_score(
-    board: BoardDocument, class_name: str, report: EvaluationReport, digest: str, rounding: float
+    board: BoardDocument,
+    class_name: str,
+    digest: str,
+    report: EvaluationReport,
+    rounding: float,
+    sketch: str,
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
@@ -292,5 +313,6 @@ def _run_score(
             for name, each in report.agents.items()
         ),
         rounding=rounding,
+        sketch=sketch,
         **metrics,
     )

@@ -7,7 +7,8 @@ next one continues from the state it leaves.
 
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage
-from leaderboard.store.index import EntryRow, Index, IndexUnusable, Likeness
+from leaderboard.store.index import EntryRow, Index, IndexUnusable
+from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue

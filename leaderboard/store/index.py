@@ -1,9 +1,9 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
-The tables `head`, `entry`, `object` and `artefact` are a function of the log alone, so a rebuilt
-index equals one that grew. `lease`, `turn` and `upload` are temporary state: the claims of scorers
-and the faults that ended them, the scoring time of each key, and artefacts that no submission
-names yet.
+The tables `head`, `entry`, `run`, `object` and `artefact` are a function of the log alone, so a
+rebuilt index equals one that grew. `lease`, `turn` and `upload` are temporary state: the claims of
+scorers and the faults that ended them, the scoring time of each key, and artefacts that no
+submission names yet.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from leaderboard.documents.board import BoardDocument, Folder
 from leaderboard.documents.result import METRICS, Estimate, Result, Scores
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
+from leaderboard.store import likeness
 from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
+from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, LogEntry
 
 Status = Literal["waiting", "scored", "rejected", "withdrawn"]
@@ -35,11 +37,12 @@ Status = Literal["waiting", "scored", "rejected", "withdrawn"]
 DERIVED = {  # tables and their keys
     "head": "zero",
     "entry": "id",
+    "run": "position",
     "object": "digest",
     "artefact": "digest || submission",
 }
 
-SCHEMA = """
+SCHEMA = f"""
 CREATE TABLE head (
   zero INTEGER PRIMARY KEY CHECK (zero = 0),
   board TEXT NOT NULL, sequence INTEGER NOT NULL, digest TEXT NOT NULL, time TEXT NOT NULL
@@ -56,7 +59,7 @@ CREATE TABLE entry (
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
-CREATE TABLE object (
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{likeness.SCHEMA}CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX object_of_key ON object (key, received);
@@ -84,20 +87,6 @@ CHECK_SECONDS = 60.0
 
 class IndexUnusable(Exception):
     """The index is missing, broken, or of another schema or log: rebuild it."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """An earlier submission whose policies some runs of a submission behave like.
-
-    Attributes:
-      id, key: of the earlier submission; of several, a run counts for the earliest.
-      runs: number of such runs.
-    """
-
-    id: str
-    key: str
-    runs: int
 
 
 @dataclass(frozen=True)
@@ -189,6 +178,7 @@ class Index:
         self.folder = folder
         self.document = document
         self._board = document.digest
+        self._runs = likeness.Runs(connection)
 
     @classmethod
     def open(
@@ -251,6 +241,7 @@ class Index:
             yield
         except BaseException:
             self.connection.execute("ROLLBACK")
+            self._runs.forget()
             raise
         self.connection.execute("COMMIT")
 
@@ -341,6 +332,11 @@ class Index:
                 entry.subject,
             ),
         )
+        sequence, reference = self.one(
+            "SELECT sequence, reference FROM entry WHERE id = ?", entry.subject
+        ) or (0, True)
+        if not reference:
+            self._runs.add(entry.subject, sequence, result.runs)
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 
     def _withdrawn(self, entry: LogEntry) -> None:
@@ -371,12 +367,15 @@ class Index:
 
     def entries(self) -> list[EntryRow]:
         """All submissions, in the order in which they were received."""
-        return [_entry_row(row) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")]
+        alike = self._runs.likenesses()
+        return [
+            _entry_row(row, alike) for row in self.connection.execute(f"{_ROWS} ORDER BY sequence")
+        ]
 
     def entry(self, id: str) -> EntryRow | None:
         """One submission; None if there is no such submission."""
         row = self.one(f"{_ROWS} WHERE id = ?", id)
-        return None if row is None else _entry_row(row)
+        return None if row is None else _entry_row(row, self._runs.likenesses(id))
 
     def derived_rows(self) -> Iterator[tuple[str, str, tuple[Any, ...]]]:
         """Table, key and values of each row that the log determines, in a fixed order."""
@@ -497,8 +496,9 @@ def _scores(text: str) -> Scores:
     return Scores.model_construct(None, **named, normalised_regret=tuple(estimates[count:]))
 
 
-def _entry_row(row: tuple[Any, ...]) -> EntryRow:
+def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Likeness, ...]]) -> EntryRow:
     values = dict(zip(_COLUMNS, row, strict=True))
+    values["alike"] = alike.get(values["id"], ())
     for name in ("enough_runs", "oracle_like", "reference"):
         values[name] = bool(values[name])
     if values["scores"] is not None:

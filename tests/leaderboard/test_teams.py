@@ -113,7 +113,7 @@ def test_a_board_of_teams_scores_a_shared_policy_and_each_agent(
 def evaluate_optimum() -> None:
     machine = score._Machine(available_isolation())
     data, digest = optimal_onnx(TEAM), "sha256:" + "0" * 64
-    score._evaluate(DOCUMENT, TEAM, data, digest, lambda *_: None, machine)
+    score._evaluate(DOCUMENT, TEAM, data, digest, lambda *_: None, machine, lambda _: "")
 
 
 def test_no_agent_receives_state_channels_that_it_does_not_observe(

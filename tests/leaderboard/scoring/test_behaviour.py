@@ -1,0 +1,239 @@
+"""Runs that repeat one policy are refused, whatever their bytes; honest runs are not."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from leaderboard.documents import sketch
+from leaderboard.errors import Rejection
+from leaderboard.scoring.behaviour import CONSTANT, FLOOR, Behaviours
+from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry.evaluation import reference_policy
+from sme_registry.spec import Suite
+
+PROTOCOL = EvaluationProtocol(states_per_region=100)
+
+
+def plane(**setting: Any) -> SMESpec:
+    setting = {"state_dim": 2, "action_dim": 2, "complexity": 3, **setting}
+    suite = Suite.from_dict({"classes": [{"name": "a", "setting": setting, "seeds": [0]}]})
+    return suite.instances[0]
+
+
+SPEC = plane()
+Numbers = npt.NDArray[Any]
+Policy = Callable[[Numbers], Numbers]
+OPTIMUM: Any = reference_policy("optimal", SPEC)
+
+
+def network(seed: int, hidden: int = 32) -> list[Numbers]:
+    """A network fitted to 400 optimal actions: random features, and least squares on them."""
+    rng = np.random.default_rng(seed)
+    s = np.concatenate([rng.random((400, 2)), np.zeros((400, 2))], axis=1)
+    W, b = 3 * rng.normal(size=(4, hidden)), rng.normal(size=hidden)
+    features = np.maximum(s @ W + b, 0.0)
+    V = np.linalg.lstsq(features, OPTIMUM(s) - 0.5, rcond=1e-3)[0]
+    return [W, b, V]
+
+
+def act(o: Numbers, W: Numbers, b: Numbers, V: Numbers) -> Numbers:
+    return np.maximum(o.astype(float) @ W + b, 0.0) @ V + 0.5
+
+
+def policy(weights: list[Numbers]) -> Policy:
+    return functools.partial(act, W=weights[0], b=weights[1], V=weights[2])
+
+
+def permuted(weights: list[Numbers]) -> list[Numbers]:
+    W, b, V = weights
+    order = np.random.default_rng(0).permutation(len(b))
+    return [W[:, order], b[order], V[order]]
+
+
+def rescaled(weights: list[Numbers]) -> list[Numbers]:
+    W, b, V = weights
+    factor = np.random.default_rng(0).uniform(0.2, 5.0, len(b))
+    return [W * factor, b * factor, V / factor[:, None]]
+
+
+def noisy(weights: list[Numbers], noise: float, seed: int = 0) -> list[Numbers]:
+    rng = np.random.default_rng(seed)
+    return [each * (1 + noise * rng.normal(size=each.shape)) for each in weights]
+
+
+def shifted(weights: list[Numbers], by: float) -> Policy:
+    return lambda o: policy(weights)(o) + by
+
+
+def observed(*policies: Policy, spec: SMESpec = SPEC, submission: str = "one") -> list[str]:
+    behaviours = Behaviours(PROTOCOL, submission)
+    return [behaviours.observe(f"runs.{i}", spec, each) for i, each in enumerate(policies)]
+
+
+def refused(*policies: Policy, spec: SMESpec = SPEC) -> bool:
+    try:
+        observed(*policies, spec=spec)
+    except Rejection as error:
+        return error.code == "run_repeated"
+    return False
+
+
+ORIGINAL = network(0)
+COPIES = {
+    "the same": ORIGINAL,
+    "permuted": permuted(ORIGINAL),
+    "rescaled": rescaled(ORIGINAL),
+    "0.1 % noise": noisy(ORIGINAL, 0.001),
+}
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_one_policy_in_other_bytes_is_one_run(name: str) -> None:
+    assert refused(policy(ORIGINAL), policy(COPIES[name]))
+
+
+def test_independent_trainings_are_runs() -> None:
+    assert not refused(*(policy(network(seed)) for seed in range(6)))
+
+
+def test_a_copy_that_differs_only_outside_the_cube_is_refused() -> None:
+    def other_outside(o: Numbers) -> Numbers:
+        outside = (np.abs(o[:, :2] - 0.5).max(axis=1) > 0.5)[:, None]
+        return np.where(outside, policy(network(1))(o), policy(ORIGINAL)(o))
+
+    assert refused(policy(ORIGINAL), other_outside)
+
+
+def test_the_error_names_the_other_run() -> None:
+    with pytest.raises(Rejection, match=r"of runs\.1 in the same states") as caught:
+        observed(policy(network(1)), policy(ORIGINAL), policy(COPIES["permuted"]))
+
+    assert caught.value.code == "run_repeated"
+
+
+def test_the_same_policy_on_another_instance_is_no_repetition() -> None:
+    behaviours = Behaviours(PROTOCOL, "one")
+    for spec in (SPEC, plane(complexity=2)):
+        behaviours.observe("runs.0", spec, policy(ORIGINAL))
+
+
+def test_near_optimal_copies_are_refused_and_near_optimal_networks_are_not() -> None:
+    assert refused(OPTIMUM, lambda o: OPTIMUM(o) + FLOOR / 2)
+    wave = [lambda o, k=k: OPTIMUM(o) + 2e-3 * np.sin(9 * o[:, :2] + k) for k in range(3)]
+    assert not refused(*wave)
+
+
+def test_runs_that_collapsed_to_one_constant_are_no_repetition() -> None:
+    corner = [lambda o, k=k: np.full((len(o), 2), [1.0 + k, -3.0 - k]) for k in range(5)]
+    almost = [lambda o, k=k: 0.3 + CONSTANT * np.sin(o[:, :2] + k) for k in range(3)]
+
+    assert observed(*corner, *almost) == [""] * 8
+
+
+def test_hardly_trained_networks_are_runs() -> None:
+    def weak(seed: int) -> Policy:
+        W, b, V = network(seed)
+        return policy([W, b, 0.02 * V])
+
+    assert not refused(*map(weak, range(4)))
+
+
+def test_a_saturated_policy_that_depends_on_the_state_is_compared() -> None:
+    def bang(o: Numbers) -> Numbers:
+        return (o[:, :2] > 0.4) * 1.0
+
+    assert refused(bang, lambda o: 3 * bang(o) - 1)
+
+
+# Sketches
+
+
+def alike(one: str, other: str) -> bool:
+    x, y = (sketch.numbers(sketch.to_bytes(each)) for each in (one, other))
+    return sketch.alike(x[0], y).tolist() == sketch.alike(y[0], x).tolist() == [0]
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_copies_have_like_sketches_in_other_submissions(name: str) -> None:
+    (one,), (other,) = (
+        observed(policy(weights), submission=submission)
+        for submission, weights in (("one", ORIGINAL), ("two", COPIES[name]))
+    )
+
+    assert one != other  # other states
+    assert alike(one, other)
+
+
+def test_independent_trainings_have_unlike_sketches() -> None:
+    sketches = [observed(policy(network(k)), submission=f"{k}")[0] for k in range(8)]
+
+    pairs = [(one, other) for i, one in enumerate(sketches) for other in sketches[:i]]
+    assert not any(alike(*pair) for pair in pairs)
+
+
+def test_no_policy_hides_behind_the_states_of_another_submission() -> None:
+    # The public parts of a sketch are its waves and mixtures. A policy that errs differently in
+    # the states of one submission has no effect on the next.
+    seen: list[Numbers] = []
+
+    def recorded(o: Numbers) -> Numbers:
+        seen.append(np.array(o))
+        return policy(ORIGINAL)(o)
+
+    (one,) = observed(recorded)
+    probes = {row.tobytes() for row in np.concatenate(seen)}
+
+    def hiding(o: Numbers) -> Numbers:
+        known = np.array([row.tobytes() in probes for row in o])[:, None]
+        return np.where(known, 0.5, policy(ORIGINAL)(o))
+
+    (other,) = observed(hiding, submission="two")
+    assert alike(one, other)
+
+
+def test_the_optimum_is_like_the_optimum() -> None:
+    (one,), (other,) = (observed(OPTIMUM, submission=name) for name in ("one", "two"))
+
+    assert alike(one, other)
+
+
+def test_a_sketch_is_a_function_of_policy_protocol_instance_and_submission() -> None:
+    one, again = (observed(policy(ORIGINAL))[0] for _ in range(2))
+    elsewhere = Behaviours(PROTOCOL.model_copy(update={"seed": 1}), "one")
+    other = elsewhere.observe("runs.0", SPEC, policy(ORIGINAL))
+
+    assert one == again
+    assert not sketch.differ(one, again, 0.0)
+    assert sketch.differ(one, other, 1e-9)
+    assert sketch.differ(one, "", 1.0)
+
+
+def test_numbers_that_are_not_finite_are_like_nothing() -> None:
+    (one,) = observed(policy(ORIGINAL))
+    good = sketch.numbers(sketch.to_bytes(one))
+    for value in (np.nan, np.inf, 0.0):
+        bad = np.full_like(good, value)
+        assert sketch.alike(bad[0], good).tolist() == []
+        assert sketch.alike(good[0], bad).tolist() == []
+    assert sketch.alike(good[0], good[:0]).tolist() == []
+
+
+def test_the_policies_of_teams_are_compared_and_sketched() -> None:
+    agents = [{"name": f"agent_{i}", "action_dim": 1} for i in range(2)]
+    spec = plane(team={"agents": agents})
+
+    def shared(number: int) -> Policy:
+        rng = np.random.default_rng(number)
+        W = rng.normal(size=(6, 1))
+        return lambda o: 0.5 + 0.2 * np.sin(o @ W)
+
+    assert not refused(shared(0), shared(1), spec=spec)
+    assert refused(shared(0), shared(0), spec=spec)
+    one, other = (observed(shared(0), spec=spec, submission=name)[0] for name in "pq")
+    assert alike(one, other)
