@@ -341,18 +341,22 @@ def test_no_interval_of_a_regret_reaches_below_zero() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wd", "ood", "expected"),
+    ("wd", "ood", "expected", "by_rules_1"),
     [
-        (0.0, 0.01, True),
-        (0.5, 0.01, True),
-        (0.02, 0.03, True),
-        (0.02, 0.031, False),
-        (0.021, 0.022, False),
-        (0.0, 0.011, False),
+        (0.0, 0.01, True, True),
+        (0.5, 0.01, True, True),
+        (0.0, 0.5, True, False),  # perfect inside, and anything outside
+        (0.0, 0.011, True, False),
+        (0.011, 0.022, False, False),
+        (0.02, 0.03, True, True),
+        (0.02, 0.031, False, False),
+        (0.021, 0.022, True, False),  # π* shrunk by two per cent
+        (0.05, 0.06, True, False),
+        (0.051, 0.051, False, False),
     ],
 )
-def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
-    wd: float, ood: float, expected: bool
+def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside(
+    wd: float, ood: float, expected: bool, by_rules_1: bool
 ) -> None:
     values = {
         "wd_regret": wd,
@@ -364,7 +368,6 @@ def test_oracle_like_is_little_regret_outside_or_as_little_as_inside(
     estimates = {name: Estimate(value=x, low=x, high=x) for name, x in values.items()}
     assert tuple(values) == METRICS
 
-    assert (
-        _oracle_like(Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2))
-        is expected
-    )
+    scores = Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2)
+    assert _oracle_like(scores, 2) is expected
+    assert _oracle_like(scores, 1) is by_rules_1
