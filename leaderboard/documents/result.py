@@ -157,8 +157,10 @@ class Result(Document):
       scores, classes, runs: null and empty where it was rejected.
       runs: those that the submission lists, in its order; by rules 1 then those that it does not.
       enough_runs: whether each instance (by rules 1, each class) has the runs that ranking needs.
-      oracle_like: OOD regret ≤ 0.01, or WD regret ≤ 0.02 and |OOD decay| ≤ 0.01: the page asks
-        for code.
+      oracle_like: whether the method, or any run, has a WD or OOD regret of at most 0.01, or a WD
+        regret of at most 0.05 and an |OOD decay| of at most 0.01: the page asks for code. By rules
+        1 the method, with an OOD regret of at most 0.01, or a WD regret of at most 0.02 and an
+        |OOD decay| of at most 0.01.
       versions: of the packages on which the numbers depend.
       isolation: of the sandbox, "bwrap" or "process"; empty in results of rules 1.
     """

@@ -371,3 +371,14 @@ def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside
     scores = Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2)
     assert _oracle_like(scores, 2) is expected
     assert _oracle_like(scores, 1) is by_rules_1
+
+
+def test_one_oracle_like_run_marks_a_method() -> None:
+    level = Estimate(value=0.4, low=0.4, high=0.4)
+    scores = Scores(**dict.fromkeys(METRICS, level), normalised_regret=(level, level))
+    run = failed_run(BOARD, "two", None)
+    near = run.model_copy(update={"wd_regret": 0.005})
+
+    assert not _oracle_like(scores, 2, [run])
+    assert _oracle_like(scores, 2, [run, near])
+    assert not _oracle_like(scores, 1, [run, near])

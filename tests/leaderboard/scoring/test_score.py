@@ -113,6 +113,40 @@ def score(
 LINEAR = as_bytes(models.linear())
 
 
+def hidden_units(order: list[int], factor: float = 1.0) -> bytes:
+    """The same function for every order of its units and every factor above 0."""
+    rng = np.random.default_rng(0)
+    W, V = rng.normal(size=(4, 8)), rng.normal(size=(8, 2))
+    nodes = [
+        models.node("MatMul", "o W", "h"),
+        models.node("Relu", "h", "r"),
+        models.node("MatMul", "r V", "a"),
+    ]
+    tensors = [
+        models.tensor(name, numbers.astype(np.float32))
+        for name, numbers in (("W", W[:, order] * factor), ("V", V[order] / factor))
+    ]
+    return as_bytes(models.model(nodes, tensors))
+
+
+def test_one_policy_in_several_files_is_refused_and_both_runs_are_named() -> None:
+    original, permuted = hidden_units(list(range(8))), hidden_units(list(range(8))[::-1])
+    rescaled = hidden_units(list(range(8)), 0.3)
+    assert len({original, permuted, rescaled}) == 3
+    for copy in (permuted, rescaled):
+        result = score(original, LINEAR, LINEAR, copy)
+
+        assert (result.status, result.code) == ("rejected", "run_repeated")
+        assert result.message.startswith("runs.3 (class shallow")
+        assert "runs.0 in the same states" in result.message
+
+
+def test_runs_carry_sketches_by_which_copies_are_found() -> None:
+    result = score(LINEAR, constant_onnx, None)
+
+    assert [bool(run.sketch) for run in result.runs] == [True, False, False]
+
+
 def without_rounding(result: Result) -> Result:
     """The result without what random numbers measured."""
     runs = tuple(run.model_copy(update={"rounding": None}) for run in result.runs)
