@@ -114,7 +114,8 @@ def score(
     """Score all waiting submissions.
 
     Several of these commands may run at once, and each may be killed at any point. Every policy
-    runs in its own sandboxed process, without your files and with limits on time and memory.
+    runs in bubblewrap (apt install bubblewrap), without your files and with limits on time and
+    memory; where it is not installed, the limits remain.
     Submissions that cannot be scored because of a fault of the machine keep waiting and are listed
     at the end, with exit code 1.
 
@@ -122,6 +123,7 @@ def score(
 
       sme-leaderboard score board --workers 2
     """
+    from leaderboard.artefact.isolation import available_isolation
     from leaderboard.scoring.worker import run_scorers
     from leaderboard.store import Store
 
@@ -132,8 +134,15 @@ def score(
     if not waiting:
         out().print("No submission is waiting.")
         return
+    isolation = available_isolation()
+    if isolation == "process":
+        err().print(
+            "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
+            "could read your files and use your network. Install it: apt install bubblewrap.",
+            soft_wrap=True,
+        )
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
-        run_scorers(board, workers, progress=progress.update_of)
+        run_scorers(board, workers, progress=progress.update_of, isolation=isolation)
     with Store.open(board) as store:
         entries = store.entries()
     counts = Counter(entry.status for entry in entries if entry.id not in before)

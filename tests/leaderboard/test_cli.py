@@ -12,6 +12,7 @@ import httpx
 import pytest
 from typer.testing import CliRunner, Result
 
+from leaderboard.artefact import isolation
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
 from leaderboard.documents.board import hex_of
@@ -99,6 +100,26 @@ def test_help_prints_the_examples_unchanged(monkeypatch: pytest.MonkeyPatch) -> 
         shown = " ".join(good(command.name, "--help").split())
         for example in filter(None, map(str.strip, examples)):
             assert example in shown
+
+
+def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    make_board()
+    broken = Path("bin/bwrap").absolute()
+    broken.parent.mkdir()
+    broken.write_text("#!/bin/sh\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", str(broken.parent))
+    isolation._bwrap.cache_clear()
+    assert "bubblewrap is installed" in fails(2, "score", "board")
+    broken.unlink()
+    result = board_command("score", "board")
+    assert result.exit_code == 0
+    assert "bubblewrap is not installed" in " ".join(result.stderr.split())
+    with Store.open("board", read_only=True) as store:
+        kinds = {store.result(entry.id).isolation for entry in store.entries()}  # type: ignore[union-attr]
+    assert kinds == {"process"}
 
 
 def test_from_a_key_to_a_page() -> None:
