@@ -190,7 +190,7 @@ QUANTITIES = {
     "waiting_submissions": "maximum number that wait to be scored",
     "artefact_bytes": "maximum size of an artefact",
     "age_days": "maximum age of a signature",
-    "total_bytes": "maximum size of all artefacts",
+    "total_bytes": "maximum size of all artefacts and documents",
     # Time
     "seconds": "duration",
     "wall_seconds": "wall-clock time",

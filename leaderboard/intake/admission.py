@@ -27,7 +27,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from leaderboard.intake.refusals import Refusals
-from leaderboard.intake.uploads import quota_window
+from leaderboard.intake.uploads import check_room, quota_window
 from leaderboard.store import Store
 
 _DAY = datetime.timedelta(days=1)
@@ -117,6 +117,8 @@ def admit(
     with store.transaction():  # no other submission can use the quota or the name in between
         _check_name(store, submission.submitter)
         _check_quotas(store, key, moment, refused)
+        if key != store.document.key:
+            check_room(store, key, len(signed.to_bytes()))
         for declared in _artefacts(submission).values():  # nor can `gc` take an artefact
             _check_stored(store, key, declared)
         return store.receive(signed)

@@ -12,7 +12,7 @@ import re
 from leaderboard.documents.keys import SigningKey, verifies
 from leaderboard.documents.submission import now, shifted, utc
 from leaderboard.errors import Rejection
-from leaderboard.store import Store
+from leaderboard.store import Store, make_room
 
 UPLOAD_MINUTES = 10
 _DAY, _SKEW = datetime.timedelta(days=1), datetime.timedelta(minutes=UPLOAD_MINUTES)
@@ -138,9 +138,20 @@ def check_upload(
             f"key={key[:16]}…: has uploaded {used:,} of {limits.upload_bytes_per_day:,} bytes "
             "within 24 hours. Upload the rest 24 hours after the first of them.",
         )
-    if store.total_bytes() + pending + size > limits.total_bytes:
+    check_room(store, key, pending + size)
+
+
+def check_room(store: Store, key: str, size: int) -> None:
+    """Reject (`quota`) what does not fit onto a board, even without the uploads of others.
+
+    Args:
+      store: the board; it loses uploads that no submission names if it is full.
+      key: the public key of the sender, which loses nothing.
+      size: of what is to be stored, in bytes.
+    """
+    if not make_room(store, size, keep=key):
         raise Rejection(
             "quota",
-            f"objects: the board's {limits.total_bytes:,} bytes are full. "
-            "Ask its owner to raise the limit or to run `sme-leaderboard gc`.",
+            f"board: its {store.document.limits.total_bytes:,} bytes are full. "
+            "Send it again in a few minutes, or ask the board's owner to raise the limit.",
         )

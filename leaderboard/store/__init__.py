@@ -6,7 +6,7 @@ next one continues from the state it leaves.
 """
 
 from leaderboard.store.files import digest_of, read_document
-from leaderboard.store.garbage import Garbage, collect_garbage
+from leaderboard.store.garbage import Garbage, collect_garbage, make_room
 from leaderboard.store.index import EntryRow, Index, IndexUnusable
 from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
@@ -31,6 +31,7 @@ __all__ = [
     "Store",
     "collect_garbage",
     "digest_of",
+    "make_room",
     "read_document",
     "unknown_submission",
 ]

@@ -1,12 +1,19 @@
-"""`collect_garbage`: remove what dead processes and missing submissions leave behind."""
+"""What dead processes and missing submissions leave behind, and how it is removed.
+
+`collect_garbage` does so on request, `make_room` where a board is full.
+"""
 
 from __future__ import annotations
 
+import datetime
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from leaderboard.documents.submission import shifted, utc
 from leaderboard.store.files import unwritable
+from leaderboard.store.index import Index
 from leaderboard.store.store import Store
 from sme_registry.io import TEMPORARY
 
@@ -71,10 +78,84 @@ def collect_garbage(
         size = sum(path.lstat().st_size for path in paths)
         if not dry_run:
             for path in paths:
-                try:
-                    path.unlink()
-                except OSError as error:
-                    raise unwritable(path, error) from error
+                _remove(path)
             for digest in objects:
                 index.connection.execute("DELETE FROM upload WHERE digest = ?", (digest,))
+            _forget_uploads_of_named_artefacts(index, objects_older_than)
     return Garbage(len(temporary), len(objects), size)
+
+
+def make_room(store: Store, size: int, *, keep: str = "", older_than: float = 600.0) -> bool:
+    """Remove artefacts that no submission names, until `size` more bytes fit onto the board.
+
+    Whoever has no submission on the board loses its uploads first, and then whoever has uploaded
+    nothing for longest. An upload's age is that of its key's last one, so that a key that uploads
+    many artefacts over a slow connection keeps the first of them.
+
+    Args:
+      store: the board.
+      size: in bytes.
+      keep: the public key of an uploader that loses nothing.
+      older_than: seconds since a key's last upload; a submission may follow within that time.
+
+    Returns:
+      False if they do not fit; then nothing is removed.
+
+    Raises:
+      BoardError: a file cannot be removed.
+    """
+    limit = store.document.limits.total_bytes
+    if store.total_bytes() + size <= limit:
+        return True
+    with store.transaction() as index:
+        excess = store.total_bytes() + size - limit
+        removed: set[tuple[str, str]] = set()
+        files: list[str] = []
+        uploads = index.connection.execute(_UNNAMED, (keep, *_outside(older_than))).fetchall()
+        holders = Counter(digest for (digest,) in index.connection.execute(_HOLDERS))
+        for digest, bytes_, key in uploads:
+            if excess <= 0:
+                break
+            removed.add((digest, key))
+            holders[digest] -= 1
+            if holders[digest] == 0:
+                files.append(digest)
+                excess -= bytes_
+        if excess > 0:
+            return False
+        for digest in files:
+            _remove(store.folder.object(digest))
+        index.connection.executemany("DELETE FROM upload WHERE digest = ? AND key = ?", removed)
+    return True
+
+
+_HOLDERS = "SELECT digest FROM upload WHERE digest NOT IN (SELECT digest FROM object)"
+_UNNAMED = """
+SELECT digest, size, upload.key FROM upload
+JOIN (SELECT key, max(time) AS last FROM upload GROUP BY key) AS uploader USING (key)
+WHERE digest NOT IN (SELECT digest FROM object) AND key <> ? AND NOT (last > ? AND last <= ?)
+ORDER BY EXISTS (SELECT 1 FROM entry WHERE entry.key = upload.key), last, time, digest
+"""
+
+
+def _outside(seconds: float) -> tuple[str, str]:
+    """Ends of the time in which an upload is young; it is not if its time is in the future."""
+    moment = datetime.datetime.now(datetime.UTC)
+    age = datetime.timedelta(seconds=seconds)
+    return utc(shifted(moment, -age)), utc(shifted(moment, age))
+
+
+def _forget_uploads_of_named_artefacts(index: Index, older_than: float) -> None:
+    """Forget who else has the bytes of a submission's artefact, and has not submitted it."""
+    index.connection.execute(
+        "DELETE FROM upload WHERE digest IN (SELECT digest FROM object) "
+        "AND NOT (time > ? AND time <= ?)",
+        _outside(older_than),
+    )
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from error

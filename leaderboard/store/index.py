@@ -55,10 +55,11 @@ CREATE TABLE entry (
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL,
   enough_runs INTEGER NOT NULL DEFAULT 0, oracle_like INTEGER NOT NULL DEFAULT 0,
-  reference INTEGER NOT NULL, scores TEXT
+  reference INTEGER NOT NULL, scores TEXT, bytes INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
+CREATE INDEX entry_bytes ON entry (bytes);
 CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{likeness.SCHEMA}CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -297,6 +298,7 @@ class Index:
             "policies": sum(run.artefact is not None for run in submission.runs),
             "steps": sum(run.steps for run in submission.runs),
             "reference": submitter.key == self.document.key and method.family == "reference",
+            "bytes": path.stat().st_size,
         }
         self.connection.execute(
             f"INSERT INTO entry ({', '.join(values)}) VALUES (:{', :'.join(values)})", values
@@ -324,11 +326,12 @@ class Index:
         _check_subject(entry, result.submission)
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
-            "scores = ? WHERE id = ?",
+            "scores = ?, bytes = bytes + ? WHERE id = ?",
             (
                 *(entry.document, result.status, result.code),
                 *(result.enough_runs, result.oracle_like),
                 None if result.scores is None else _scores_text(result.scores),
+                path.stat().st_size,
                 entry.subject,
             ),
         )
@@ -346,8 +349,8 @@ class Index:
         signed = read_document(self.folder, path, SignedWithdrawal, entry.document)
         _check_subject(entry, signed.withdrawal.submission)
         self.connection.execute(
-            "UPDATE entry SET status = 'withdrawn', withdrawal = ? WHERE id = ?",
-            (entry.document, entry.subject),
+            "UPDATE entry SET status = 'withdrawn', withdrawal = ?, bytes = bytes + ? WHERE id = ?",
+            (entry.document, path.stat().st_size, entry.subject),
         )
         self.connection.execute("DELETE FROM lease WHERE submission = ?", (entry.subject,))
 

@@ -287,26 +287,30 @@ class Store(Database):
             return index.head
 
     def uploaded_bytes(self, key: str, since: str, until: str = LAST_TIME) -> int:
-        """Bytes that a key has uploaded after `since` and not after `until`.
+        """Bytes that a key has sent or caused after `since` and not after `until`.
 
-        Both have the form of `submission.now()`. An upload dated after `until` was made while the
-        clock was wrong.
+        These are its artefacts and submissions, and their results and withdrawals. Both times have
+        the form of `submission.now()`. An upload dated after `until` was made while the clock was
+        wrong.
         """
         with self.reading() as index:
             return index.number(
                 "SELECT (SELECT coalesce(sum(size), 0) FROM object "
                 "WHERE key = ?1 AND received > ?2 AND received <= ?3) + "
                 "(SELECT coalesce(sum(size), 0) FROM upload "
-                "WHERE key = ?1 AND time > ?2 AND time <= ?3)",
+                "WHERE key = ?1 AND time > ?2 AND time <= ?3) + "
+                "(SELECT coalesce(sum(bytes), 0) FROM entry "
+                "WHERE key = ?1 AND received > ?2 AND received <= ?3)",
                 *(key, since, until),
             )
 
     def total_bytes(self) -> int:
-        """Bytes of all artefacts."""
+        """Bytes of all artefacts, submissions, results and withdrawals."""
         with self.reading() as index:
             return index.number(
-                "SELECT coalesce(sum(size), 0) FROM "
-                "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload)"
+                "SELECT (SELECT coalesce(sum(size), 0) FROM "
+                "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload))"
+                " + (SELECT coalesce(sum(bytes), 0) FROM entry)"
             )
 
     def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:

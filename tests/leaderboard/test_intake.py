@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from tests.leaderboard.conftest import (
     tiny_submission,
 )
 
+Upload = Callable[[str, bytes, float], str]
 ANY_TIME = "2000-01-01T00:00:00Z"
 
 
@@ -618,3 +619,125 @@ def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: Signi
 
 def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
+
+
+def test_documents_count_like_artefacts(store: Store, key: SigningKey) -> None:
+    signed = put_submission(store, key)
+    (artefact,) = {run.artefact.size for run in signed.submission.runs if run.artefact}
+    before = artefact + len(signed.to_bytes())
+    assert store.uploaded_bytes(key.public, ANY_TIME) == store.total_bytes() == before
+    assert run_scorer(store.folder.path) == 1
+    result = store.folder.result(signed.id).stat().st_size
+    assert store.uploaded_bytes(key.public, ANY_TIME) == before + result
+    withdrawal = signed_withdrawal(store, signed.id, key)
+    store.withdraw(withdrawal)
+    after = before + result + store.folder.withdrawal(signed.id).stat().st_size
+    assert store.total_bytes() == after
+    store.reindex()
+    assert store.total_bytes() == after
+
+
+def test_a_full_board_accepts_no_submission(tmp_path: Path, key: SigningKey) -> None:
+    limits = {"total_bytes": 2000, "artefact_bytes": 2000}
+    with tiny_board(tmp_path / "b", limits=limits) as store:
+        signed, artefacts = tiny_submission(store, key, statement="x" * 1500)
+        put(store, key, artefacts)
+        assert code_of(lambda: receive(store, signed)) == "quota"
+        assert store.entries() == []
+
+
+# Room on a full board.
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> Iterator[tuple[Store, Upload]]:
+    """A board of 1,000 bytes, and how to fill it with old uploads."""
+    with tiny_board(tmp_path / "full", limits={"total_bytes": 1000, "artefact_bytes": 900}) as made:
+
+        def upload(key: str, data: bytes, minutes: float) -> str:
+            digest = "sha256:" + _sha256(data)
+            made.put_object(digest, [data], by=key)
+            time = utc(datetime.datetime.now(datetime.UTC) - datetime.timedelta(minutes=minutes))
+            with made.transaction() as index:
+                index.connection.execute(
+                    "UPDATE upload SET time = ? WHERE digest = ? AND key = ?", (time, digest, key)
+                )
+            return digest
+
+        yield made, upload
+
+
+A, B, C, ME = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
+
+
+def left(store: Store) -> set[bytes]:
+    return {store.objects.read(digest)[:1] for digest, _ in store.objects.paths()}
+
+
+def test_old_uploads_without_a_submission_make_room(full: tuple[Store, Upload]) -> None:
+    store, upload = full
+    upload(A, b"1" * 300, 30)
+    upload(B, b"2" * 300, 40)
+    upload(C, b"3" * 300, 20)
+    intake.check_upload(store, ME, 100)
+    assert left(store) == {b"1", b"2", b"3"}  # it fits without
+    intake.check_upload(store, ME, 150)
+    assert left(store) == {b"1", b"3"}
+    intake.check_upload(store, ME, 900)
+    assert (left(store), store.total_bytes()) == (set(), 0)
+
+
+def test_young_uploads_and_those_of_the_sender_stay(full: tuple[Store, Upload]) -> None:
+    store, upload = full
+    upload(A, b"1" * 300, 9)
+    upload(ME, b"2" * 300, 90)
+    upload(B, b"3" * 300, 90)
+    upload(B, b"4" * 50, 1)  # B still uploads
+    assert code_of(lambda: intake.check_upload(store, ME, 100)) == "quota"
+    assert left(store) == {b"1", b"2", b"3", b"4"}
+    upload(C, b"5" * 40, 90)
+    assert code_of(lambda: intake.check_upload(store, ME, 100)) == "quota"
+    assert b"5" in left(store)  # it would not have been enough
+
+
+def test_who_has_a_submission_keeps_uploads_longer(
+    full: tuple[Store, Upload], key: SigningKey
+) -> None:
+    store, upload = full
+    plain = tiny_submission(store, key)[0].submission.to_dict()
+    for run in plain["runs"]:
+        run["artefact"] = None
+    signed = type(tiny_submission(store, key)[0].submission).from_dict(plain)
+    store.receive(signed.signed(key, store.document.key))
+    used = store.total_bytes()
+    with store.transaction() as index:  # documents count, too
+        index.connection.execute("UPDATE entry SET bytes = 100")
+    assert used > 100
+    upload(key.public, b"1" * 400, 90)
+    upload(A, b"2" * 400, 20)
+    intake.check_upload(store, ME, 200)
+    assert left(store) == {b"1"}
+
+
+def test_bytes_that_two_keys_uploaded_stay_until_both_lose_them(
+    full: tuple[Store, Upload],
+) -> None:
+    store, upload = full
+    digest = upload(A, b"1" * 600, 90)
+    upload(B, b"1" * 600, 9)
+    assert store.total_bytes() == 600
+    assert code_of(lambda: intake.check_upload(store, ME, 500)) == "quota"
+    assert store.possesses(A, digest)
+    with store.transaction() as index:
+        index.connection.execute("UPDATE upload SET time = '2020-01-01T00:00:00Z'")
+    intake.check_upload(store, ME, 500)
+    assert not store.possesses(A, digest)
+    assert not store.objects.has(digest)
+
+
+def test_uploads_dated_in_the_future_make_room(full: tuple[Store, Upload]) -> None:
+    """They were made while the clock was wrong."""
+    store, upload = full
+    upload(A, b"1" * 600, -60 * 24 * 365)
+    intake.check_upload(store, ME, 500)
+    assert left(store) == set()
