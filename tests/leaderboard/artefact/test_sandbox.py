@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import itertools
 import os
 import random
 import re
@@ -408,6 +409,28 @@ def test_external_data_cannot_be_read_without_the_gate(isolation, ungated, tmp_p
     W.data_location = W.EXTERNAL
     W.external_data.add(key="location", value=os.path.relpath(secret, "/"))
     assert code_of(found) == "onnx_refused"
+
+
+def test_another_format_that_onnxruntime_knows_is_refused_without_the_gate(ungated, tmp_path):
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.optimized_model_filepath = str(tmp_path / "model.ort")
+    options.add_session_config_entry("session.save_model_format", "ORT")
+    onnxruntime.InferenceSession(linear().SerializeToString(), options)
+    assert code_of((tmp_path / "model.ort").read_bytes()) == "onnx_refused"
+
+
+def test_denormal_numbers_are_zero():
+    factors = {"small": 1e-25, "tiny": 1e-20, "large": 1e25, "huge": 1e20}
+    names = ["y", *(f"{name}_y" for name in factors)]
+    nodes = [
+        node("Mul", f"{before} {name}", after)
+        for name, (before, after) in zip(factors, itertools.pairwise(names), strict=True)
+    ]
+    tensors = [tensor(name, np.float32(factor)) for name, factor in factors.items()]
+    with opened(squashed([*nodes, node("Identity", names[-1], "a")], tensors)) as policy:
+        assert (policy(observations(8)) == 0.0).all()
 
 
 @pytest.mark.parametrize("data", [b"", b"no model", b"\x08\x08" * 1000], ids=repr)
