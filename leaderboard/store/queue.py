@@ -92,7 +92,7 @@ class Queue:
           The claim; None if there is nothing to claim now.
 
         Raises:
-          BoardError: the index cannot be written.
+          BoardError: the index cannot be written, or the board's key is missing.
         """
         with self._database.transaction() as index:
             boot, at = _uptime()
@@ -104,6 +104,7 @@ class Queue:
             row = index.one(_NEXT, boot, at)
             if row is None:
                 return None
+            self._database.signing_key()  # without it no result could follow
             id, key, attempts, faults, fault, start = row
             index.connection.execute(
                 "REPLACE INTO lease VALUES (?, ?, ?, 1, ?, ?, ?, ?, ?)",

@@ -27,7 +27,7 @@ from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board
 
 @pytest.fixture
 def board(store, submit) -> Path:
-    """A board of two real policies and one run that failed."""
+    """A board of three policies."""
     submit(1)
     submit(2)
     submit(3)

@@ -6,6 +6,7 @@ import pytest
 
 from leaderboard import intake
 from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import BoardError
 from leaderboard.store import Store
 from leaderboard.store.queue import retry_seconds
 from tests.leaderboard.conftest import put_submission, signed_withdrawal
@@ -223,6 +224,19 @@ def test_a_new_key_is_neither_before_nor_behind_those_that_wait(store, submit, c
         assert store.queue.finish(claim, synthetic_result(store, claim.id))
         order.append(ids[claim.id])
     assert order == [0, 0, 0, 1, 0, 1, 0, 1, 0, 1, 0, 0]
+
+
+def test_nothing_is_claimed_without_the_boards_key(store, submit):
+    submit()
+    key = store.folder.key.read_text()
+    store.folder.key.unlink()
+    with (
+        Store.open(store.folder.path) as other,
+        pytest.raises(BoardError, match=r"board\.key"),
+    ):
+        other.queue.claim("worker")
+    store.folder.key.write_text(key)
+    assert store.queue.claim("worker").attempt == 1
 
 
 def test_two_scorers_work_for_two_keys(store, submit):
