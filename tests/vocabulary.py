@@ -14,6 +14,7 @@ QUANTITIES = {
     "agents_regret": "regret of each agent of a team, mean over steps",
     "mae": "mean |a − a*|",
     "normalised_regret": "N_m = mean |a − a*| / mean |½ − a*|",
+    "rounding": "mean |Δa| where every operation's result is rounded at random",
     "clipped_share": "share of action entries outside the action range",
     # Performance over the regions of an evaluation
     "wd_regret": "N₀, normalised regret in WD",

@@ -167,6 +167,8 @@ def test_check_and_board_compute_the_same_scores() -> None:
     good("submit", "bundle", "board")
     good("score", "board")
     on_board = json.loads(good("show", "board", id, "--json"))["result"]
+    for run in (*at_home["runs"], *on_board["runs"]):
+        run.pop("rounding", None)  # measured on random states
     for field in ("scores", "runs", "classes", "suite", "protocol"):
         assert at_home[field] == on_board[field]
 
