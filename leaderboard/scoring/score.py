@@ -44,6 +44,7 @@ ROUNDING_STATES = 1024
 """States of each region in which the effect of rounding is measured."""
 
 _ROUNDING_DRAWS = 4
+_SINGLE_ROWS = 8  # of a checked batch, evaluated one at a time
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch")
 
@@ -275,7 +276,7 @@ class _CheckedPolicy:
     def __call__(self, observations: Observations) -> Actions:
         end = self._first + len(observations)
         if self._first <= self._batch_with < end or end == self._states:
-            self._sandbox.check_rows(observations)
+            self._sandbox.check_rows(observations, _SINGLE_ROWS)
         low, high = np.searchsorted(self._chosen, (self._first, end))
         self._rows.append(observations[self._chosen[low:high] - self._first])
         a = self._sandbox(observations)

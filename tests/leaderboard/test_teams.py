@@ -141,7 +141,7 @@ def test_the_rows_of_every_agent_are_checked_in_every_region(
 ) -> None:
     checked: list[tuple[float, ...]] = []
     monkeypatch.setattr(
-        sandbox.Sandbox, "check_rows", lambda self, seen: checked.append(tuple(seen[0, -2:]))
+        sandbox.Sandbox, "check_rows", lambda self, seen, rows: checked.append(tuple(seen[0, -2:]))
     )
     evaluate_optimum()
     regions = [checked[first : first + 2] for first in range(0, len(checked), 2)]

@@ -323,7 +323,7 @@ class Recorder:
     def __call__(self, observations: Observations) -> Observations:
         return observations[:, :1]
 
-    def check_rows(self, observations: Observations) -> None:
+    def check_rows(self, observations: Observations, rows: int) -> None:
         self.checked.append(observations)
 
     def check_rounding(self, observations: Observations) -> float:
