@@ -171,19 +171,24 @@ def test_the_likenesses_do_not_depend_on_the_order_of_scoring(board, author, thi
 
 
 def test_another_process_and_a_failed_transaction_leave_no_stale_sketches(board, author, thief):
-    board.add(author, 1, 2, 3, 4)
-    with Store.open(board.store.folder.path) as other:
-        second = Board(other)
-        second._numbers = itertools.count(50)
-        second.add(SigningKey.generate(), 5, 6, 7, 8)
+    first = board.add(author, 1, 2, 3, 4)
+    runs = [
+        run.model_copy(update={"sketch": sketch_of(7, 0)})
+        for run in synthetic_result(board.store, first).runs
+    ]
 
     def fails() -> None:
         with board.store.transaction() as index:
-            index._runs.add("sha256:" + "f" * 64, 99, [])
+            for number in (90, 91):
+                index._runs.add(f"sha256:{number:064}", number, runs)
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         fails()
+    with Store.open(board.store.folder.path) as other:
+        second = Board(other)
+        second._numbers = itertools.count(50)
+        second.add(SigningKey.generate(), 5, 6, 7, 8)
     copy = board.add(thief, 5, 6, 3, 4)
 
     assert [runs for _, runs in board.copies(copy)] == [2, 2]
