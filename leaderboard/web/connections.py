@@ -7,13 +7,14 @@ A connection is in one of three phases, each with its own limit:
     writing    the client has not read what was sent    at most `stalled_seconds` for each piece
 
 When all slots are taken, or all those of one address, a new connection takes the slot of another
-one: of the one that has waited longest without a complete request, else of the one whose body or
-answer moves slowest. Clients that send a request and read its answer are never affected.
+one: of the one that has waited longest without a complete request, or, if that has just come, of
+the one whose body or answer moves slowest.
 """
 
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,8 +22,9 @@ from typing import Any, Literal
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from leaderboard.web.limits import LOOPBACK, Network, counted_address
+from leaderboard.web.limits import LEAST_RATE, LOOPBACK, Network, counted_address
 
+_COMPARED = 64
 _HEAD_BYTES = 2**14
 _ENDING_SECONDS = 2.0  # before uvicorn cancels requests, which would log each as an error
 _TINY_CHUNKS, _CHUNK_BYTES = 1000, 256  # a chunked body has larger chunks, but for some
@@ -40,12 +42,14 @@ class ConnectionLimits:
         and trusted proxies are exempt, because many clients share their addresses.
       head_seconds: from the start, or the end of an answer, until a request head is complete.
       stalled_seconds: for the client to read what was sent, at most 64 KiB and the system's buffer.
+      grace_seconds: for which a new connection or request keeps its slot if others are slow.
     """
 
     connections: int = 1000
     of_one_address: int = 64
     head_seconds: float = 10.0
     stalled_seconds: float = 30.0
+    grace_seconds: float = 1.0
 
 
 class Connections:
@@ -115,12 +119,19 @@ class Connections:
                 del self._of_address[address]
 
     def _close_one(self, candidates: Collection[Connection]) -> bool:
-        waiting = (each for each in self._waiting if each in candidates)
-        slow = (each for each in candidates if each.depends_on_client)
-        chosen = next(waiting, None) or min(slow, key=lambda each: each.rate, default=None)
-        if chosen is None:
+        grace = self.limits.grace_seconds
+        waiting = next((each for each in self._waiting if each in candidates), None)
+        # Of many, some are enough to find a slow one, and to look at all would be slow itself.
+        some = random.sample(list(candidates), min(len(candidates), _COMPARED))
+        moving = [each for each in some if each.depends_on_client]
+        slow = [each for each in moving if each.age > grace and each.rate < LEAST_RATE]
+        # One that has just come may be about to send its request: slow ones go before it.
+        if waiting is not None and (waiting.age > grace or not slow):
+            waiting.abort()
+        elif moving:
+            min(slow or moving, key=lambda each: each.rate).abort()
+        else:
             return False
-        chosen.abort()
         return True
 
 
@@ -173,7 +184,12 @@ class Connection(H11Protocol):
     @property
     def rate(self) -> float:
         """Bytes a second that the client has sent or read in this exchange."""
-        return self._moved / (1.0 + self.loop.time() - self._started)
+        return self._moved / (1.0 + self.age)
+
+    @property
+    def age(self) -> float:
+        """Seconds for which it has waited for a request, or has been in its exchange."""
+        return self.loop.time() - self._started
 
     def abort(self) -> None:
         """Close the connection at once, and drop what is not sent."""
@@ -233,7 +249,7 @@ class Connection(H11Protocol):
         phase: _Phase = "writing" if self.flow.write_paused else "waiting" if idle else "working"
         if phase == self._phase:
             return
-        if self._phase in (None, "waiting"):
+        if "waiting" in (phase, self._phase):
             self._started = self.loop.time()
         if phase == "waiting":
             self._moved = 0

@@ -130,7 +130,7 @@ def test_clients_without_a_complete_request_lock_nobody_out(path: Path, first: b
 
 def test_a_request_in_progress_loses_its_slot_only_to_a_faster_one(path: Path) -> None:
     """The slot of a connection without a request is taken first, whenever it began."""
-    with serving(path, limited(connections=3)) as url:
+    with serving(path, limited(connections=3, grace_seconds=PATIENCE)) as url:
         slow, fast = connect(url, BODY + b" "), connect(url, BODY + b" " * 59_000)
         for _ in range(3):
             assert httpx.get(f"{url}/healthz", timeout=PATIENCE).status_code == 200
@@ -142,6 +142,18 @@ def test_a_request_in_progress_loses_its_slot_only_to_a_faster_one(path: Path) -
         for each, missing in ((fast, 1000), (third, 10_000), (fourth, 10_000)):
             each.sendall(b" " * missing)
             assert each.recv(2**16).startswith(b"HTTP/1.1 400 ")
+            each.close()
+
+
+def test_one_that_has_just_come_keeps_its_slot_before_slow_ones(path: Path) -> None:
+    with serving(path, limited(connections=4, head_seconds=2.0)) as url:
+        slow = [connect(url, BODY + b" " * 30_000) for _ in range(3)]
+        assert rest(connect(url)) == b""  # after two seconds, more than the grace
+        silent = connect(url)
+        fast = connect(url, BODY + b" " * 60_000)
+        assert fast.recv(2**16).startswith(b"HTTP/1.1 400 ")
+        assert answers(silent)
+        for each in (*slow, fast):
             each.close()
 
 
