@@ -347,6 +347,22 @@ def test_a_board_without_a_description_has_no_field_for_it() -> None:
     ]
 
 
+def test_a_bundle_for_one_board_is_accepted_there_only() -> None:
+    good("keygen")
+    make_board()
+    good("init", "other", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")
+    arguments = ("--runs", "runs.json", "--method", "Linear", "--submitter", "A Lab")
+    assert "--suite" in fails(
+        2, "new", "bundle", "--board", "board", "--suite", "tiny-v1.json", *arguments
+    )
+    id = good("new", "bundle", "--board", "board", *arguments).split()[0]
+    assert "wrong_board" in fails(1, "submit", "bundle", "other")
+    assert good("submit", "bundle", "board").strip() == id
+    unbound = make_bundle("unbound")
+    for board in ("board", "other"):  # signed anew for each
+        assert good("submit", "unbound", board).strip() == unbound
+
+
 def test_everything_a_submitter_needs_is_at_the_boards_address() -> None:
     good("keygen")
     make_board()

@@ -123,7 +123,7 @@ def test_a_board_is_created_completely_or_not_at_all(tmp_path):
 
 
 def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
-    with small_disk(tmp_path / "disk", "1500k") as disk:
+    with small_disk(tmp_path / "disk", "2000k") as disk:
         if disk is None:
             pytest.skip("no file system may be mounted here")
         messages = []
