@@ -40,7 +40,7 @@ from sme_registry.io import versions
 
 Progress = Callable[[int, int], None]
 
-ROUNDING_STATES = 1024
+ROUNDING_STATES = 512
 """States of each region in which the effect of rounding is measured."""
 
 _ROUNDING_DRAWS = 4
