@@ -44,6 +44,18 @@ def available_isolation() -> Isolation:
     return "bwrap"
 
 
+def isolation_for_own() -> Isolation:
+    """The isolation for policies of one's own: a broken bubblewrap is no reason to refuse them.
+
+    Raises:
+      MissingDependencyError: onnxruntime is not installed.
+    """
+    try:
+        return available_isolation()
+    except ScoringFault:
+        return "process"
+
+
 def start(isolation: Isolation, arguments: Sequence[int]) -> subprocess.Popen[bytes]:
     """Start a child with its limits, its pipes open and unbuffered.
 
@@ -131,7 +143,7 @@ def _bwrap() -> tuple[str, ...]:
     if not answer.startswith(child.HEAD.pack(child.OK, child.START.size)):
         raise ScoringFault(
             f"bubblewrap is installed ({program}) but does not start a process, with status "
-            f"{process.returncode}. Containers often forbid user namespaces: allow them, or remove "
-            "bubblewrap if nobody else can submit to this board."
+            f"{process.returncode}. Containers often forbid user namespaces: allow them, or use "
+            "--unsafe-no-sandbox if nobody else can submit to this board."
         )
     return command

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -21,6 +21,18 @@ from leaderboard.cli.options import (
 )
 from leaderboard.errors import BoardError
 from sme_registry.terminal import Progress, err, out, print_json, templates
+
+if TYPE_CHECKING:
+    from leaderboard.artefact.isolation import Isolation
+
+
+UnsafeNoSandbox = Annotated[
+    bool,
+    typer.Option(
+        "--unsafe-no-sandbox",
+        help="Score without bubblewrap: policies could read your files and use your network.",
+    ),
+]
 
 
 def init(
@@ -110,6 +122,7 @@ def score(
     workers: Annotated[
         int, typer.Option("--workers", "-w", min=1, max=256, help="Number of processes.")
     ] = 1,
+    unsafe_no_sandbox: UnsafeNoSandbox = False,
 ) -> None:
     """Score all waiting submissions.
 
@@ -124,6 +137,23 @@ def score(
       sme-leaderboard score board --workers 2
     """
     from leaderboard.artefact.isolation import available_isolation
+
+    isolation: Isolation = "process" if unsafe_no_sandbox else available_isolation()
+    if isolation == "process" and not unsafe_no_sandbox:
+        err().print(
+            "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
+            "could read your files and use your network. Install it: apt install bubblewrap.",
+            soft_wrap=True,
+        )
+    score_waiting(board, workers, isolation)
+
+
+def score_waiting(board: Path, workers: int, isolation: Isolation) -> None:
+    """Score all waiting submissions of a board, and print what became of them.
+
+    Raises:
+      typer.Exit: with code 1, if some could not be scored because of a fault of the machine.
+    """
     from leaderboard.scoring.worker import run_scorers
     from leaderboard.store import Store
 
@@ -134,13 +164,6 @@ def score(
     if not waiting:
         out().print("No submission is waiting.")
         return
-    isolation = available_isolation()
-    if isolation == "process":
-        err().print(
-            "[bold red]Policies run without a sandbox[/]: bubblewrap is not installed, so they "
-            "could read your files and use your network. Install it: apt install bubblewrap.",
-            soft_wrap=True,
-        )
     with Progress("scoring", waiting, console=err(), unit="submissions") as progress:
         run_scorers(board, workers, progress=progress.update_of, isolation=isolation)
     with Store.open(board) as store:
@@ -203,13 +226,7 @@ def serve(
             "Repeat it for several.",
         ),
     ] = None,
-    unsafe_no_sandbox: Annotated[
-        bool,
-        typer.Option(
-            "--unsafe-no-sandbox",
-            help="Score without bubblewrap: policies could read your files and use your network.",
-        ),
-    ] = False,
+    unsafe_no_sandbox: UnsafeNoSandbox = False,
 ) -> None:
     """Serve the board: its pages, and an API that accepts submissions, and score them.
 

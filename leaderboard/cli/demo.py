@@ -43,6 +43,7 @@ def demo(
 
       sme-leaderboard demo runs/demo
     """
+    from leaderboard.artefact.isolation import isolation_for_own
     from sme_registry.training import RunRecord
 
     record = RunRecord.read(run)
@@ -55,7 +56,7 @@ def demo(
 
     err().print("Creating a board with this task and two reference rows, and submitting the agent.")
     _create_board(folder, run, record)
-    administration.score(folder / "board")
+    administration.score_waiting(folder / "board", 1, isolation_for_own())
     results.rank(folder / "board")
     out().print(
         "The run is listed without a rank, which needs ten runs in each class.\n"

@@ -242,6 +242,7 @@ def check(
 
       sme-leaderboard check td3 --protocol quick-v1
     """
+    from leaderboard.artefact.isolation import isolation_for_own
     from leaderboard.bundle import Bundle
     from leaderboard.documents.checks import check_submission
     from leaderboard.scoring.score import score_submission
@@ -257,7 +258,11 @@ def check(
     check_submission(document, submission, datetime.datetime.now(datetime.UTC))
     with Progress("scoring", len(submission.runs), console=err(), unit="states") as progress:
         result = score_submission(
-            document, submission, content.artefact, progress=progress.update_of
+            document,
+            submission,
+            content.artefact,
+            progress=progress.update_of,
+            isolation=isolation_for_own(),
         )
     if json:
         print_json(result.to_dict())

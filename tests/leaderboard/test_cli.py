@@ -113,10 +113,23 @@ def test_scoring_refuses_a_broken_bubblewrap_and_warns_of_a_missing_one(
     monkeypatch.setenv("PATH", str(broken.parent))
     isolation._bwrap.cache_clear()
     assert "bubblewrap is installed" in fails(2, "score", "board")
+    good("keygen")
+    make_bundle()
+    good("check", "bundle", "--suite", "tiny-v1.json", "--protocol", "small-v1.json")  # one's own
+    assert isolation.isolation_for_own() == "process"
     broken.unlink()
     result = board_command("score", "board")
     assert result.exit_code == 0
     assert "bubblewrap is not installed" in " ".join(result.stderr.split())
+    with Store.open("board", read_only=True) as store:
+        kinds = {store.result(entry.id).isolation for entry in store.entries()}  # type: ignore[union-attr]
+    assert kinds == {"process"}
+
+
+def test_scoring_without_a_sandbox_can_be_asked_for() -> None:
+    make_board()
+    result = board_command("score", "board", "--unsafe-no-sandbox")
+    assert (result.exit_code, "bubblewrap" in result.stderr) == (0, False)
     with Store.open("board", read_only=True) as store:
         kinds = {store.result(entry.id).isolation for entry in store.entries()}  # type: ignore[union-attr]
     assert kinds == {"process"}
