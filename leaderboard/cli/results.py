@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from leaderboard.documents.result import Estimate, Result
     from leaderboard.public_view import PublicView
     from leaderboard.scoring.ranking import RankedRow
+    from leaderboard.scoring.verify import VerifyReport
     from leaderboard.store import EntryRow, Store
 
 SYMBOLS = {"wd_regret": "N₀", "ood_regret": "N̄", "ood_decay": "N̄ − N₀"}
@@ -299,7 +300,9 @@ def verify(
     """Check every signature, hash, log entry and score, and name the first altered row.
 
     The exit code is 3 if a row was altered. --rescore draws from all results and prints its seed.
-    Differences that prove nothing, such as other versions, are listed as notes.
+    Differences that prove nothing, such as other versions, are listed as notes. The exit code is 1
+    if what the board scored is rejected here, or the reverse, for a reason that may lie in the
+    machine: repeat it on another one.
 
     Entries cut off the end of the log leave no trace in it: keep the printed digest and pass it to
     --contains next time.
@@ -323,17 +326,25 @@ def verify(
             progress=progress.update_of,
         )
     pairs = asdict(report)
+    confirmed = all(note.kind != "verdict" for note in report.notes)
     if json:
         print_json(pairs)
-        return
+    else:
+        _print_verification(report, pairs, confirmed=confirmed)
+    if not confirmed:
+        raise typer.Exit(1)
+
+
+def _print_verification(report: VerifyReport, pairs: dict[str, object], *, confirmed: bool) -> None:
     last, digest = pairs.pop("log_sequence"), pairs.pop("log_digest")
-    notes = pairs.pop("notes")
+    del pairs["notes"]
     if not report.rescored:
         del pairs["rescore_seed"], pairs["tolerance"]
-    print_pairs("[green]Verified[/]: no row was altered.", pairs)
-    for note in notes:
-        line = f"note: {note['submission']}: {note['kind']}: {note['where']}: "
-        line += f"recorded {note['recorded'] or 'nothing'}, here {note['here']}"
+    outcome = "[green]Verified[/]" if confirmed else "[yellow]Not confirmed, see the notes[/]"
+    print_pairs(f"{outcome}: no row was altered.", pairs)
+    for note in report.notes:
+        line = f"note: {note.submission}: {note.kind}: {note.where}: "
+        line += f"recorded {note.recorded or 'nothing'}, here {note.here}"
         out().print(escape(_printable(line)), soft_wrap=True)
     out().print(f"Digest of the last log entry, {last}:\n{digest}", soft_wrap=True)
 

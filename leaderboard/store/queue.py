@@ -11,8 +11,9 @@ delay everyone else's (start-time fair queueing, Goyal, Vin and Cheng 1996):
     start(key)  = max(time(key), start of the last claim)     the least is claimed next
     time(key)   = start(key) + seconds of the claim           once the claim has ended
 
-A new key starts at the present, neither before nor behind the others. Who signs with many keys gets
-many turns: only the quotas limit that.
+A new key starts at the present, neither before nor behind the others. Every fourth claim is of the
+submission received first, so that new keys, which never end, delay nobody forever. Who signs with
+many keys gets many turns: only the quotas limit that.
 """
 
 from __future__ import annotations
@@ -51,8 +52,9 @@ SELECT id, key, coalesce(attempt, 0), coalesce(faults, 0), coalesce(fault, ''),
 FROM entry LEFT JOIN lease ON submission = id
   LEFT JOIN turn USING (key) LEFT JOIN busy USING (key)
 WHERE status = 'waiting' AND (submission IS NULL OR boot <> ? OR expires <= ?)
-ORDER BY reference DESC, coalesce(claims, 0), start, sequence LIMIT 1
+ORDER BY reference DESC, {{order}} sequence LIMIT 1
 """
+_CLAIMS = "coalesce((SELECT time FROM turn WHERE key = 'claims'), 0.0)"
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,10 @@ class Queue:
         """
         with self._database.transaction() as index:
             boot, at = _uptime()
-            for (id,) in index.connection.execute(
-                f"SELECT submission FROM lease WHERE held AND NOT ({_CLAIMED})", (boot, at)
-            ).fetchall():
-                # It keeps its worker, who may be slow, and finish before anyone claims it again.
-                _end(index, id, (boot, at), fault=_NO_NEWS)
-            row = index.one(_NEXT, boot, at)
+            _end_lost(index, (boot, at))
+            claims = index.number(f"SELECT {_CLAIMS}")
+            order = "" if claims % 4 == 3 else "coalesce(claims, 0), start,"
+            row = index.one(_NEXT.format(order=order), boot, at)
             if row is None:
                 return None
             self._database.signing_key()  # without it no result could follow
@@ -111,9 +111,12 @@ class Queue:
                 (id, worker, attempts + 1, faults, fault, boot, at, at + seconds),
             )
             # Of a key whose time is past, nothing need be remembered.
-            index.connection.execute("DELETE FROM turn WHERE time < ?", (start,))
             index.connection.execute(
-                "REPLACE INTO turn VALUES ('', ?), (?, ?)", (start, key, start)
+                "DELETE FROM turn WHERE time < ? AND key <> 'claims'", (start,)
+            )
+            index.connection.execute(
+                "REPLACE INTO turn VALUES ('', ?), (?, ?), ('claims', ?)",
+                (start, key, start, claims + 1),
             )
             return Claim(id, worker, attempts + 1, seconds)
 
@@ -169,6 +172,7 @@ class Queue:
     def retry(self) -> None:
         """End the postponement of every submission, for example after a fault was repaired."""
         with self._database.transaction() as index:
+            _end_lost(index, _uptime())
             index.connection.execute("UPDATE lease SET expires = 0 WHERE NOT held")
 
     def finish(self, claim: Claim, result: Result) -> bool:
@@ -230,6 +234,15 @@ def retry_seconds(faults: int) -> float:
     if faults <= 1:
         return 0.0
     return min(RETRY_SECONDS * 2.0 ** min(faults - 2, 20), LONGEST_RETRY_SECONDS)
+
+
+def _end_lost(index: Index, now: tuple[str, float]) -> None:
+    """End the claims that have expired."""
+    for (id,) in index.connection.execute(
+        f"SELECT submission FROM lease WHERE held AND NOT ({_CLAIMED})", now
+    ).fetchall():
+        # It keeps its worker, who may be slow, and finish before anyone claims it again.
+        _end(index, id, now, fault=_NO_NEWS)
 
 
 def _end(

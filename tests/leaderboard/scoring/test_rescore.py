@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from leaderboard.cli.app import app
 from leaderboard.documents.board import Folder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
@@ -181,6 +183,8 @@ def test_a_rejection_by_chance_or_by_other_versions_is_noted(
     notes = verify(board, rescore="all").notes
     assert [note.here for note in notes if note.kind == "verdict"] == ["scored"]
     assert {note.submission for note in notes} == {id}
+    answer = CliRunner().invoke(app, ["verify", str(board), "--rescore", "all"])
+    assert (answer.exit_code, "Not confirmed" in answer.stdout) == (1, True)
 
 
 def test_scores_of_a_policy_that_is_rejected_are_found(board: Path) -> None:

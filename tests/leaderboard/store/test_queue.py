@@ -197,7 +197,30 @@ def test_keys_take_turns_by_scoring_time(store, submit, clock):
         clock[0] += 300.0 if claim.id in slow else 100.0
         assert store.queue.finish(claim, synthetic_result(store, claim.id))
         order.append("slow" if claim.id in slow else "quick")
-    assert order == ["slow", *["quick"] * 3, "slow", *["quick"] * 3, *["slow"] * 4]
+    turns = ["slow", "quick", "quick", "slow", *["quick"] * 3, "slow", "quick", *["slow"] * 3]
+    assert order == turns
+
+
+def test_new_keys_without_end_do_not_starve_a_key_that_waits(store, submit, clock):
+    first, waiting = submit(0).id, submit(1).id
+    assert store.queue.claim("worker", seconds=1000).id == first
+    for number in range(8):
+        clock[0] += 100.0
+        put_submission(store, SigningKey.generate(), 10 + number)
+        claim = store.queue.claim("worker", seconds=1000)
+        assert store.queue.finish(claim, synthetic_result(store, claim.id))
+        if claim.id == waiting:
+            return
+    pytest.fail("it never had a turn")
+
+
+def test_a_lost_claim_does_not_postpone_a_submission_that_is_to_be_retried(store, submit, clock):
+    submit()
+    for _ in range(3):
+        store.queue.claim("killed", seconds=60)
+        clock[0] += 61.0
+        store.queue.retry()
+        assert store.queue.claimable() == 1
 
 
 def test_faults_use_up_their_keys_time(store, submit, clock):
@@ -223,7 +246,7 @@ def test_a_new_key_is_neither_before_nor_behind_those_that_wait(store, submit, c
         clock[0] += 100.0
         assert store.queue.finish(claim, synthetic_result(store, claim.id))
         order.append(ids[claim.id])
-    assert order == [0, 0, 0, 1, 0, 1, 0, 1, 0, 1, 0, 0]
+    assert order == [0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 1, 0]
 
 
 def test_nothing_is_claimed_without_the_boards_key(store, submit):
