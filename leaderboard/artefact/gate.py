@@ -199,11 +199,10 @@ class _Inspection:
         onnxruntime crashes at some of the others.
         """
         required = node["input"][: _OPTIONAL_INPUTS.get(operator)]
-        if b"" in required or not node["output"] or node["output"][0] == b"":
+        if b"" in required or not node["output"] or b"" in node["output"]:
             raise WireError(f"{operator} without a name of an input or output")
         for name in node["output"]:
-            if name != b"":
-                self._define(bytes(name))
+            self._define(bytes(name))
 
     def _define(self, name: bytes) -> None:
         if name == b"" or name in self._values:

@@ -49,7 +49,10 @@ _MAX_RUNS_1 = 10_000  # by rules 1
 # ASCII only: a similar letter of another script would let one method imitate another.
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._+()-]| (?=[A-Za-z0-9._+()-]))*")
 _LINK = re.compile(r"https://[A-Za-z0-9._~:/?#\[\]@!$&'()*+,;=%-]+")
-_LOOK_ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "5": "s"})
+_LOOK_ALIKE = str.maketrans(
+    {"0": "o", "1": "l", "i": "l", "2": "z", "3": "e", "4": "a", "5": "s", "8": "b"}
+)
+_PAIRS_ALIKE = {"rn": "m", "vv": "w", "cl": "d"}  # cl after i and 1 have become l
 # Control characters, format characters (some reverse the direction of text), surrogates,
 # line separators and paragraph separators.
 _UNSAFE_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -92,7 +95,13 @@ def check_board(board: BoardDocument, signed_for: str | None) -> None:
       board: the board.
       signed_for: the public key of the board that the signature is for; None if it is for none.
     """
-    if signed_for is None or signed_for != board.signatures_for:
+    if board.signatures_for is None:
+        raise Rejection(
+            "wrong_board",
+            f"board={board.key[:16]}…: follows earlier rules ({board.rules}) and accepts nothing. "
+            "Submit to a board that was created later.",
+        )
+    if signed_for != board.signatures_for:
         stated = "none" if signed_for is None else f"{signed_for[:16]}…"
         raise Rejection(
             "wrong_board",
@@ -168,7 +177,10 @@ def skeleton(name: str) -> str:
     """
     folded = unicodedata.normalize("NFKC", name).casefold()
     letters = "".join(letter for letter in folded if letter.isalnum())
-    return letters.translate(_LOOK_ALIKE).replace("rn", "m").replace("vv", "w")
+    letters = letters.translate(_LOOK_ALIKE)
+    for pair, letter in _PAIRS_ALIKE.items():
+        letters = letters.replace(pair, letter)
+    return letters
 
 
 def check_runs(

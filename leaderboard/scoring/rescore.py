@@ -40,10 +40,13 @@ most `TOLERANCE` of `artefact.sandbox` on average."""
 
 _MARGIN = 2.0  # of other rounding errors than those drawn
 _UNCERTAIN = (
-    *("run_time", "run_memory", "run_failed", "scoring_failed"),
+    *("run_time", "run_memory", "scoring_failed"),
     *("run_batch_dependent", "run_rounding"),
 )
 """Codes of rejections that depend on the machine or on random states."""
+
+_OF_RUNTIME = ("run_failed", "onnx_refused")
+"""Codes that depend on the runtime, but with the same versions on nothing else."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,8 @@ def _other_versions(stored: Result, again: Result) -> Iterator[RescoreNote]:
 def _other_verdict(stored: Result, again: Result, other_versions: bool) -> RescoreNote:
     recorded, here = stored.code or "scored", again.code or "scored"
     uncertain = stored.code in _UNCERTAIN or again.code in _UNCERTAIN
-    if not uncertain and not (stored.status == "rejected" and other_versions):
+    of_versions = stored.status == "rejected" or again.code in _OF_RUNTIME
+    if not uncertain and not (of_versions and other_versions):
         _refuse(stored, f"scored again, it is {here}, not {recorded}. {again.message}".strip())
     return RescoreNote(stored.submission, "verdict", "code", recorded, here)
 

@@ -180,10 +180,15 @@ class Store(Database):
             )
 
     def holder_of_name(self, name: str) -> str | None:
-        """The key that was first to use a submitter's name, or one that looks like it."""
+        """The key that was first to use a submitter's name, or one that looks like it.
+
+        A name is used by an entry that waits or has had scores: otherwise, policies that are
+        rejected would be enough to occupy names.
+        """
         with self.reading() as index:
             rows = index.connection.execute(
-                "SELECT submitter, key FROM entry GROUP BY submitter, key ORDER BY min(sequence)"
+                "SELECT submitter, key FROM entry WHERE status = 'waiting' OR scores IS NOT NULL "
+                "GROUP BY submitter, key ORDER BY min(sequence)"
             )
             alike = skeleton(name)
             return next((key for submitter, key in rows if skeleton(submitter) == alike), None)

@@ -93,7 +93,10 @@ def train_suite(
     if status.failed:
         raise typer.Exit(1)
     if not json:
+        instances = max(len(one.seeds) for one in file.suite.classes)
         hint = f"To submit them: sme-leaderboard new BUNDLE --suite {suite} --runs {folder}"
+        if plan.seeds < instances:
+            hint = f"A leaderboard needs a run on every instance: use --seeds {instances} or more."
         err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)
 
 

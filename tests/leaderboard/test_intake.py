@@ -12,6 +12,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import Result
 from leaderboard.documents.submission import Envelope, SignedSubmission, SignedWithdrawal, utc
 from leaderboard.errors import Rejection
 from leaderboard.intake import admission, references
@@ -149,7 +150,7 @@ def test_an_upload_without_the_bytes_is_no_upload(store: Store, key: SigningKey)
     assert not store.possesses(copier.public, digest)
 
 
-@pytest.mark.parametrize("name", ["A Lab", "a lab", "A.Lab", "A-L-A-B", "A 1ab", "A Iab"])
+@pytest.mark.parametrize("name", ["A Lab", "a lab", "A.Lab", "A-L-A-B", "A 1ab", "A Iab", "4 La8"])
 def test_a_name_belongs_to_the_first_key_that_uses_it(
     store: Store, key: SigningKey, name: str
 ) -> None:
@@ -164,6 +165,23 @@ def test_a_name_belongs_to_the_first_key_that_uses_it(
     mine, artefacts = tiny_submission(store, key, 3, submitter={"name": name, "key": key.public})
     put(store, key, artefacts)
     assert receive(store, mine) == mine.id
+
+
+def test_policies_that_are_rejected_occupy_no_name(store: Store, key: SigningKey) -> None:
+    put_submission(store, key, 1, submitter={"name": "A Lab", "key": key.public})
+    assert store.holder_of_name("a lab") == key.public  # while it waits
+    claim = store.queue.claim("worker")
+    assert claim is not None
+    board = store.document
+    rejected = Result(
+        submission=claim.id,
+        suite=board.suite.digest,
+        protocol=board.protocol.digest,
+        status="rejected",
+        code="run_failed",
+    )
+    assert store.queue.finish(claim, rejected)
+    assert store.holder_of_name("a lab") is None
 
 
 def test_two_keys_that_send_a_name_at_once_do_not_share_it(

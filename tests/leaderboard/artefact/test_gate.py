@@ -309,6 +309,9 @@ BAD = {
     "fewer outputs announced than there are": (split(3, num_outputs=2), "onnx_malformed"),
     "more outputs announced than there are": (split(3, num_outputs=4), "onnx_malformed"),
     "outputs that nothing announces": (split(3), "onnx_malformed"),
+    "a second output without a name": (
+        squashed([node_with("Split", ["y"], ["q", ""], axis=1, num_outputs=2),
+                  node("Tanh", "q", "a")], opsets=[("", 18)]), "onnx_malformed"),
     "an attribute given twice": (twice_attributed(), "onnx_malformed"),
     "a value computed twice": (squashed([node("Tanh", "y", "a"), node("Tanh", "y", "a")]),
                                "onnx_malformed"),

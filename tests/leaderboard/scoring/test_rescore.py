@@ -21,7 +21,7 @@ from leaderboard.documents.submission import Run
 from leaderboard.errors import TamperedError
 from leaderboard.scoring.aggregation import result_of
 from leaderboard.scoring.metrics import levels_of, run_metrics
-from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw
+from leaderboard.scoring.rescore import RESCORED, RescoreNote, _other_verdict, draw
 from leaderboard.scoring.score import evaluation_seed
 from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import run_scorer
@@ -199,6 +199,19 @@ def test_scores_of_a_policy_that_is_rejected_are_found(board: Path) -> None:
     )
     with pytest.raises(TamperedError, match="it is onnx_interface, not scored"):
         verify(board, rescore="all")
+
+
+@pytest.mark.parametrize("code", ["run_failed", "onnx_refused"])
+def test_a_policy_that_fails_here_was_not_scored_by_the_same_versions(
+    board: Path, code: str
+) -> None:
+    with Store.open(board, read_only=True) as store:
+        scored = store.result(store.entries()[STEADY].id)
+    assert scored is not None
+    again = rejected(code)(scored)
+    assert _other_verdict(scored, again, other_versions=True).here == code
+    with pytest.raises(TamperedError, match=f"it is {code}, not scored"):
+        _other_verdict(scored, again, other_versions=False)
 
 
 def forged(board: Path, scored: Result, id: str, run: Run) -> Result:
