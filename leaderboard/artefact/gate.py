@@ -199,7 +199,7 @@ class _Inspection:
         onnxruntime crashes at some of the others.
         """
         required = node["input"][: _OPTIONAL_INPUTS.get(operator)]
-        if b"" in required or not node["output"] or b"" in node["output"]:
+        if b"" in required or not node["output"]:
             raise WireError(f"{operator} without a name of an input or output")
         for name in node["output"]:
             self._define(bytes(name))

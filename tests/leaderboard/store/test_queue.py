@@ -217,10 +217,9 @@ def test_new_keys_without_end_do_not_starve_a_key_that_waits(store, submit, cloc
 def test_a_lost_claim_does_not_postpone_a_submission_that_is_to_be_retried(store, submit, clock):
     submit()
     for _ in range(3):
-        store.queue.claim("killed", seconds=60)
+        assert store.queue.claim("killed", seconds=60) is not None
         clock[0] += 61.0
         store.queue.retry()
-        assert store.queue.claimable() == 1
 
 
 def test_faults_use_up_their_keys_time(store, submit, clock):
