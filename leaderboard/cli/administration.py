@@ -105,7 +105,7 @@ def init(
     out().print(f"Created {folder}: {kind} with suite {name} and protocol {protocol_name}.")
     out().print(
         f"A ranked entry needs {templates.plural(runs, 'trained policy', 'trained policies')}: at "
-        f"least {runs_to_rank} in each class ({classes}), and as many on each of its instances "
+        f"least {runs_to_rank} in each class ({classes}), equally many on each of its instances "
         f"({instances} in the suite).",
         soft_wrap=True,
     )
