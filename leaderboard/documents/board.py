@@ -218,15 +218,15 @@ class Folder:
         """The board's private key.
 
         Raises:
-          BoardError: it is missing, or is not a regular file.
+          BoardError: it is missing, is not a regular file, or contains no key.
         """
         try:
-            read_regular(self.key, 4096)
+            data = read_regular(self.key, 4096)
         except OSError as error:
             raise BoardError(
                 f"{self.key}: cannot be read: {error.strerror}. Restore the board's key."
             ) from None
-        return SigningKey.read(self.key)
+        return SigningKey.parse(data, self.key)
 
     def submission(self, id: str) -> Path:
         """The path of a submission, by its id."""

@@ -56,16 +56,26 @@ class SigningKey:
           BoardError: the file is missing or contains no key.
         """
         _require_nacl()
+        try:
+            data = Path(path).read_bytes()
+        except OSError as error:
+            raise _no_key(path, str(error.strerror)) from None
+        return cls.parse(data, path)
+
+    @classmethod
+    def parse(cls, data: bytes, path: str | os.PathLike[str]) -> SigningKey:
+        """The key in the bytes of a file; an error names its path.
+
+        Raises:
+          BoardError: they are no key.
+        """
+        _require_nacl()
         from nacl import signing
 
         try:
-            text = Path(path).read_text("ascii").strip()
-            return cls(signing.SigningKey(bytes.fromhex(text)))
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or "not 64 hex digits"
-            raise BoardError(
-                f"{path}: no signing key: {reason}. Create one with `sme-leaderboard keygen`."
-            ) from None
+            return cls(signing.SigningKey(bytes.fromhex(data.decode("ascii").strip())))
+        except ValueError:
+            raise _no_key(path, "not 64 hex digits") from None
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the key into a new file that only its owner can read.
@@ -129,6 +139,12 @@ def verifies(
     except (CryptoError, ValueError):
         return False
     return True
+
+
+def _no_key(path: str | os.PathLike[str], reason: str) -> BoardError:
+    return BoardError(
+        f"{path}: no signing key: {reason}. Create one with `sme-leaderboard keygen`."
+    )
 
 
 def _require_nacl() -> None:
