@@ -126,6 +126,19 @@ def put_submission(
     return signed
 
 
+def put_policy(store: Store, key: SigningKey, data: bytes, number: int = 0) -> SignedSubmission:
+    """`put_submission`, with one run: this artefact on the suite's first instance."""
+    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    store.put_object(digest, [data], by=key.public)
+    run = {
+        "spec": store.document.suite.instances[0].digest,
+        "seed": 0,
+        "steps": 5,
+        "artefact": {"sha256": digest, "size": len(data)},
+    }
+    return put_submission(store, key, number, runs=[run])
+
+
 def signed_withdrawal(
     store: Store, id: str, key: SigningKey, reason: str = "a test"
 ) -> SignedWithdrawal:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -28,7 +27,7 @@ from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
 from sme_registry.io import to_json
 from tests.leaderboard.artefact import models
-from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board
+from tests.leaderboard.conftest import linear_onnx, put_policy, tiny_board
 from tests.leaderboard.scoring.test_verify import resign
 
 STEADY, SENSITIVE, REFUSED = range(3)
@@ -62,15 +61,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for number, data in enumerate(
             [linear_onnx(0), sensitive_onnx(), linear_onnx(0, observation_dim=9)]
         ):
-            digest = "sha256:" + hashlib.sha256(data).hexdigest()
-            store.put_object(digest, [data], by=key.public)
-            run = {
-                "spec": store.document.suite.instances[0].digest,
-                "seed": 0,
-                "steps": 5,
-                "artefact": {"sha256": digest, "size": len(data)},
-            }
-            put_submission(store, key, number, runs=[run])
+            put_policy(store, key, data, number)
         run_scorer(path)
         assert [row.status for row in store.entries()] == ["scored", "scored", "rejected"]
     return path

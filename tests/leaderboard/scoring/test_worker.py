@@ -22,7 +22,7 @@ from leaderboard.scoring.verify import verify
 from leaderboard.scoring.worker import background_scorers, run_scorer, run_scorers
 from leaderboard.store import Queue, Store
 from sme_registry.errors import MissingDependencyError, OptionError
-from tests.leaderboard.conftest import linear_onnx, put_submission, tiny_board
+from tests.leaderboard.conftest import linear_onnx, put_policy, put_submission, tiny_board
 
 
 @pytest.fixture
@@ -48,18 +48,7 @@ def test_a_scorer_empties_the_queue_and_returns(store, board):
 
 
 def test_an_invalid_policy_is_rejected_with_its_code(store, key):
-    data = linear_onnx(0, observation_dim=9)
-    import hashlib
-
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
-    store.put_object(digest, [data], by=key.public)
-    run = {
-        "spec": store.document.suite.instances[0].digest,
-        "seed": 0,
-        "steps": 5,
-        "artefact": {"sha256": digest, "size": len(data)},
-    }
-    signed = put_submission(store, key, 0, runs=[run])
+    signed = put_policy(store, key, linear_onnx(0, observation_dim=9))
     assert run_scorer(store.folder.path) == 1
     assert store.entry(signed.id).code == "onnx_interface"
 
