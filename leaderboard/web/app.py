@@ -110,7 +110,8 @@ def create_app(
     )
     app.state.scores = score_workers > 0  # see `errors.on_board_error`
     app.add_middleware(limits.RequestsByAddress, limit=requests_of_address)
-    app.add_middleware(Guard)  # the last one is the outermost
+    app.add_middleware(Guard)
+    app.add_middleware(limits.RefusedBodies)  # the last one is the outermost
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
     app.add_api_route("/api/objects/{digits}", routes.get_object, methods=["GET", "HEAD"])
@@ -177,22 +178,17 @@ class _Routes:
         limit = self._store.document.limits.artefact_bytes
         # The HTTP parser accepts digits only, and holds the body to them.
         size = int(request.headers.get("Content-Length", limit))
-        try:
-            key = intake.uploader(
-                request.headers.get("Authorization"), digest, board=self._store.document.key
-            )
-            async with self._reservations.reserve(key, size):
-                # Without a name, and in the board's file system.
-                with await to_thread.run_sync(
-                    lambda: tempfile.TemporaryFile(dir=self._store.folder.path)
-                ) as spool:
-                    async for chunk in limits.body_chunks(request, size, self._upload_seconds):
-                        await to_thread.run_sync(spool.write, chunk)
-                    new = await to_thread.run_sync(self._store_object, spool, digest, key)
-        except Rejection:
-            if size <= limit:
-                await limits.drain(request, limit)
-            raise
+        key = intake.uploader(
+            request.headers.get("Authorization"), digest, board=self._store.document.key
+        )
+        async with self._reservations.reserve(key, size):
+            # Without a name, and in the board's file system.
+            with await to_thread.run_sync(
+                lambda: tempfile.TemporaryFile(dir=self._store.folder.path)
+            ) as spool:
+                async for chunk in limits.body_chunks(request, size, self._upload_seconds):
+                    await to_thread.run_sync(spool.write, chunk)
+                new = await to_thread.run_sync(self._store_object, spool, digest, key)
         return JSONResponse({"digest": digest}, 201 if new else 200)
 
     def _store_object(self, spool: IO[bytes], digest: str, key: str) -> bool:

@@ -49,8 +49,6 @@ class Guard:
                 headers = MutableHeaders(scope=message)
                 headers.update(_HEADERS)
                 headers.setdefault("Cache-Control", "no-store")
-                if message["status"] >= 400 and scope["method"] not in ("GET", "HEAD"):
-                    headers["Connection"] = "close"  # more of the body may be on its way
             for piece in _pieces(message):
                 await send(piece)
 

@@ -11,11 +11,12 @@ from typing import TypeVar
 import anyio
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
+from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard import intake
-from leaderboard.documents.submission import MAX_BYTES
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, MAX_BYTES
 from leaderboard.errors import Rejection
 from leaderboard.store import Store
 from leaderboard.web.errors import HTTP_CODES, RequestError, error_answer
@@ -25,7 +26,7 @@ UPLOAD_SECONDS = 300.0
 _DOCUMENT_SECONDS = 30.0
 LEAST_RATE = 2**15  # bytes a second
 _START_SECONDS = 30.0  # before which a body may be slower
-_DRAIN_SECONDS = 30.0
+_LINGER_SECONDS, _SILENCE_SECONDS = 30.0, 1.0
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 _T = TypeVar("_T")
@@ -82,6 +83,53 @@ class RequestsByAddress:
             await self._app(scope, receive, send)
         finally:
             self._running -= Counter({address: 1})  # drops an address without requests
+
+
+class RefusedBodies:
+    """ASGI middleware: a client whose request is refused can finish sending its body.
+
+    Cut off while it sends, it may never read why. The answer goes out at once, and ends when the
+    body has been read; nothing is kept of it. Who falls silent for a second, takes longer than 30
+    or sends more than an artefact's bytes is cut off.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http" or scope["method"] in ("GET", "HEAD"):
+            await self._app(scope, receive, send)
+            return
+        more_body, refused, cut_short = True, False, False
+
+        async def receive_some() -> Message:
+            nonlocal more_body
+            message = await receive()
+            more_body = message.get("more_body", False)
+            return message
+
+        async def send_some(message: Message) -> None:
+            nonlocal refused, cut_short
+            if message["type"] == "http.response.start":
+                refused = message["status"] >= 400
+                if refused:
+                    MutableHeaders(scope=message)["Connection"] = "close"
+            elif refused and more_body and not message.get("more_body"):
+                cut_short = True
+                message = {**message, "more_body": True}
+            await send(message)
+
+        await self._app(scope, receive_some, send_some)
+        if cut_short:
+            size = 0
+            with anyio.move_on_after(_LINGER_SECONDS):
+                while more_body and size <= MAX_ARTEFACT_BYTES:
+                    with anyio.move_on_after(_SILENCE_SECONDS) as waiting:
+                        size += len((await receive_some()).get("body", b""))
+                    if waiting.cancelled_caught:
+                        break
+            await send({"type": "http.response.body"})
 
 
 class Turns:
@@ -194,13 +242,3 @@ async def body_chunks(
                 "too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one."
             )
         yield chunk
-
-
-async def drain(request: Request, limit: int, seconds: float = _DRAIN_SECONDS) -> None:
-    """Let a client finish its body: one that is cut off while it sends may never read why.
-
-    Nothing is kept of it. A client that takes longer loses the answer, not the server a slot.
-    """
-    with contextlib.suppress(Rejection, RequestError, RuntimeError):  # already read to its end
-        async for _ in body_chunks(request, limit, seconds):
-            pass
