@@ -1,0 +1,24 @@
+"""SMEs and agents on the accelerator: environment, learner and evaluation in one XLA program.
+
+    params = task_params("SME/Default-v1")
+    observation, state = reset(key, params)
+    observation, state, reward, done, info = step(key, state, action, params)   # gymnax's signature
+
+Every module below imports JAX, which nothing outside this folder does. Importing the package turns
+64-bit numbers on for the whole process: states are float64, as METHOD, section 1 defines them.
+
+    device      the process's JAX: float64, precision, devices, compile cache
+    task        a drawn task as a pytree; several of one group, padded to equal shapes
+    transition  next states, exact: in float64, or in pairs of uint32
+    oracle      the optimal action, similarity and step reward
+    env         reset and step of one environment; vmap them
+    gymnax      the same as a class with gymnax's methods
+    networks    perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as Torch
+    ppo td3 sac the algorithms: hyperparameters, updates, and a `Program` of many lanes
+    program     what all programs have: lanes, evaluation, saving, lanes that failed
+    run         a program from its start to its end, evaluated where a study's cell is
+"""
+
+from sme_registry.jax import device as _device
+
+_device.prepare()
