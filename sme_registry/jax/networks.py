@@ -81,7 +81,7 @@ class Adam(NamedTuple):
 
     mean: Weights
     square: Weights
-    count: jax.Array
+    updates: jax.Array
 
     @classmethod
     def initial(cls, weights: Weights) -> Adam:
@@ -99,7 +99,7 @@ def adam(
     betas: tuple[float, float] = (0.9, 0.999),
 ) -> tuple[Adam, Weights]:
     """One update of `torch.optim.Adam`, in its order of operations."""
-    count = state.count + 1
+    count = state.updates + 1
     first, second = betas
     t = count.astype(jnp.float64)
     step = (learning_rate / (1.0 - first**t)).astype(jnp.float32)
