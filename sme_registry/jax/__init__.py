@@ -9,7 +9,8 @@ Every module below imports JAX, which nothing outside this folder does. Importin
 
     device      the process's JAX: float64, precision, devices, compile cache
     task        a drawn task as a pytree; several of one group, padded to equal shapes
-    transition  next states, exact: in float64, or in pairs of uint32
+    pairs       float64 numbers as pairs of uint32, for devices without float64
+    transition  next states, exact: in float64 or in pairs
     oracle      the optimal action, similarity and step reward
     env         reset and step of one environment; vmap them
     gymnax      the same as a class with gymnax's methods

@@ -1,0 +1,131 @@
+"""One SME as pure functions with gymnax's signatures; vmap them over lanes, with or without params.
+
+    observation, state = reset(key, params)
+    observation, state, reward, done, info = step(key, state, action, params)
+
+The rules are those of `sme_registry.task.step`, for one agent. `S` state_dim, `A` action_dim, both
+padded. An observation is `[S + 2]` float32: s, t/T and r_cum/k.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sme_registry.jax import oracle, pairs
+from sme_registry.jax.pairs import Pair
+from sme_registry.jax.task import TaskParams
+from sme_registry.jax.transition import States, next_state
+
+Info = dict[str, jax.Array]
+
+
+class EnvState(NamedTuple):
+    """An episode at one point.
+
+    Attributes:
+      s: `[S]` the state, float64 or a pair, as the params say.
+      t: completed steps, int32.
+      accumulated_reward: r_cum.
+    """
+
+    s: States
+    t: jax.Array
+    accumulated_reward: jax.Array
+
+
+def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
+    """Begin an episode at a uniform state, on the grid 2⁻³².
+
+    Padding does not change the numbers that a key draws.
+    """
+    bits = jax.random.bits(key, (params.W.shape[-1],), jnp.uint32)
+    bits = jnp.where(params.state_mask, bits, jnp.uint32(0))
+    if isinstance(params.b, Pair):
+        return start(pairs.from_fraction(bits), params)
+    return start(bits.astype(jnp.float64) * 2.0**-32, params)
+
+
+def start(s: States, params: TaskParams) -> tuple[jax.Array, EnvState]:
+    """Begin an episode at state s `[S]`; padded channels must be 0."""
+    state = EnvState(s, jnp.zeros((), jnp.int32), jnp.zeros((), params.r_min.dtype))
+    return observe(state, params), state
+
+
+def step(
+    key: jax.Array, state: EnvState, action: jax.Array, params: TaskParams
+) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
+    """One step; where the episode ends, the observation and state are those of a new one.
+
+    Args:
+      key: of the new episode's start.
+      state: the episode.
+      action: `[A]` in the unit range, clipped; see `to_unit`.
+      params: one task.
+
+    Returns:
+      Observation, state, reward R, done (terminated or truncated), and info: that of `step_env`,
+      and `final_observation`, that of the ended episode.
+    """
+    observation, after, reward, done, info = step_env(key, state, action, params)
+    fresh_observation, fresh = reset(key, params)
+    info["final_observation"] = observation
+    after = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
+    return jnp.where(done, fresh_observation, observation), after, reward, done, info
+
+
+def step_env(
+    key: jax.Array, state: EnvState, action: jax.Array, params: TaskParams
+) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
+    """`step` without a new episode at the end; nothing in it is random.
+
+    `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`.
+    """
+    optimal = oracle.optimal_action(params, state.s)
+    similarity = oracle.similarity(params, action, optimal)
+    step_reward = oracle.step_reward(params, similarity)
+
+    total = state.accumulated_reward + step_reward
+    t = state.t + 1
+    terminated, truncated = step_reward < params.D, t >= params.horizon
+    paid = truncated | (t % params.k == 0)
+    after = EnvState(next_state(params, state.s, action), t, jnp.where(paid, 0.0, total))
+    info = {
+        "similarity": similarity,
+        "step_reward": step_reward,
+        "regret": 1.0 - step_reward,
+        "terminated": terminated,
+        "truncated": truncated,
+    }
+    reward = jnp.where(paid, total, 0.0)
+    return observe(after, params), after, reward, terminated | truncated, info
+
+
+reset_env = reset
+"""gymnax's name of the same."""
+
+
+def observe(state: EnvState, params: TaskParams) -> jax.Array:
+    """The observation (s, t/T, r_cum/k), `[S + 2]` float32; s and t/T with the bits of NumPy's."""
+    if isinstance(state.s, Pair):
+        s, real = pairs.to_float32(state.s), jnp.float32
+    else:
+        s, real = state.s.astype(jnp.float32), jnp.float64
+    # XLA turns a division by a constant, or by one scalar of all lanes, into a product, which is
+    # an ulp off; max(t, T), which is T, is neither.
+    t = state.t.astype(real)
+    time = t / jnp.maximum(t, params.horizon.astype(real))
+    accumulated = state.accumulated_reward.astype(real) / params.k.astype(real)
+    return jnp.concatenate([s, jnp.stack([time, accumulated]).astype(jnp.float32)])
+
+
+def to_unit(action: jax.Array, symmetric: bool, dtype: Any = jnp.float64) -> jax.Array:
+    """Actions of an agent in the unit range, not clipped, as `envs.arguments.to_unit`.
+
+    A symmetric range is [−1, 1]: a = (u + 1) / 2. In float64 for exact rewards. The transition
+    rounds to float32, and gets the same bits from float32.
+    """
+    action = action.astype(dtype)
+    return (action + 1.0) / 2.0 if symmetric else action

@@ -1,0 +1,60 @@
+"""Next states, ψ(s + a W + b) with ψ(x) = 2 |x − rint x|, with the bits of `Task.transition`.
+
+Source: METHOD, section 1. In float64, or, where the task's states are pairs, in uint32 alone.
+`S` state_dim, `A` action_dim; any leading axes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from sme_registry.jax import pairs
+from sme_registry.jax.pairs import Pair
+from sme_registry.jax.task import TaskParams
+
+States = jax.Array | Pair
+
+_UNROLLED = 16  # channels; above it the program would grow with A
+
+
+def next_state(params: TaskParams, s: States, a: jax.Array) -> States:
+    """The next states, exact to the bit.
+
+    The sum runs in the fixed order of the definition, s + b and then W_i a_i for i = 1…A. Each
+    product is exact, so that it does not matter whether a compiler fuses it with its sum.
+
+    Args:
+      params: one task.
+      s: `[..., S]` states, as the task has them: float64 or pairs.
+      a: `[..., A]` actions; clipped to [0, 1], and rounded to float32.
+
+    Returns:
+      `[..., S]` next states in [0, 1].
+    """
+    a = jnp.clip(a, 0.0, 1.0).astype(jnp.float32)
+    y: Any
+    if isinstance(params.b, Pair):
+        assert isinstance(s, Pair)
+        y = pairs.add(s, params.b)
+        y = _sum_over_channels(lambda y, W, a: pairs.add(y, pairs.product(W, a)), y, params.W, a)
+        return pairs.fold(y)
+    a = a.astype(jnp.float64)
+    y = _sum_over_channels(lambda y, W, a: y + W * a, jnp.asarray(s) + params.b, params.W, a)
+    return 2.0 * jnp.abs(y - jnp.rint(y))
+
+
+def _sum_over_channels(add: Any, y: Any, W: jax.Array, a: jax.Array) -> Any:
+    channels = W.shape[0]
+    if channels <= _UNROLLED:
+        for i in range(channels):
+            y = add(y, W[i], a[..., i, None])
+        return y
+
+    def body(i: jax.Array, y: Any) -> Any:
+        return add(y, W[i], lax.dynamic_slice_in_dim(a, i, 1, axis=-1))
+
+    return lax.fori_loop(0, channels, body, y)
