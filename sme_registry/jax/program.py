@@ -4,16 +4,36 @@ A lane is one run: a task, a seed, weights. All lanes of a program have the same
 hyperparameters, budget and padded shapes, and take the same number of steps; their tasks, seeds and
 reward settings (k, T, r_min, D) differ. A lane's bits depend on the number of lanes and on no other
 lane, so results record that number.
+
+A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and the pure functions
+`initial_weights` and `act`; all else is here.
 """
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import numpy.typing as npt
 
+from sme_registry.errors import OptionError
+from sme_registry.jax import oracle
+from sme_registry.jax.device import find_device
+from sme_registry.jax.env import EnvState, observe, start, step_env, to_unit
+from sme_registry.jax.networks import HostWeights, Weights
+from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.task import Shape, TaskParams, task_params
+from sme_registry.jax.transition import States, next_state
+from sme_registry.spec import SMESpec
+
 Array = npt.NDArray[Any]
+
+_PIECE = 25  # steps of an episode that are judged at once
 
 
 class StepLog(NamedTuple):
@@ -50,16 +70,104 @@ class Evaluation(NamedTuple):
     similarity: Array
 
 
-class Program(ABC):
-    """The lanes of one algorithm: `advance` until the budget is used, then `finish`."""
-
-    steps: int
-    """Environment steps that each lane has taken."""
+class State(Protocol):
+    """All that changes in a program: a pytree of arrays, such as a NamedTuple."""
 
     @property
+    def weights(self) -> Weights:
+        """By SB3's names, `[lanes, ...]`."""
+
+
+class Program(ABC):
+    """The lanes of one algorithm: `advance` until the budget is used, then `finish`.
+
+    Attributes:
+      settings: the hyperparameters; hashable, so that equal programs share their compiled code.
+      specs: of each lane, without the copies that fill the program up.
+      budget: steps that each lane is to take.
+      symmetric: whether actions are in [−1, 1] instead of [0, 1].
+      lanes: their number, with copies.
+      params: the lanes' tasks, padded; leading axis `lanes`.
+      separable: whether rewards change no observation and end no episode (k = 1 and D = 0 in all
+        lanes), so that the oracle can be asked later, for many steps at once.
+      state: all that changes.
+      steps: environment steps that each lane has taken.
+    """
+
+    buffer = ""
+    """The field of the state that is a replay buffer, `[capacity, ...]`: longer for more steps."""
+
+    rollout = 1
+    """Steps between two updates: an evaluation due in them has the weights before the second."""
+
+    state: Any
+
+    def __init__(
+        self,
+        settings: Any,
+        specs: Sequence[SMESpec],
+        seeds: Sequence[int],
+        *,
+        steps: int,
+        action_range: str = "symmetric",
+        lanes: int | None = None,
+        shape: Shape | None = None,
+        device: str | None = None,
+    ) -> None:
+        """New lanes, before their first step.
+
+        Args:
+          settings: the hyperparameters.
+          specs: the task of each lane.
+          seeds: of each lane, in [0, 2**32): of its weights, its starts and its noise.
+          steps: that each lane is to take.
+          action_range: of the policies' actions, "symmetric" or "unit".
+          lanes: fill up to this number with copies of the first lane; None for none.
+          shape: to which the tasks are padded; None for their maxima.
+          device: see `find_device`.
+
+        Raises:
+          SpecError: a task is not one that JAX has; see `task_params`.
+          OptionError: there is no such device.
+        """
+        self.settings, self.specs, self.budget = settings, tuple(specs), steps
+        self.symmetric = action_range == "symmetric"
+        self.lanes = len(specs) if lanes is None else lanes
+        copies = self.lanes - len(specs)
+        specs = [*specs, *[specs[0]] * copies]
+        seeds = [*seeds, *[seeds[0]] * copies]
+        self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
+        self.device = find_device(device)
+        self.params: TaskParams = jax.device_put(task_params(specs, shape=shape), self.device)
+        A, S = self.params.W.shape[-2:]
+        self._padding = Padding(self.initial_weights, Widths(S, A))
+        weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
+        stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
+        keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
+        self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
+        self.steps = 0
+
     @abstractmethod
-    def lanes(self) -> int:
-        """Number of lanes."""
+    def initial_weights(
+        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        """The weights of a new lane, by SB3's names."""
+
+    @abstractmethod
+    def initial_state(self, weights: Weights, keys: jax.Array) -> State:
+        """All that changes, before the first step, for weights and random keys `[lanes, ...]`."""
+
+    @staticmethod
+    @abstractmethod
+    def act(settings: Any, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
+        """One lane's deterministic actions `[..., A]` in its action range, or beyond it.
+
+        Args:
+          settings: the hyperparameters.
+          weights: of one lane.
+          observations: `[..., O]` float32.
+          symmetric: whether the range is [−1, 1] instead of [0, 1].
+        """
 
     @abstractmethod
     def advance(self, limit: int) -> StepLog:
@@ -74,22 +182,161 @@ class Program(ABC):
     def finish(self) -> None:
         """Make the update that follows the last step."""
 
-    @abstractmethod
     def evaluate(self, states: Array) -> Evaluation:
         """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights."""
+        sums = _episodes(
+            type(self).act,
+            self.settings,
+            self.symmetric,
+            self.separable,
+            self.state.weights,
+            self.params,
+            jax.device_put(np.asarray(states, np.float64), self.device),
+        )
+        return Evaluation(*(np.asarray(each) for each in sums))
 
-    @abstractmethod
     def weights(self, lane: int) -> dict[str, Array]:
         """A lane's weights without padding, by SB3's names, as NumPy arrays."""
+        padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
+        return self._padding.remove(padded, _widths(self.specs[lane]))
 
-    @abstractmethod
     def failed(self) -> Array:
         """`[lanes]`, whether a lane's weights are not finite; such lanes go on without effect."""
+        return np.asarray(_not_finite(self.state.weights))
 
-    @abstractmethod
     def save(self) -> dict[str, Array]:
         """All state, as named arrays."""
+        leaves = jax.tree_util.tree_leaves_with_path(self.state)
+        arrays = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
+        return {"steps": np.asarray(self.steps), **arrays}
 
-    @abstractmethod
     def restore(self, arrays: dict[str, Array]) -> None:
-        """Go on from saved state, bit for bit."""
+        """Go on from saved state, bit for bit.
+
+        A replay buffer may be that of a smaller budget.
+
+        Raises:
+          OptionError: the state is another program's.
+        """
+        leaves, structure = jax.tree_util.tree_flatten_with_path(self.state)
+        names = [jax.tree_util.keystr(path) for path, _ in leaves]
+        if {"steps", *names} != arrays.keys():
+            raise OptionError(
+                "arrays: are the state of another program. Give those that a program of the same "
+                "algorithm, hyperparameters and lanes saved."
+            )
+        restored = [
+            jax.device_put(self._fitted(name, arrays[name], leaf), self.device)
+            for name, (_, leaf) in zip(names, leaves, strict=True)
+        ]
+        self.state = jax.tree_util.tree_unflatten(structure, restored)
+        self.steps = int(arrays["steps"])
+
+    def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
+        own, rng = _widths(spec), np.random.default_rng(seed)
+        return self._padding.add(
+            self.initial_weights(rng, own.observation_dim, own.action_dim), own
+        )
+
+    def _fitted(self, name: str, saved: Array, present: jax.Array) -> Array:
+        """A saved array, in the shape that it has here."""
+        saved = np.asarray(saved)
+        grows = self.buffer and name.startswith(f".{self.buffer}") and saved.ndim == present.ndim
+        shape = (len(saved), *present.shape[1:]) if grows else present.shape
+        if (
+            saved.dtype != present.dtype
+            or saved.shape != shape
+            or (grows and len(saved) > len(present))
+        ):
+            raise OptionError(
+                f"arrays[{name!r}]: is {saved.dtype} of shape {saved.shape}: must be "
+                f"{present.dtype} of shape {present.shape}. Give the state of a program of the "
+                "same lanes and tasks."
+            )
+        if saved.shape == present.shape:
+            return saved
+        longer = np.zeros(present.shape, present.dtype)
+        longer[: len(saved)] = saved
+        return longer
+
+
+def _widths(spec: SMESpec) -> Widths:
+    return Widths(spec.state_dim, spec.action_dim)
+
+
+@jax.jit
+def _not_finite(weights: Weights) -> jax.Array:
+    return ~jnp.stack(
+        [jnp.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in weights.values()]
+    ).all(axis=0)
+
+
+@functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric", "separable"))
+def _episodes(
+    act: Any,
+    settings: Any,
+    symmetric: bool,
+    separable: bool,
+    weights: Weights,
+    params: TaskParams,
+    states: jax.Array,
+) -> tuple[jax.Array, ...]:
+    """`Program.evaluate`: loops outside, vmap inside; sums in float64."""
+
+    def chosen(state: EnvState) -> jax.Array:
+        """Actions `[lanes, episodes, A]` of the unit range."""
+        observations = _each(observe, state, params=params)
+        actions = jax.vmap(lambda w, o: act(settings, w, o, symmetric))(weights, observations)
+        return to_unit(actions, symmetric)
+
+    def one_step(now: _Running) -> _Running:
+        key = jax.random.PRNGKey(0)  # a step is not random
+        _, state, reward, done, info = _each(
+            functools.partial(step_env, key), now.state, chosen(now.state), params=params
+        )
+        here = (reward, jnp.ones_like(reward), info["regret"], info["similarity"])
+        sums = jax.tree.map(lambda sum, x: sum + jnp.where(now.running, x, 0.0), now.sums, here)
+        return _Running(state, sums, now.running & ~done)
+
+    def one_piece(now: _Running) -> _Running:
+        def move(state: EnvState, _: None) -> tuple[EnvState, tuple[States, jax.Array]]:
+            a = chosen(state)
+            s = _each(lambda s, a, p: next_state(p, s, a), state.s, a, params=params)
+            return state._replace(s=s, t=state.t + 1), (state.s, a)
+
+        state, (s, a) = jax.lax.scan(move, now.state, length=_PIECE)
+        judge = jax.vmap(_judged, (0, 1, 1), (1, 1))
+        similarity, reward = judge(params, s, a)  # [piece, lanes, episodes]
+        horizon = params.horizon[:, None]
+        counted = now.state.t + jnp.arange(_PIECE)[:, None, None] < horizon
+        here = (reward, jnp.ones_like(reward), 1.0 - reward, similarity)
+        sums = jax.tree.map(
+            lambda sum, x: sum + jnp.where(counted, x, 0.0).sum(axis=0), now.sums, here
+        )
+        return _Running(state, sums, state.t < horizon)
+
+    _, begin = _each(start, states, params=params)
+    zeros = jnp.zeros_like(begin.accumulated_reward)
+    now = _Running(begin, (zeros,) * 4, jnp.ones_like(zeros, bool))
+    body = one_piece if separable else one_step
+    return jax.lax.while_loop(lambda now: now.running.any(), body, now).sums
+
+
+class _Running(NamedTuple):
+    """Episodes `[lanes, episodes]`, with the sums over their steps so far."""
+
+    state: EnvState
+    sums: tuple[jax.Array, ...]
+    running: jax.Array
+
+
+def _each(function: Any, *arguments: Any, params: TaskParams) -> Any:
+    """`function(*arguments, params)` of each episode `[lanes, episodes]`."""
+    episodes = jax.vmap(function, (*[0] * len(arguments), None))
+    return jax.vmap(episodes)(*arguments, params)
+
+
+def _judged(params: TaskParams, s: States, a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """r̃ and r `[...]` of states and actions of one task."""
+    similarity = oracle.similarity(params, a, oracle.optimal_action(params, s))
+    return similarity, oracle.step_reward(params, similarity)

@@ -1,0 +1,137 @@
+"""What all programs have: evaluation, padding, saving, lanes that failed."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jax")
+
+import jax.numpy as jnp
+
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError
+from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.jax.networks import HostWeights, Weights, initial_linear, linear
+from sme_registry.jax.program import Program, StepLog
+from sme_registry.task import materialize
+
+BASE = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=1)
+COUPLED = (BASE, BASE.derive(k=7, r_min=0.3), BASE.derive(state_dim=2, action_dim=3, D=0.1))
+SEPARABLE = (BASE, BASE.derive(seed=2, horizon=33), BASE.derive(state_dim=2, action_dim=3))
+
+
+BASE_LANES = (BASE, BASE)
+
+
+class LinearState(NamedTuple):
+    weights: Weights
+    count: Any
+    buffer: Any
+
+
+class Linear(Program):
+    """The smallest program: a linear policy that does not learn, and critic that nothing reads."""
+
+    buffer = "buffer"
+
+    def initial_weights(
+        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        both = observation_dim + action_dim
+        return {
+            **initial_linear(rng, "actor", observation_dim, action_dim),
+            **initial_linear(rng, "critic", both, 1),
+            "log_std": np.full(action_dim, 0.5, np.float32),
+        }
+
+    def initial_state(self, weights: Weights, keys: Any) -> LinearState:
+        return LinearState(weights, jnp.zeros((), jnp.int32), jnp.zeros((self.budget, self.lanes)))
+
+    @staticmethod
+    def act(settings: Any, weights: Weights, observations: Any, symmetric: bool) -> Any:
+        # Rounded, so that another order of its sums does not start another trajectory.
+        return jnp.round(32 * linear(weights, "actor", observations)) / 32
+
+    def advance(self, limit: int) -> StepLog:
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        raise NotImplementedError
+
+
+def program(specs: tuple[SMESpec, ...], **changes: Any) -> Linear:
+    return Linear((), specs, range(len(specs)), **{"steps": 4, "lanes": 4, **changes})
+
+
+CASES = {"coupled": (COUPLED, "symmetric"), "separable": (SEPARABLE, "unit")}
+
+
+@pytest.mark.parametrize(("specs", "action_range"), CASES.values(), ids=CASES.keys())
+def test_evaluations_are_those_of_numpy(specs: tuple[SMESpec, ...], action_range: str) -> None:
+    """Also in lanes that are padded, and beside copies that fill the program up."""
+    linear_program = program(specs, action_range=action_range)
+    states = np.zeros((4, 5, 3))
+    for lane, spec in enumerate(specs):
+        states[lane, :, : spec.state_dim] = start_states(lane, 0, 5, spec.state_dim)
+    evaluation = linear_program.evaluate(states)
+    assert evaluation.regret.shape == (4, 5)
+    for lane, spec in enumerate(specs):
+        weights = linear_program.weights(lane)
+        assert weights["actor.weight"].shape == (spec.action_dim, spec.state_dim + 2)
+        assert weights["critic.weight"].shape == (1, spec.state_dim + 2 + spec.action_dim)
+
+        def policy(observations: Any, weights: Any = weights) -> Any:
+            actions = observations @ weights["actor.weight"].T + weights["actor.bias"]
+            actions = np.round(32 * actions) / 32
+            return (actions + 1) / 2 if action_range == "symmetric" else actions
+
+        expected = rollouts(policy, materialize(spec), states[lane, :, : spec.state_dim])
+        length = evaluation.length[lane]
+        assert (length == expected.length).all()
+        assert evaluation.regret[lane] / length == pytest.approx(expected.regret, abs=1e-12)
+        assert evaluation.similarity[lane] / length == pytest.approx(expected.similarity, abs=1e-12)
+        assert evaluation.episode_return[lane] == pytest.approx(expected.episode_return, abs=1e-11)
+
+
+def test_weights_depend_on_their_seed_and_not_on_the_padding() -> None:
+    together, alone = program(COUPLED), Linear((), COUPLED[2:], [2], steps=4)
+    for name, weight in alone.weights(0).items():
+        assert np.array_equal(together.weights(2)[name], weight)
+    assert (together.weights(0)["critic.weight"] != together.weights(1)["critic.weight"]).any()
+    padded = np.asarray(together.state.weights["critic.weight"])[2, 0]
+    assert (padded[[2]] == 0).all()  # a third state channel
+    assert (padded[[0, 1, 3, 4, 5, 6, 7]] != 0).all()
+
+
+def test_state_is_restored_whole_also_for_more_steps() -> None:
+    one, other = program(BASE_LANES), program(BASE_LANES[::-1], steps=6)
+    one.steps = 3
+    one.state = one.state._replace(count=jnp.int32(7), buffer=jnp.ones((4, 4)))
+    other.restore(one.save())
+    assert other.steps == 3
+    assert int(other.state.count) == 7
+    assert np.asarray(other.state.buffer).sum(axis=1).tolist() == [4, 4, 4, 4, 0, 0]
+    for name, weight in one.state.weights.items():
+        assert np.array_equal(other.state.weights[name], weight)
+
+
+def test_the_state_of_another_program_is_refused() -> None:
+    two = program(BASE_LANES)
+    with pytest.raises(OptionError, match=r"actor.*float32 of shape \(3, .*must be .*\(4, "):
+        two.restore(program(BASE_LANES, lanes=3).save())
+    with pytest.raises(OptionError, match=r"buffer.*shape \(6, 4\): must be .*\(4, 4\)"):
+        two.restore(program(BASE_LANES, steps=6).save())
+    with pytest.raises(OptionError, match="another program"):
+        two.restore({"steps": np.asarray(0)})
+    assert two.steps == 0
+
+
+def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
+    broken = program(BASE_LANES)
+    assert not broken.failed().any()
+    actor = broken.state.weights["actor.weight"].at[2, 0, 0].set(jnp.nan)
+    broken.state = broken.state._replace(weights={**broken.state.weights, "actor.weight": actor})
+    assert broken.failed().tolist() == [False, False, True, False]
