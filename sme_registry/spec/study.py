@@ -28,6 +28,7 @@ Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 OFFLINE = "offline:"  # the beginning of a `uses` that learns from data
 INDEPENDENT = "independent:"  # of one with a model for each agent of a team
+JAX = "jax:"  # of one that runs with its environment in a program of JAX
 
 
 def _check_task(uses: str, setting: Setting, field: str) -> None:

@@ -1,0 +1,203 @@
+"""A program from a name and hyperparameters, and its run: advance, evaluate where due, finish.
+
+program = new_program("jax:PPO", specs, seeds, hyperparameters={"n_steps": 512}, steps=100_000)
+run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=...)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.jax.program import Array, Evaluation, Program, StepLog
+from sme_registry.jax.task import Shape
+from sme_registry.spec import SMESpec
+from sme_registry.spec.study import JAX
+
+ALGORITHMS = ("PPO", "TD3", "SAC")
+POLICY = "policy_kwargs"
+_OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `policy_kwargs`
+_PIECE = 500  # steps
+
+
+def full_name(uses: str, field: str = "uses") -> str:
+    """The exact name, `jax:PPO`, of an algorithm in any case.
+
+    Raises:
+      UnknownNameError: there is no such algorithm here; lists those there are.
+    """
+    name = uses.removeprefix(JAX)
+    for known in ALGORITHMS:
+        if known.casefold() == name.casefold():
+            return JAX + known
+    names = [JAX + known for known in ALGORITHMS]
+    raise UnknownNameError(
+        f"{field}={uses!r}: must be one of {', '.join(names)}. Other algorithms run without JAX."
+        f"{did_you_mean(uses, names)}"
+    )
+
+
+def settings_of(
+    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+) -> Any:
+    """The hyperparameters of an algorithm, with its defaults for those that are left out.
+
+    Args:
+      uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
+      hyperparameters: JSON values by the names of Stable-Baselines3; `net_arch` in `policy_kwargs`.
+      field: what error messages call them.
+
+    Raises:
+      UnknownNameError: no such algorithm.
+      OptionError: it has no such hyperparameter here, or not this value.
+    """
+    kind = _class(full_name(uses))
+    fields = {each.name for each in dataclasses.fields(kind)}
+    known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in sorted(fields)}
+    values = {}
+    for name, value in _flat(hyperparameters).items():
+        if name not in known:
+            raise OptionError(
+                f"{field}.{name}: {full_name(uses)} has no such hyperparameter."
+                f"{did_you_mean(name, known)} Known: {', '.join(known)}. For others, use the "
+                "algorithm of Stable-Baselines3."
+            )
+        values[known[name]] = value
+    try:
+        return TypeAdapter(kind).validate_python(values)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(str(part) for part in fault["loc"][:1])
+        name = next((shown for shown, own in known.items() if own == place), place)
+        raise OptionError(
+            f"{field}.{name}={values.get(place, values)!r:.60}: {fault['msg']}. Correct it, or "
+            "leave it out for the default."
+        ) from None
+
+
+def new_program(
+    uses: str,
+    specs: Sequence[SMESpec],
+    seeds: Sequence[int],
+    *,
+    hyperparameters: Mapping[str, Any] | None = None,
+    action_range: str = "symmetric",
+    steps: int,
+    lanes: int | None = None,
+    shape: Shape | None = None,
+    device: str | None = None,
+) -> Program:
+    """A program of new lanes; see `Program` for the arguments, and `settings_of`.
+
+    Raises:
+      UnknownNameError: no such algorithm.
+      OptionError: see `settings_of`; or there is no such device.
+      SpecError: a task is not one that JAX has, such as a team's.
+    """
+    name = full_name(uses)
+    program: type[Program] = getattr(_module(name), f"{name.removeprefix(JAX)}Program")
+    return program(
+        settings_of(uses, hyperparameters or {}),
+        specs,
+        seeds,
+        steps=steps,
+        action_range=action_range,
+        lanes=lanes,
+        shape=shape,
+        device=device,
+    )
+
+
+def run(
+    program: Program,
+    *,
+    due: Sequence[int] = (),
+    start_states: Callable[[int], Sequence[Array]] | None = None,
+    on_log: Callable[[StepLog], Any],
+    on_evaluation: Callable[[int, int, Evaluation], Any] | None = None,
+    after_piece: Callable[[], Any] = lambda: None,
+    piece: int = _PIECE,
+) -> None:
+    """Run a program to its end, from its start or from where it was restored.
+
+    Evaluations are those of a study's cell: the k-th one has the weights of step `due[k]`, before
+    an update that follows it; the last one waits for the end and the last update. Those whose
+    weights are the same, as in PPO's rollouts, run together.
+
+    Args:
+      program: whose state is saved only in `after_piece`, or before.
+      due: steps of the evaluations, increasing.
+      start_states: the initial states of the k-th evaluation, `[episodes, S]` of each lane that is
+        no copy; equally many in all lanes.
+      on_log: called with the steps after each piece.
+      on_evaluation: called with k, the step, and the evaluation of all lanes.
+      after_piece: called after each piece and its evaluations, when the state may be saved.
+      piece: most steps between two calls; on-policy programs finish their rollout.
+    """
+    during = list(due[:-1])
+    together = _most_at_once(during, program.rollout)
+
+    def evaluate(indices: Sequence[int], steps: Sequence[int]) -> None:
+        if not indices or start_states is None or on_evaluation is None:
+            return
+        # Always as many episodes: another number would be compiled again.
+        groups = [start_states(index) for index in indices]
+        groups += groups[-1:] * (together - len(groups))
+        evaluation = program.evaluate(_stacked(program, groups))
+        for i, (index, step) in enumerate(zip(indices, steps, strict=True)):
+            n = evaluation.length.shape[1] // len(groups)
+            on_evaluation(index, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in evaluation)))
+
+    def evaluate_due(after: int) -> None:
+        indices = [k for k, step in enumerate(during) if after < step <= program.steps]
+        evaluate(indices, [during[k] for k in indices])
+
+    if program.steps == 0:
+        evaluate_due(after=-1)
+    while program.steps < program.budget:
+        before = program.steps
+        upcoming = [step for step in during if step > before]
+        on_log(program.advance(min([before + piece, program.budget, *upcoming[:1]])))
+        evaluate_due(after=before)
+        after_piece()
+    if program.budget:
+        program.finish()
+    evaluate(range(len(during), len(due)), [program.steps])
+
+
+def _most_at_once(due: Sequence[int], rollout: int) -> int:
+    """The greatest number of evaluations with the same weights, at least 1."""
+    return int(
+        max(np.unique([-(-step // rollout) for step in due], return_counts=True)[1], default=1)
+    )
+
+
+def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
+    """Initial states of all lanes `[lanes, episodes, S]`, padded; copies have the first lane's."""
+    S = program.params.W.shape[-1]
+    own = [np.concatenate(lane) for lane in zip(*groups, strict=True)]
+    lanes = own + own[:1] * (program.lanes - len(own))
+    return np.stack([np.pad(states, [(0, 0), (0, S - states.shape[1])]) for states in lanes])
+
+
+def _module(uses: str) -> Any:
+    return importlib.import_module(f"sme_registry.jax.{uses.removeprefix(JAX).lower()}")
+
+
+def _class(uses: str) -> Any:
+    return getattr(_module(uses), uses.removeprefix(JAX))
+
+
+def _flat(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the policy by dotted names."""
+    flat = {name: value for name, value in hyperparameters.items() if name != POLICY}
+    of_policy = hyperparameters.get(POLICY, {})
+    if not isinstance(of_policy, Mapping):
+        return {**flat, POLICY: of_policy}  # refused as unknown
+    return {**flat, **{f"{POLICY}.{name}": value for name, value in of_policy.items()}}
