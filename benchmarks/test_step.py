@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -90,3 +93,64 @@ def test_batched_step(compare: Any) -> None:
             ),
         },
     )
+
+
+SCRIPT = f"""
+import sys
+import numpy as np
+import sme_registry
+
+env = sme_registry.make_vec("SME/Default-v1", {BATCH})
+actions = np.random.default_rng(0).random(({BATCH}, 4), dtype=np.float32)
+env.reset(seed=0)
+for line in sys.stdin:
+    for _ in range(int(line)):
+        observations, rewards, terminated, truncated, infos = env.step(actions)
+    print(flush=True)
+"""
+
+
+def script_stepping(script: subprocess.Popen[str]) -> Callable[[int], None]:
+    """Steps in the process of `SCRIPT`; a request costs as much as a step or two."""
+
+    def work(steps: int) -> None:
+        assert script.stdin is not None
+        assert script.stdout is not None
+        print(steps, file=script.stdin, flush=True)
+        assert script.stdout.readline() == "\n"
+
+    return work
+
+
+def started_script(trim_threshold: int) -> subprocess.Popen[str]:
+    """The process of `SCRIPT`, where glibc returns free memory above the threshold at once."""
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "MALLOC_TRIM_THRESHOLD_": str(trim_threshold)},
+    )
+
+
+def test_batched_step_of_a_plain_script(compare: Any) -> None:
+    """A script steps as fast as this process, however readily its heap shrinks.
+
+    Whether it does depends on all that a process has ever allocated; glibc's default threshold,
+    128 KiB, stays in force if it is set explicitly.
+    """
+    actions = np.random.default_rng(0).random((BATCH, 4), dtype=np.float32)
+    here = batch_stepping(sme_registry.make_vec("SME/Default-v1", BATCH), actions)
+    with started_script(2**17) as shrinking, started_script(2**27) as growing:
+        compare(
+            f"batch of {BATCH}, a plain script",
+            "batch",
+            script_stepping(shrinking),
+            500,
+            {
+                "a heap that never shrinks": (script_stepping(growing), 500, 0.95),
+                "the same in this process": (here, 500, 0.9),
+            },
+        )
+        shrinking.communicate()
+        growing.communicate()

@@ -82,12 +82,19 @@ def to_unit(
     array = np.array(array, dtype=np.float64, order="C")
     if ignored is not None:
         array[ignored] = 0.0
-    return (array + 1.0) / 2.0 if rescaled else array
+    if rescaled:  # in place: a temporary array of a large batch costs as much as the arithmetic
+        array += 1.0
+        array /= 2.0
+    return array
 
 
 def from_unit(unit: npt.NDArray[Any], rescaled: bool) -> npt.NDArray[Any]:
     """Actions of the unit range in the environment's range."""
-    return unit if not rescaled else 2.0 * unit - 1.0
+    if not rescaled:
+        return unit
+    symmetric = 2.0 * unit
+    symmetric -= 1.0
+    return symmetric
 
 
 def not_finite_error() -> ActionError:

@@ -7,6 +7,8 @@ of n agents is stepped as one: its joint observation is s, t/T and every agent's
 
 from __future__ import annotations
 
+import itertools
+import sys
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +25,11 @@ from sme_registry.task.memory import refuse_above_limit
 _FLOAT64 = np.dtype(np.float64)
 _AHEAD = 16  # states drawn at once for a lane
 _MAX_NUMBERS = 2**19  # held in advance for all lanes, 4 MiB
+_KEPT = 3  # a loop holds an observation and the next one while a step writes the third
 
 
 class BatchStep(NamedTuple):
-    """The result of one step of all lanes; every array is fresh, unless the batch reuses them.
+    """The result of one step of all lanes; no later step writes to an array that is still held.
 
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
@@ -42,6 +45,62 @@ class BatchStep(NamedTuple):
     values: Array
     terminated: Mask
     truncated: Mask
+
+
+class _Arrays(NamedTuple):
+    """What a step writes besides the state: `[B, S + 1 + n]`, `[B, A]`, `[5, n, B]`, `[2, B]`."""
+
+    observation: Observation
+    optimal: Array
+    values: Array
+    ends: Mask
+
+
+class _Results:
+    """Arrays for the results of steps, written again once nobody holds them.
+
+    They are too large for NumPy's cache of small arrays: fresh ones at each step can make the heap
+    shrink and grow each time, for half as much time again with 1,024 lanes and three times as much
+    with 4,096. So the last few are kept, and used again when their reference counts show that they
+    are alone.
+
+    Views of them are handed out, never they themselves. A view holds its array, as do a view or
+    slice of it, its memoryview, and a tensor that shares its memory; and what a user does to a
+    view, such as setting its shape, does not outlive it.
+    """
+
+    def __init__(self, lanes: int, observation_dim: int, action_dim: int, agents: int) -> None:
+        self._shapes = (lanes, observation_dim), (lanes, action_dim), (ROWS, agents, lanes)
+        self._kept: list[_Arrays] = []
+
+    def take(self) -> tuple[_Arrays, BatchStep]:
+        """Arrays that nobody else holds, with undefined content, and the result that views them."""
+        for arrays in self._kept:
+            if _references(arrays) == _ALONE:
+                break
+        else:
+            arrays = self._allocate()
+            self._kept = [*self._kept[1 - _KEPT :], arrays]
+        observation, optimal, values, ends = arrays
+        return arrays, BatchStep(observation[:], optimal[:], values[:], ends[0], ends[1])
+
+    def _allocate(self) -> _Arrays:
+        observation, optimal, values = self._shapes
+        return _Arrays(
+            np.empty(observation, np.float32),
+            np.empty(optimal),
+            np.empty(values),
+            np.empty((2, observation[0]), bool),
+        )
+
+
+def _references(arrays: _Arrays) -> list[int]:
+    """How often each array is referenced."""
+    return [*map(sys.getrefcount, arrays)]
+
+
+# Measured, since versions of Python differ in what they count.
+_ALONE = _references(_Results(1, 1, 1, 1)._allocate())
 
 
 class InitialStates:
@@ -83,7 +142,7 @@ class Batch:
       task: the task.
       lanes: B, at least 1.
       reuse: write each step into the arrays of the step before the last, for environments that
-        copy their results anyway; a small batch spends a fifth of its time on fresh arrays.
+        copy their results anyway; a small batch spends a third of its time on handing out arrays.
 
     Raises:
       ResourceLimitError: a batch this large would not fit in memory.
@@ -91,9 +150,9 @@ class Batch:
 
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
-        self._shapes = (S, lanes), (lanes, S + 1 + n), (lanes, A), (ROWS, n, lanes), (2, lanes)
+        self._shape = (lanes, A)
         refuse_above_limit(
-            lanes * 8 * (4 * S + 4 * A + 16 * n + 48),
+            lanes * 8 * (5 * S + 6 * A + 20 * n + 48),
             f"num_envs={lanes}: a batch this large",
             "Use fewer lanes.",
         )
@@ -106,27 +165,17 @@ class Batch:
         self._reuse = reuse
         self._load_engine()
 
-    def _allocate(self) -> tuple[Array, Mask, BatchStep]:
-        """What a step writes: next states, ends, and its result, which includes the ends."""
-        state, observation, optimal, values, ends = self._shapes
-        ended = np.empty(ends, bool)
-        result = BatchStep(
-            np.empty(observation, np.float32),
-            np.empty(optimal),
-            np.empty(values),
-            terminated=ended[0],
-            truncated=ended[1],
-        )
-        return np.empty(state), ended, result
-
     def _load_engine(self) -> None:
+        S, A, n = self.task.spec.state_dim, self.task.spec.action_dim, len(self._accumulated)
         self._step_many = engine(self.task).step_many
-        # Two sets in turn: a step reads the state from the one that it does not write.
-        self._arrays = (self._allocate(), self._allocate()) if self._reuse else None
+        self._moved = np.empty((S, self.lanes))
+        results = _Results(self.lanes, S + 1 + n, A, n)
+        in_turn = itertools.cycle([results.take(), results.take()])
+        self._take = in_turn.__next__ if self._reuse else results.take
 
-    # Neither machine code nor views can be pickled or copied: the copy recreates both.
+    # Machine code cannot be pickled or copied: the copy loads it, and has arrays of its own.
     def __getstate__(self) -> dict[str, Any]:
-        dropped = ("_step_many", "_arrays")
+        dropped = ("_step_many", "_moved", "_take")
         return {name: value for name, value in self.__dict__.items() if name not in dropped}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -175,22 +224,13 @@ class Batch:
           ActionError: of another shape, or not finite; no lane has changed then.
         """
         # Machine code does not check shape, dtype and layout: any other would be misread.
-        if actions.shape != self._shapes[2]:
-            raise ActionError(
-                f"action of shape {actions.shape}: must be of shape {self._shapes[2]}."
-            )
+        if actions.shape != self._shape:
+            raise ActionError(f"action of shape {actions.shape}: must be of shape {self._shape}.")
         if actions.dtype is not _FLOAT64 or not actions.flags.c_contiguous:
             actions = np.ascontiguousarray(actions, dtype=np.float64)
-        if self._arrays is None:
-            arrays = self._allocate()
-        else:
-            arrays, other = self._arrays
-            self._arrays = other, arrays
-        moved, ended, result = arrays
-        if not self._step_many(
-            self._s, self._t, self._accumulated, actions,
-            moved, result.observation, result.optimal, result.values, ended,
-        ):  # fmt: skip
+        moved = self._moved
+        arrays, result = self._take()
+        if not self._step_many(self._s, self._t, self._accumulated, actions, moved, *arrays):
             raise not_finite_error()
-        self._s = moved
+        self._s, self._moved = moved, self._s
         return result

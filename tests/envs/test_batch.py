@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import pickle
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sme_registry.envs.batch import Batch
+from sme_registry.envs.batch import Batch, BatchStep
 from sme_registry.envs.team import SMETeamEnv, observed_columns
 from sme_registry.errors import ActionError, ResourceLimitError
 from sme_registry.spec import SMESpec
@@ -123,14 +125,71 @@ def test_copies_go_on_as_the_original_does() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-def test_what_a_step_gives_is_not_written_into_by_the_next() -> None:
+def torch_tensor(array: Any) -> Any:
+    return pytest.importorskip("torch").from_numpy(array)
+
+
+HOLDERS: dict[str, Callable[[Any], Any]] = {
+    "itself": lambda array: array,
+    "a slice": lambda array: array[..., 1:],
+    "a view of a view": lambda array: array.T[::2].reshape(-1, order="A")[:],
+    "other bytes": lambda array: array.view(np.uint8),
+    "strides": lambda array: np.lib.stride_tricks.as_strided(array),
+    "memoryview": memoryview,
+    "an array of a memoryview": lambda array: np.asarray(memoryview(array)),
+    "pickle's buffer": pickle.PickleBuffer,
+    "DLPack": np.from_dlpack,
+    "torch.from_numpy": torch_tensor,
+    "a row of torch.from_numpy": lambda array: torch_tensor(array)[0],
+}
+
+
+@pytest.mark.parametrize("field", BatchStep._fields)
+@pytest.mark.parametrize("holder", HOLDERS)
+def test_no_step_writes_to_a_result_that_is_held(holder: str, field: str) -> None:
+    batch, rng = Batch(materialize(SPECS["fragile"].derive(horizon=2)), 5), np.random.default_rng(0)
+
+    def step() -> Any:
+        batch.place(rng.random((5, 8)), rng.integers(0, 2, 5), np.zeros((5, 3)))
+        return getattr(batch.advance(rng.random((5, 4))), field)
+
+    held, kept = [], []
+    for _ in range(8):
+        step()  # dropped, so that arrays are recycled all the while
+        held.append(HOLDERS[holder](step()))
+        kept.append(bytes(np.asarray(held[-1])))
+    assert [bytes(np.asarray(one)) for one in held] == kept
+    assert len(set(kept)) > 1
+
+
+def test_a_result_that_nobody_holds_is_written_again() -> None:
     batch = Batch(materialize(SPECS["individual"]), 3)
     batch.begin(np.arange(3), batch.observe())
-    first = batch.advance(np.full((3, 4), 0.4))
-    kept = copy.deepcopy(first)
-    batch.advance(np.full((3, 4), 0.7))
-    for one, other in zip(first, kept, strict=True):
-        np.testing.assert_array_equal(one, other)
+    action = np.full((3, 4), 0.4)
+    first = batch.advance(action)
+    arrays = [weakref.ref(value.base) for value in first]
+    del first
+    again = batch.advance(action)
+    assert [value.base for value in again] == [array() for array in arrays]
+
+
+def test_few_results_are_kept_of_many_that_were_held() -> None:
+    batch = Batch(materialize(SPECS["individual"]), 3)
+    batch.begin(np.arange(3), batch.observe())
+    held = [batch.advance(np.full((3, 4), 0.4)) for _ in range(20)]
+    arrays = [weakref.ref(step.observation.base) for step in held]
+    del held
+    assert sum(array() is not None for array in arrays) == 3
+
+
+def test_what_is_done_to_a_result_ends_with_it() -> None:
+    batch = Batch(materialize(SPECS["individual"]), 3)
+    batch.begin(np.arange(3), batch.observe())
+    for _ in range(4):
+        step = batch.advance(np.full((3, 4), 0.4))
+        assert all(value.flags.writeable for value in step)
+        for value in step:
+            value.flags.writeable = False
 
 
 @pytest.mark.parametrize(("lanes", "state_dim"), [(1, 8), (5, 1), (1, 1), (5, 8)])
