@@ -43,6 +43,17 @@ def train(
             "for teams PPO.",
         ),
     ] = None,
+    agents: Annotated[
+        str,
+        typer.Option(
+            help="sb3, algorithms of Stable-Baselines3; or jax: PPO, TD3 and SAC with their "
+            "environment in one program."
+        ),
+    ] = "sb3",
+    device: Annotated[
+        str | None,
+        typer.Option(help="With --agents jax: cpu, gpu or tpu. Default JAX's."),
+    ] = None,
     steps: Annotated[
         int, typer.Option("--steps", "-n", help="Environment steps; for a team, of the team.")
     ] = 20_000,
@@ -113,17 +124,25 @@ def train(
     as regret/agent_0. A step is one step of the whole team, so a shared policy sees as many
     transitions per step as there are agents, and TensorBoard's axis counts those transitions.
 
+    --agents jax trains our PPO, TD3 or SAC, the same algorithms in JAX, on a task without a team:
+    PPO in a twentieth of the time, TD3 and SAC faster on a GPU. The folder, by default
+    runs/TASK-jax-ALGORITHM-seedN, contains the same files, model.zip is a model of
+    Stable-Baselines3 with the trained weights, and a run that is resumed is the uninterrupted one,
+    bit for bit. The first run of a shape and of hyperparameters compiles for some seconds.
+
     --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
     runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
     `report` read it, and `sme-leaderboard new --runs` makes a submission of it.
 
     --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
     hyperparameters and step count. The result differs from an uninterrupted run: random streams get
-    new seeds, and unfinished episodes start again.
+    new seeds, and unfinished episodes start again. (With --agents jax it does not differ.)
 
     Examples:
 
       sme train Default --steps 20000 --seed 1
+
+      sme train Default -a PPO -n 100000 --agents jax
 
       sme train Default -a PPO -n 100000 --num-envs 8 --set complexity=10 --set learning_rate=1e-4
 
@@ -146,6 +165,7 @@ def train(
             context,
             suite,
             algorithm=algorithm,
+            agents=agents,
             steps=steps,
             seeds=seeds,
             folder=out_folder,
@@ -161,11 +181,11 @@ def train(
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
     spec = load(task).derive(**overrides)
-    algorithm = training.full_name(algorithm or training.default_algorithm(spec))
+    algorithm = training.full_name(algorithm or training.default_algorithm(spec), agents)
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:
         label = _label(task, spec, changed=bool(overrides))
-        name = training.short_name(algorithm)
+        name = training.folder_name(algorithm)
         out_folder = Path("runs") / f"{label}-{'independent-' * independent}{name}-seed{seed}"
     try:
         result = training.train(
@@ -183,6 +203,7 @@ def train(
             console=err(),
             resume=resume,
             force=force,
+            device=device,
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(how_to_continue(out_folder)) from None

@@ -18,7 +18,7 @@ RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""
 
 _EVALUATIONS = 10  # of a run, for the learning curves of `sme study report`
-_NOT_WITH_SUITE = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force")
+_NOT_WITH_SUITE = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force", "device")
 
 
 def train_suite(
@@ -26,6 +26,7 @@ def train_suite(
     suite: str,
     *,
     algorithm: str | None,
+    agents: str,
     steps: int,
     seeds: int | None,
     folder: Path | None,
@@ -42,6 +43,7 @@ def train_suite(
       context: of the command, to refuse its options for a single task.
       suite: name or path of the suite.
       algorithm: as in `sme train`; None for the default of the suite's first task.
+      agents: "sb3" or "jax".
       steps: of each run.
       seeds: runs on each class; None for `RUNS`, rounded up so that all instances of a class have
         equally many.
@@ -65,10 +67,12 @@ def train_suite(
 
     _refuse_options(context, _NOT_WITH_SUITE, "is for a single task. Leave it out, or --suite")
     file = find_file(SuiteFile, suite)
-    uses = training.full_name(algorithm or training.default_algorithm(file.suite.instances[0]))
+    algorithm = algorithm or training.default_algorithm(file.suite.instances[0])
+    uses = training.full_name(algorithm, agents)
     name = training.short_name(uses)
     if folder is None:
-        folder = Path("runs") / f"{file.name}-{'independent-' * independent}{name}"
+        label = training.folder_name(uses)
+        folder = Path("runs") / f"{file.name}-{'independent-' * independent}{label}"
     plan = StudyPlan.from_dict(
         {
             "classes": [member.to_dict() for member in file.suite.classes],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,10 @@ def full_name(uses: str, field: str = "uses") -> str:
 
 
 def settings_of(
-    uses: str, hyperparameters: Mapping[str, Any], field: str = "hyperparameters"
+    uses: str,
+    hyperparameters: Mapping[str, Any],
+    field: str = "hyperparameters",
+    others: Iterable[str] = (),
 ) -> Any:
     """The hyperparameters of an algorithm, with its defaults for those that are left out.
 
@@ -52,6 +55,7 @@ def settings_of(
       uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
       hyperparameters: JSON values by the names of Stable-Baselines3; `net_arch` in `policy_kwargs`.
       field: what error messages call them.
+      others: names that the caller accepts beside them, which messages may suggest.
 
     Raises:
       UnknownNameError: no such algorithm.
@@ -65,8 +69,8 @@ def settings_of(
         if name not in known:
             raise OptionError(
                 f"{field}.{name}: {full_name(uses)} has no such hyperparameter."
-                f"{did_you_mean(name, known)} Known: {', '.join(known)}. For others, use the "
-                "algorithm of Stable-Baselines3."
+                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known)}. For "
+                "others, use the algorithm of Stable-Baselines3."
             )
         values[known[name]] = value
     try:

@@ -1,15 +1,16 @@
-"""Training: one algorithm of Stable-Baselines3 on one task, with exact regret of every episode.
+"""Training: one algorithm on one task, with exact regret of every episode.
 
     from sme_registry.training import train
     result = train("SME/Default-v1", algorithm="SAC", steps=20_000, folder="runs/sac")
     result.report.wd_regret, result.episodes[-1].regret
 
-Importing this module does not import PyTorch.
+Importing this module imports neither PyTorch nor JAX.
 """
 
 from sme_registry.training.algorithms import (
     ALGORITHMS,
     default_algorithm,
+    folder_name,
     full_name,
     known_algorithm,
     short_name,
@@ -31,6 +32,7 @@ __all__ = [
     "TrainingResult",
     "check_hyperparameters",
     "default_algorithm",
+    "folder_name",
     "full_name",
     "known_algorithm",
     "nested_hyperparameters",

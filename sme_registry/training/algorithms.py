@@ -1,6 +1,7 @@
 """`uses`: the name of what `sme train` and the cells of a study train. Imported only when needed.
 
     PPO, TD3, …        an algorithm of Stable-Baselines3, in any case
+    jax:PPO, …         the same in JAX, with its environment in one program (`sme_registry.jax`)
     an entry point     of the group `sme_registry.algorithms`, in an installed package
     module:name        imported, from this folder or installed
 
@@ -21,8 +22,9 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.io import import_object, require_packages
+from sme_registry.io import choice, import_object, require_packages
 from sme_registry.spec import SMESpec
+from sme_registry.spec.study import JAX
 
 # Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
 ALGORITHMS = {
@@ -54,14 +56,35 @@ def is_on_policy(algorithm: Any) -> bool:
     return isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)
 
 
-def full_name(uses: str) -> str:
-    """The exact name of an algorithm of Stable-Baselines3 in any case; other names unchanged."""
-    return next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
+AGENTS = ("sb3", "jax")
+"""Whose implementation of an algorithm is trained: Stable-Baselines3's, or ours in JAX."""
+
+
+def full_name(uses: str, agents: str = "sb3") -> str:
+    """The exact name of an algorithm in any case, also of `jax:…`; others' names unchanged.
+
+    Args:
+      uses: the name.
+      agents: "jax" for the algorithm of this name in JAX.
+
+    Raises:
+      OptionError: `agents` is neither "sb3" nor "jax".
+    """
+    in_jax = choice("agents", agents, AGENTS) == "jax"
+    if uses.casefold().startswith(JAX):
+        uses, in_jax = uses[len(JAX) :], True
+    name = next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
+    return f"{JAX}{name}" if in_jax else name
 
 
 def short_name(uses: str) -> str:
-    """What figures, reports and folders call an algorithm: `TQC` for `sb3_contrib:TQC`."""
+    """What figures and reports call an algorithm: `TQC` for `sb3_contrib:TQC`."""
     return uses.rpartition(":")[2]
+
+
+def folder_name(uses: str) -> str:
+    """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`."""
+    return f"{'jax-' * uses.startswith(JAX)}{short_name(uses)}"
 
 
 def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:

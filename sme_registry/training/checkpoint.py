@@ -1,7 +1,8 @@
 """`checkpoint.zip`: an SB3 model and its replay buffer in one file, written atomically.
 
 It is a model's .zip that SB3 can load, with one more member: the filled part of the replay buffer.
-With two files, a kill between the writes would pair a model with the wrong buffer.
+With two files, a kill between the writes would pair a model with the wrong buffer. That of an agent
+in JAX is an .npz of all arrays of its program.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from sme_registry.errors import PolicyError
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.policies import saved_sb3
-from sme_registry.io import write_atomically
+from sme_registry.io import atomic_file, write_atomically
 
 FILE = "checkpoint.zip"
 _MEMBER = "sme_replay_buffer.npz"
@@ -60,10 +62,34 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
         _refill(model.replay_buffer, replay)
         return model
     except Exception as error:
-        raise PolicyError(
-            f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
-            "(in Python, force=True), or in another folder."
-        ) from error
+        raise _unloadable(path, error) from error
+
+
+def save_arrays(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> None:
+    """Write a checkpoint of named arrays; raises OptionError as `save` does."""
+    try:
+        with atomic_file(path) as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+    except OSError as error:
+        raise OptionError(
+            f"{path}: cannot be written: {error.strerror}. Make room, or give another folder."
+        ) from None
+
+
+def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a checkpoint; runs no code of the file. Raises PolicyError as `load` does."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return dict(archive)
+    except Exception as error:
+        raise _unloadable(path, error) from error
+
+
+def _unloadable(path: Path, error: Exception) -> PolicyError:
+    return PolicyError(
+        f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
+        "(in Python, force=True), or in another folder."
+    )
 
 
 def _refill(buffer: Any, replay: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from sme_registry.errors import OptionError, did_you_mean
 from sme_registry.io import import_object, read_json
+from sme_registry.spec.study import JAX
 from sme_registry.training.algorithms import find_algorithm, is_sb3
 
 # Arguments of an algorithm's constructor that are not hyperparameters.
@@ -67,7 +68,7 @@ def check_hyperparameters(
     field: str = "hyperparameters",
     others: Iterable[str] = (),
 ) -> None:
-    """Check that an algorithm has hyperparameters of these names. It checks no values.
+    """Check that an algorithm has hyperparameters of these names. It checks no values, but in JAX.
 
     The names are those of the constructor, or of the function, and in `policy_kwargs` those of the
     policy's constructor.
@@ -82,7 +83,11 @@ def check_hyperparameters(
       OptionError: it has no hyperparameter of a name; the message suggests a similar one.
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
-    if hyperparameters:
+    if uses.startswith(JAX):
+        from sme_registry.jax.run import settings_of
+
+        settings_of(uses, hyperparameters, field, others)
+    elif hyperparameters:
         refuse_unknown(find_algorithm(uses), uses, hyperparameters, field, others)
 
 

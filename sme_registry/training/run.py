@@ -1,10 +1,10 @@
-"""`train`: train one Stable-Baselines3 algorithm on one task, with exact regret of every episode.
+"""`train`: train one algorithm on one task, with exact regret of every episode.
 
 The folder of a run, which `resume` continues after an interruption:
     run.json          the run and its progress
     episodes.csv      one row for each finished episode
     checkpoint.zip    model and replay buffer, for resuming
-    model.zip         the trained model
+    model.zip         the trained model, of Stable-Baselines3, also where it was trained in JAX
     model/            instead: one model for each agent of a team, `<agent>.zip`
     evaluation.json   its evaluation
     *.png, *.pdf      figures, if matplotlib is installed
@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 
@@ -27,6 +27,7 @@ from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.io import choice, claim_folder, integer_in, is_installed
 from sme_registry.plots import files as plot_files
 from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
+from sme_registry.spec.study import JAX
 from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
@@ -38,6 +39,7 @@ from sme_registry.training.algorithms import (
     full_name,
     one_thread,
     quiet,
+    require_sb3,
     short_name,
 )
 from sme_registry.training.episodes import Episode
@@ -93,8 +95,10 @@ def train(
     console: Console | None = None,
     resume: bool = False,
     force: bool = False,
+    agents: Literal["sb3", "jax"] = "sb3",
+    device: str | None = None,
 ) -> TrainingResult:
-    """Train one algorithm of Stable-Baselines3's kind on the CPU.
+    """Train one algorithm of Stable-Baselines3's kind: with it on the CPU, or in JAX.
 
     Hyperparameters that are not given have the algorithm's defaults, except in several environments
     or for a team, where `n_steps` or `gradient_steps` keep the algorithm what it is in one; see
@@ -103,13 +107,14 @@ def train(
     A resumed run continues from its last checkpoint, with the same networks, optimisers, replay
     buffer and step count. It does not reproduce the uninterrupted run bit for bit: random streams
     are seeded again, and the current episodes (for PPO and A2C the current rollout) restart.
-    Episodes logged after the checkpoint are dropped.
+    Episodes logged after the checkpoint are dropped. In JAX the checkpoint holds everything, and
+    the resumed run is the uninterrupted one, bit for bit on the same device and versions.
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
       algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; "module:Class", such as
-        "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); None takes TD3, and
-        PPO for a team.
+        "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); "jax:PPO", "jax:TD3"
+        or "jax:SAC" in JAX; None takes TD3, and PPO for a team.
       steps: environment steps over all environments, at least 1. One step of a team is a step of
         all its n agents and gives n transitions. PPO and A2C finish their last rollout.
       seed: of the algorithm and of the environment's starts, in [0, 2**32 - num_envs].
@@ -128,6 +133,9 @@ def train(
       console: where to show it; None for standard error.
       resume: continue an unfinished run in the folder, if there is one; `steps` may be larger.
       force: remove the run in the folder and start again.
+      agents: "jax" trains our implementation of "PPO", "TD3" or "SAC" in JAX: one environment in
+        one program with its agent, for a task without a team.
+      device: of agents in JAX, "cpu", "gpu" or "tpu"; None for JAX's default.
 
     Returns:
       The finished run.
@@ -136,9 +144,9 @@ def train(
       UnknownNameError, SpecError: no such task, algorithm or protocol, or a field is out of range.
       OptionError: another argument is out of range; or the folder contains another run, a finished
         run or other files, or is not writable.
-      PolicyError: the checkpoint cannot be loaded.
+      PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer (JAX).
       ResourceLimitError: the task would not fit in memory.
-      MissingDependencyError: Stable-Baselines3 or PyTorch is not installed.
+      MissingDependencyError: Stable-Baselines3, PyTorch or JAX is not installed.
     """
     plan = _plan(
         spec,
@@ -150,18 +158,18 @@ def train(
         independent=independent,
     )
     with quiet():
-        plan = _with_algorithm(plan, algorithm, num_envs, hyperparameters or {})
+        plan = _with_algorithm(plan, algorithm, agents, num_envs, hyperparameters or {}, device)
     materialize(plan.spec)  # fails before the folder is created
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread():
-        from sme_registry.training.learn import learn, new_model
-
-        model = new_model(record)  # rejects values of hyperparameters before the folder is created
+        training = _training(record)
+        # Rejects values of hyperparameters before the folder is created.
+        model = training.new_model(record)
         if record.sessions == 1:
             _claim(folder, force=force)
         record.write(folder)
-        record, episodes, model = learn(model, record, folder, progress, console)
+        record, episodes, model = training.learn(model, record, folder, progress, console)
         report, figures = _evaluate(model, record, folder, progress, console)
     record = record.updated(status="finished")
     record.write(folder)
@@ -210,12 +218,24 @@ def _plan(
 
 
 def _with_algorithm(
-    plan: RunRecord, uses: str | None, num_envs: int | None, hyperparameters: Mapping[str, Any]
+    plan: RunRecord,
+    uses: str | None,
+    agents: str,
+    num_envs: int | None,
+    hyperparameters: Mapping[str, Any],
+    device: str | None,
 ) -> RunRecord:
     """A plan with its algorithm, the hyperparameters that the user set, and its environments."""
-    uses = default_algorithm(plan.spec) if uses is None else full_name(uses)
-    algorithm = find_algorithm(uses, "algorithm")
+    uses = full_name(default_algorithm(plan.spec) if uses is None else uses, agents)
     settings = nested_hyperparameters(hyperparameters)
+    if uses.startswith(JAX):
+        return _with_jax_algorithm(plan, uses, num_envs, settings, device)
+    if device is not None:
+        raise OptionError(
+            f"device={device!r}: is for agents in JAX; those of Stable-Baselines3 train on the "
+            'CPU. Leave it out, or use --agents jax (in Python, agents="jax").'
+        )
+    algorithm = find_algorithm(uses, "algorithm")
     refuse_unknown(algorithm, uses, settings)
     if num_envs is None:
         num_envs = default_num_envs(plan.spec, algorithm)
@@ -229,9 +249,54 @@ def _with_algorithm(
     )
 
 
+def _with_jax_algorithm(
+    plan: RunRecord,
+    uses: str,
+    num_envs: int | None,
+    settings: dict[str, Any],
+    device: str | None,
+) -> RunRecord:
+    """The same for an agent in JAX."""
+    require_sb3()  # `model.zip` is a model of it
+    from sme_registry.jax.device import find_device
+    from sme_registry.jax.run import settings_of
+    from sme_registry.jax.task import check_supported
+
+    check_supported(plan.spec)
+    settings_of(uses, settings)
+    if num_envs not in (None, 1):
+        raise OptionError(
+            f"num_envs={num_envs!r}: must be 1 for agents in JAX. Leave it out, or train an "
+            "algorithm of Stable-Baselines3."
+        )
+    return plan.updated(
+        algorithm=uses,
+        hyperparameters=settings,
+        device=find_device(device).platform,
+        versions=versions_for(uses),
+    )
+
+
+def _in_jax(record: RunRecord) -> bool:
+    return record.algorithm.startswith(JAX)
+
+
+def _training(record: RunRecord) -> Any:
+    """The module with `new_model` and `learn` for a run."""
+    if _in_jax(record):
+        from sme_registry.training import jax_learn
+
+        return jax_learn
+    from sme_registry.training import learn
+
+    return learn
+
+
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
     """The plan with all its hyperparameters, and with the progress of a run that is resumed."""
     previous = None if force else RunRecord.read(folder)
+    if previous is None and _in_jax(plan):
+        return plan
     if previous is None:
         lanes = plan.num_envs * (1 if plan.independent else plan.agents)
         settings = for_lanes(find_algorithm(plan.algorithm), lanes, plan.hyperparameters)

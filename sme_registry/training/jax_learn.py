@@ -1,0 +1,186 @@
+"""`learn` for agents in JAX: the same files as `learn`, from a program of one lane.
+
+Its checkpoint holds everything, so a run that is resumed continues with the same bits.
+
+Imports JAX and Stable-Baselines3; import it inside functions only.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from stable_baselines3.common.logger import configure
+
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.io import is_installed, write_atomically
+from sme_registry.jax import run as jax_run
+from sme_registry.jax.program import Program, StepLog
+from sme_registry.sb3 import EpisodeRegret
+from sme_registry.terminal.interrupts import defer_interrupts
+from sme_registry.training import checkpoint
+from sme_registry.training.episodes import Episode
+from sme_registry.training.learn import RunLog
+from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
+from sme_registry.training.sb3_models import sb3_model
+
+_PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
+_EPISODE = "episode"  # of the checkpoint: the sums of the present episode
+
+
+def new_model(record: RunRecord) -> Program:
+    """The program of a run, at its start.
+
+    Raises:
+      SpecError: the task is not one that JAX has, such as a team's.
+      OptionError: there is no such device, or a hyperparameter has no such value.
+    """
+    return jax_run.new_program(
+        record.algorithm,
+        [record.spec],
+        [record.seed],
+        hyperparameters=record.hyperparameters,
+        action_range=record.action_range,
+        steps=record.steps,
+        device=record.device or None,
+    )
+
+
+def learn(
+    program: Program, record: RunRecord, folder: Path, progress: bool, console: Console | None
+) -> tuple[RunRecord, list[Episode], Any]:
+    """Train and write a model; see `training.learn.learn`.
+
+    Raises:
+      PolicyError: the checkpoint cannot be loaded; or the weights are not finite any longer, and
+        the last checkpoint stays.
+      OptionError: a file cannot be written.
+    """
+    present = _PresentEpisode()
+    path = folder / checkpoint.FILE
+    if record.sessions > 1 and path.exists():
+        arrays = checkpoint.load_arrays(path)
+        present.sums = arrays.pop(_EPISODE)
+        program.restore(arrays)
+    total = -(-max(record.steps, program.steps) // program.rollout) * program.rollout
+    board = _Board(folder / TENSORBOARD)
+    with RunLog(record, folder, program.steps, total, progress, console) as log:
+
+        def save() -> None:
+            log.save_checkpoint(
+                lambda path: checkpoint.save_arrays(
+                    path, {**program.save(), _EPISODE: present.sums}
+                )
+            )
+
+        def on_log(steps: StepLog) -> None:
+            _check_finite(program, folder)
+            finished = present.add(program.steps, steps)
+            for episode in finished:
+                log.add(episode.step, [episode])
+            log.add(program.steps, [])
+            board.add(program.steps, finished)
+
+        def after_piece() -> None:
+            if log.is_checkpoint_due() or program.steps >= program.budget:
+                save()
+
+        jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=_PIECE)
+        _check_finite(program, folder)
+    board.close()
+    model = sb3_model(
+        record.algorithm,
+        program.weights(0),
+        record.spec,
+        seed=record.seed,
+        action_range=record.action_range,
+        hyperparameters=record.hyperparameters,
+        steps=program.steps,
+    )
+    with defer_interrupts():
+        write_atomically(folder / MODEL, saved_sb3(model))
+        log.record().write(folder)
+    return log.record(), log.episodes, model
+
+
+def _check_finite(program: Program, folder: Path) -> None:
+    if not program.failed()[0]:
+        return
+    path = folder / checkpoint.FILE
+    kept = f"{path} is its last checkpoint" if path.exists() else "it has no checkpoint"
+    raise PolicyError(
+        f"training: the weights are not finite any longer at step {program.steps:,}. The run stays "
+        f"in {folder}; {kept}. Train into another folder with other hyperparameters, such as a "
+        "lower learning_rate."
+    )
+
+
+class _PresentEpisode:
+    """The episode that goes on from one piece of a run to the next.
+
+    Attributes:
+      sums: `[4]` return, length, regret and similarity so far.
+    """
+
+    def __init__(self) -> None:
+        self.sums: npt.NDArray[np.float64] = np.zeros(4)
+
+    def add(self, last_step: int, log: StepLog) -> list[EpisodeRegret]:
+        """The episodes that ended in a piece.
+
+        Args:
+          last_step: steps of the run at the end of the piece.
+          log: of the only lane.
+        """
+        lengths = np.ones_like(log.regret)
+        values = np.stack([log.reward, lengths, log.regret, log.similarity])[:, :, 0]
+        ends = np.flatnonzero(np.logical_or(log.terminated, log.truncated)[:, 0]) + 1
+        begin, finished = 0, []
+        for end in ends.tolist():
+            returned, length, regret, similarity = self._added(values[:, begin:end])
+            finished.append(
+                EpisodeRegret(
+                    step=last_step - values.shape[1] + end,
+                    regret=regret / length,
+                    similarity=similarity / length,
+                    episode_return=returned,
+                    length=int(length),
+                    terminated=bool(log.terminated[end - 1, 0]),
+                )
+            )
+            self.sums, begin = np.zeros(4), end
+        self.sums = np.array(self._added(values[:, begin:]))
+        return finished
+
+    def _added(self, values: npt.NDArray[np.float64]) -> list[float]:
+        """The sums with those of `[4, n]` steps, in order: the same bits for any pieces."""
+        sums: list[float] = np.cumsum(np.column_stack([self.sums, values]), axis=1)[:, -1].tolist()
+        return sums
+
+
+class _Board:
+    """TensorBoard's log of finished episodes, if it is installed."""
+
+    def __init__(self, folder: Path) -> None:
+        installed = is_installed("tensorboard")
+        self._logger = configure(str(folder), ["tensorboard"]) if installed else None
+
+    def add(self, step: int, episodes: list[EpisodeRegret]) -> None:
+        """Log the means of the episodes that ended in a piece."""
+        if self._logger is None or not episodes:
+            return
+        for episode in episodes:
+            self._logger.record_mean("rollout/ep_rew_mean", episode.episode_return)
+            self._logger.record_mean("rollout/ep_len_mean", episode.length)
+            self._logger.record_mean("rollout/regret", episode.regret)
+            self._logger.record_mean("rollout/similarity", episode.similarity)
+        self._logger.dump(step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._logger is not None:
+            self._logger.close()
