@@ -1,27 +1,32 @@
 """PPO as in Stable-Baselines3: hyperparameters, weights, advantages, updates, and `PPOProgram`.
 
-Source: Schulman et al. 2017; order of operations and defaults: SB3's `PPO` with `MlpPolicy`.
-`n` steps of a rollout, `O` observation width, `A` action channels, `B` a minibatch. Functions are
-of one lane, and vmapped. Padded observation columns are 0; padded action channels have weights and
-noise of 0 and are masked in densities, so that they get no gradients.
+Source: Schulman et al. (2017), Proximal Policy Optimization Algorithms; defaults and order of
+operations: SB3's `PPO` with `MlpPolicy`. `n` steps of a rollout, `O` observation width, `A` action
+channels, `B` steps of a minibatch. Functions are of one lane, and vmapped.
 
-    ã ~ N(μ(o), σ²)                         action; clipped to the range only for the environment
-    δ_t = R_t + γ V(o_{t+1}) − V(o_t)       V(o_{t+1}) is 0 after the end of an episode, but
-                                            R_t includes γ V(last observation) after a truncation
-    Â_t = δ_t + γ λ Â_{t+1}                 Â_{t+1} is 0 after the end of an episode
-    loss = −mean min(ρ Â, clip(ρ, 1 ± ε) Â) + c_V mean (V − Â − V_old)² − c_H mean entropy
+    a ~ N(μ(o), σ²)                      clipped to the action range for the environment alone
+    δ_t = R_t + γ V(o_{t+1}) − V(o_t)    after an episode's end V(o_{t+1}) and Â_{t+1} are 0;
+    Â_t = δ_t + γ λ Â_{t+1}              at a truncation R_t includes γ V(last observation)
+    loss = −mean min(ρ Â, clip(ρ, 1 ± ε) Â) + c_V mean (Â + V_old − V)² − c_H entropy
+
+ρ is the ratio of π(a) now and when the action was taken. Padded observations are 0, and padded
+action channels are masked in log π and in the entropy, so the weights of both get no gradients.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sme_registry.errors import OptionError
+from sme_registry.jax import oracle
+from sme_registry.jax.env import EnvState, observe, reset, step_env, to_unit
 from sme_registry.jax.networks import (
     Adam,
     HostWeights,
@@ -32,14 +37,23 @@ from sme_registry.jax.networks import (
     linear,
     perceptron,
 )
+from sme_registry.jax.program import Program, StepLog
+from sme_registry.jax.task import TaskParams
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
 _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
+_NO_KEY: Any = None  # `step_env` draws nothing
 
 
 @dataclass(frozen=True)
 class PPO:
-    """Hyperparameters, with Stable-Baselines3's names and defaults."""
+    """Hyperparameters, with the names and defaults of `stable_baselines3.PPO`.
+
+    `net_arch` is the widths of the hidden layers of each network (`policy_kwargs.net_arch`).
+
+    Raises:
+      OptionError: minibatches of one step, or that do not divide a rollout.
+    """
 
     learning_rate: float = 3e-4
     n_steps: int = 2048
@@ -54,6 +68,13 @@ class PPO:
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
     net_arch: tuple[int, ...] = (64, 64)
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 2 or self.n_steps % self.batch_size:
+            raise OptionError(
+                f"hyperparameters.batch_size={self.batch_size}: must be at least 2 and divide "
+                f"n_steps ({self.n_steps}); minibatches here are of equal size."
+            )
 
 
 class Learner(NamedTuple):
@@ -101,6 +122,24 @@ class Rollout(NamedTuple):
     advantage: jax.Array
 
 
+class State(NamedTuple):
+    """All that changes in a `PPOProgram`; each array has a leading axis of lanes.
+
+    Attributes:
+      weights: by SB3's names.
+      optimiser: Adam's state.
+      key: of all random numbers to come.
+      episode: the environment.
+      steps: of the last rollout.
+    """
+
+    weights: Weights
+    optimiser: Adam
+    key: jax.Array
+    episode: EnvState
+    steps: Steps
+
+
 def initial_weights(
     settings: PPO, rng: np.random.Generator, observation_dim: int, action_dim: int
 ) -> HostWeights:
@@ -137,6 +176,61 @@ def log_density(
     log_std = weights["log_std"]
     z = (action - act(settings, weights, observation)) * jnp.exp(-log_std)
     return jnp.sum(jnp.where(mask, -0.5 * z**2 - log_std - _LOG_ROOT_TAU, 0.0), axis=-1)
+
+
+def collect(
+    settings: PPO,
+    weights: Weights,
+    params: TaskParams,
+    episode: EnvState,
+    noise: jax.Array,
+    fresh: EnvState,
+    *,
+    symmetric: bool,
+    separable: bool,
+) -> tuple[EnvState, Steps, StepLog]:
+    """The steps of a rollout.
+
+    Args:
+      settings: the hyperparameters.
+      weights: the policy's.
+      params: one task.
+      episode: the environment before the first step.
+      noise: `[A, n]` standard normal.
+      fresh: `[n]` the environment after each step if an episode ends there.
+      symmetric: whether actions are in [−1, 1] instead of [0, 1].
+      separable: whether k = 1 and D = 0, so that no reward changes an observation or ends an
+        episode. The oracle is then asked once for all steps.
+
+    Returns:
+      The environment after the last step, the steps, and their log, `[n]`.
+    """
+    sigma = jnp.exp(weights["log_std"])
+
+    def one(episode: EnvState, drawn: tuple[jax.Array, EnvState]) -> tuple[EnvState, Any]:
+        noise, fresh = drawn
+        observation = observe(episode, params)
+        action = act(settings, weights, observation) + sigma * noise
+        a = to_unit(action, symmetric)
+        _, after, reward, ended, info = step_env(_NO_KEY, episode, a, params)
+        judged: Any = info["similarity"], info["step_reward"], reward, info["terminated"]
+        if separable:  # XLA drops the oracle from the loop, since no result of it is used
+            after = after._replace(accumulated_reward=episode.accumulated_reward)
+            ended, judged = info["truncated"], (episode.s, a)
+        taken = observation, action, info["truncated"], observe(after, params)
+        after = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
+        return after, (taken, judged)
+
+    episode, (taken, judged) = jax.lax.scan(one, episode, (noise.T, fresh))
+    observation, action, truncated, last_observation = taken
+    if separable:
+        similarity, step_reward = oracle.judge(params, *judged)
+        judged = similarity, step_reward, step_reward, jnp.zeros_like(truncated)
+    similarity, step_reward, reward, terminated = judged
+    log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated)
+    reward = reward.astype(jnp.float32)
+    steps = Steps(observation, action, reward, terminated, truncated, last_observation)
+    return episode, steps, log
 
 
 def rollout(
@@ -222,6 +316,19 @@ def update(
     return jax.lax.scan(one, learner, batches)[0]
 
 
+def permutations(key: jax.Array, count: int, n: int) -> jax.Array:
+    """`[count, n]` random orders of 0 … n − 1.
+
+    Random words are sorted whose last bits are the index, in a sixth of the time of
+    `jax.random.permutation` on a CPU. That two words agree in all other bits has a probability
+    below n³ 2⁻⁶⁴.
+    """
+    bits = n.bit_length()
+    words = jax.random.bits(key, (count, n), jnp.uint64) << bits | jnp.arange(n, dtype=jnp.uint64)
+    orders: jax.Array = jnp.sort(words, axis=-1) % 2**bits
+    return orders.astype(jnp.int32)
+
+
 def _loss(settings: PPO, weights: Weights, batch: Rollout, mask: jax.Array) -> jax.Array:
     density = log_density(settings, weights, batch.observation, batch.action, mask)
     ratio = jnp.exp(density - batch.log_density)
@@ -245,3 +352,105 @@ def _latent(settings: PPO, weights: Weights, network: str, observation: jax.Arra
     layers = len(settings.net_arch)
     hidden = perceptron(weights, f"mlp_extractor.{network}", observation, layers, jnp.tanh)
     return jnp.tanh(hidden)
+
+
+class PPOProgram(Program):
+    """Lanes of PPO; see `Program`."""
+
+    def __init__(self, settings: PPO, *arguments: Any, **options: Any) -> None:
+        self.rollout = settings.n_steps
+        super().__init__(settings, *arguments, **options)
+
+    def initial_weights(
+        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        """SB3's; see `initial_weights`."""
+        return initial_weights(self.settings, rng, observation_dim, action_dim)
+
+    def initial_state(self, weights: Weights, keys: jax.Array) -> State:
+        """Lanes at the start of their first episode."""
+        state: State = _begin(self.settings, self.params, weights, keys)
+        return state
+
+    @staticmethod
+    def act(settings: PPO, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
+        """μ; see `act`."""
+        return act(settings, weights, observations)
+
+    def advance(self, limit: int) -> StepLog:
+        """Whole rollouts until `limit` is reached, and the updates between them."""
+        none = np.zeros((0, self.lanes))
+        logs = [StepLog(none, none, none, none > 0, none > 0)]
+        while self.steps < limit:
+            self.finish()
+            self.state, log = _collect(
+                self.settings,
+                self.symmetric,
+                self.separable and self.params.inner is not None,
+                self.params,
+                self.state,
+            )
+            self.steps += self.rollout
+            logs.append(log)
+        return StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+
+    def finish(self) -> None:
+        """Learn from the last rollout, unless that is done."""
+        settings = self.settings
+        updates = self.steps // settings.batch_size * settings.n_epochs
+        if self.state.optimiser.updates[0] < updates:
+            self.state = _learn(settings, self.params, self.state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array) -> State:
+    def lane(params: TaskParams, weights: Weights, key: jax.Array) -> State:
+        key, own = jax.random.split(key)
+        observation, episode = reset(own, params)
+        flag, number = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
+        none = Steps(observation, weights["log_std"], number, flag, flag, observation)
+        steps = jax.tree.map(lambda x: jnp.zeros((settings.n_steps, *x.shape), x.dtype), none)
+        return State(weights, Adam.initial(weights), key, episode, steps)
+
+    return jax.vmap(lane)(params, weights, keys)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _collect(
+    settings: PPO, symmetric: bool, separable: bool, params: TaskParams, state: State
+) -> tuple[State, StepLog]:
+    """A rollout of all lanes, and its log `[n, lanes]`."""
+
+    def lane(params: TaskParams, state: State) -> tuple[State, StepLog]:
+        key, of_noise, of_starts = jax.random.split(state.key, 3)
+        n, A = settings.n_steps, params.W.shape[0]
+        noise = jax.random.normal(of_noise, (A, n), jnp.float32)
+        _, fresh = jax.vmap(reset, (0, None))(jax.random.split(of_starts, n), params)
+        episode, steps, log = collect(
+            settings, state.weights, params, state.episode, noise, fresh,
+            symmetric=symmetric, separable=separable,
+        )  # fmt: skip
+        return state._replace(key=key, episode=episode, steps=steps), log
+
+    return jax.vmap(lane, out_axes=(0, 1))(params, state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _learn(settings: PPO, params: TaskParams, state: State) -> State:
+    """The updates of all lanes on their last rollout."""
+
+    def lane(params: TaskParams, state: State) -> State:
+        key, of_batches = jax.random.split(state.key)
+        batches = permutations(of_batches, settings.n_epochs, settings.n_steps)
+        mask = params.action_mask
+        following = observe(state.episode, params)
+        learner = update(
+            settings,
+            Learner(state.weights, state.optimiser),
+            rollout(settings, state.weights, state.steps, following, mask),
+            batches.reshape(-1, settings.batch_size),
+            mask,
+        )
+        return state._replace(weights=learner.weights, optimiser=learner.optimiser, key=key)
+
+    return jax.vmap(lane)(params, state)
