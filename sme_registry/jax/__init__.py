@@ -16,6 +16,9 @@ Every module below imports JAX, which nothing outside this folder does. Importin
     gymnax      the same as a class with gymnax's methods
     networks    perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as Torch
     ppo td3 sac the algorithms: hyperparameters, updates, and a `Program` of many lanes
+    off_policy  what TD3 and SAC share: when they act and update
+    replay      their buffer
+    critics     their twin critics and targets
     program     what all programs have: lanes, evaluation, saving, lanes that failed
     run         a program from its start to its end, evaluated where a study's cell is
 """

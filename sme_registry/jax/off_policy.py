@@ -1,0 +1,304 @@
+"""`OffPolicyProgram`: what TD3 and SAC share: steps, replay, learning starts, and when they update.
+
+One iteration of the compiled loop is [the update that is pending; a step of the environment], so
+that an evaluation between two calls sees the weights before the update of the last step. Lanes are
+in lockstep, so what is due is a number of all lanes, and its branch is a real one. The order is
+that of Stable-Baselines3's `OffPolicyAlgorithm`, with n steps done:
+
+    n > learning_starts and train_freq divides n:   gradient_steps updates
+    n < learning_starts:                            a uniform action, else the policy's
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.io import integer_in
+from sme_registry.jax import replay
+from sme_registry.jax.env import EnvState, reset, step, to_unit
+from sme_registry.jax.networks import Weights
+from sme_registry.jax.program import Array, Program, StepLog
+from sme_registry.jax.replay import Transitions
+from sme_registry.jax.task import TaskParams
+
+Log = tuple[jax.Array, ...]
+"""The fields of a `StepLog`."""
+
+_PIECE = 500  # most steps of one call of the compiled loop
+
+
+class OffPolicyState(NamedTuple):
+    """All that changes; each array has a leading axis of lanes, except as said.
+
+    Attributes:
+      learner: weights and optimisers.
+      buffer: `[capacity, lanes, row]`; see `replay`.
+      episode: the environments.
+      observation: `[lanes, S + 2]`, the present one.
+      keys: one for each lane; those of a step follow from it and the step's number.
+      updated: the number of steps before the last update; a scalar.
+    """
+
+    learner: Any
+    buffer: jax.Array
+    episode: EnvState
+    observation: jax.Array
+    keys: jax.Array
+    updated: jax.Array
+
+    @property
+    def weights(self) -> Weights:
+        """By SB3's names, `[lanes, ...]`."""
+        weights: Weights = self.learner.weights
+        return weights
+
+
+class OffPolicyProgram(Program):
+    """Lanes of TD3 or SAC."""
+
+    buffer = "buffer"
+    state: OffPolicyState
+
+    @staticmethod
+    @abstractmethod
+    def initial_learner(weights: Weights) -> Any:
+        """One lane's learner before its first update."""
+
+    @staticmethod
+    @abstractmethod
+    def explore(
+        weights: Weights, observation: jax.Array, key: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask."""
+
+    @staticmethod
+    @abstractmethod
+    def update(
+        settings: Any,
+        learner: Any,
+        batch: Transitions,
+        key: jax.Array,
+        mask: jax.Array,
+        count: jax.Array,
+        index: jax.Array,
+    ) -> Any:
+        """One lane's learner after an update.
+
+        Args:
+          settings: hyperparameters.
+          learner: before it.
+          batch: `[B]` transitions.
+          key: for its noise.
+          mask: `[A]` which action channels exist.
+          count: the number of this update, from 1; the same in all lanes.
+          index: its number among the `gradient_steps` of this step, from 0; the same in all lanes.
+        """
+
+    def initial_state(self, weights: Weights, keys: jax.Array) -> OffPolicyState:
+        """New lanes: random episodes, an empty buffer."""
+        capacity = min(self.settings.buffer_size, self._whole(self.budget))
+        state: OffPolicyState = _initial(type(self), capacity, weights, keys, self.params)
+        return state
+
+    def advance(self, limit: int) -> StepLog:
+        """Go on to step `limit`, or to the end of its `train_freq` steps; see `Program.advance`."""
+        pieces: list[list[Array]] = []
+        end = self._whole(limit)
+        while self.steps < end or not pieces:
+            size = min(_PIECE, max(0, end - self.steps))
+            log = self._loop(self.steps, self.steps + size, acts=True)
+            self.steps += size
+            pieces.append([np.asarray(each)[:size] for each in log])
+        return StepLog(*map(np.concatenate, zip(*pieces, strict=True)))
+
+    def finish(self) -> None:
+        """Make the update that follows the last step."""
+        self._loop(self.steps, self.steps + 1, acts=False)
+
+    def _loop(self, begin: int, end: int, acts: bool) -> Log:
+        log: Log
+        self.state, log = _steps(
+            type(self), self.settings, self.state, self.params, begin, end, acts
+        )
+        return log
+
+    def _whole(self, steps: int) -> int:
+        """At least these steps, in whole multiples of `train_freq`."""
+        every: int = self.settings.train_freq
+        return -(-steps // every) * every
+
+
+_LEAST = {
+    "buffer_size": 1,
+    "learning_starts": 0,
+    "batch_size": 1,
+    "train_freq": 1,
+    "gradient_steps": -1,  # as many as `train_freq`
+    "policy_delay": 1,
+    "target_update_interval": 1,
+}
+
+
+def check_settings(settings: Any) -> None:
+    """Check the hyperparameters that TD3 and SAC share, or that are counts.
+
+    Raises:
+      OptionError: one is out of range.
+    """
+    for name, least in _LEAST.items():
+        if hasattr(settings, name):
+            integer_in(f"hyperparameters.{name}", getattr(settings, name), least)
+    for name in ("tau", "gamma"):
+        if not 0.0 <= getattr(settings, name) <= 1.0:
+            raise OptionError(
+                f"hyperparameters.{name}={getattr(settings, name)!r}: must be in [0, 1]."
+            )
+    if not settings.net_arch or min(settings.net_arch) < 1:
+        raise OptionError(
+            f"hyperparameters.policy_kwargs.net_arch={list(settings.net_arch)}: must be the widths "
+            "of at least one hidden layer, each at least 1."
+        )
+
+
+def in_range(action: jax.Array, symmetric: bool) -> jax.Array:
+    """Actions in [−1, 1], in the action range of the environment."""
+    return action if symmetric else to_unit(action, symmetric=True, dtype=jnp.float32)
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "capacity"))
+def _initial(
+    kind: type[OffPolicyProgram],
+    capacity: int,
+    weights: Weights,
+    keys: jax.Array,
+    params: TaskParams,
+) -> OffPolicyState:
+    starts, keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    observation, episode = jax.vmap(reset)(starts, params)
+    lanes, observation_dim = observation.shape
+    return OffPolicyState(
+        learner=jax.vmap(kind.initial_learner)(weights),
+        buffer=replay.empty(capacity, lanes, observation_dim, params.W.shape[-2]),
+        episode=episode,
+        observation=observation,
+        keys=keys,
+        updated=jnp.zeros((), jnp.int32),
+    )
+
+
+@functools.partial(
+    jax.jit, static_argnames=("kind", "settings"), donate_argnames=("state",)
+)  # donated, or the replay buffer would be copied at each call
+def _steps(
+    kind: type[OffPolicyProgram],
+    settings: Any,
+    state: OffPolicyState,
+    params: TaskParams,
+    begin: jax.Array,
+    end: jax.Array,
+    acts: jax.Array,
+) -> tuple[OffPolicyState, Log]:
+    """Each step from `begin` to `end`, after the update that is pending; no step if not `acts`.
+
+    Returns:
+      The new state, and logs `[_PIECE, lanes]` whose first `end − begin` rows are used.
+    """
+    lanes = state.observation.shape[0]
+    masks = jax.vmap(lambda each: each.action_mask)(params)
+
+    def body(n: jax.Array, carry: tuple[OffPolicyState, Log]) -> tuple[OffPolicyState, Log]:
+        state, log = carry
+        state = _updated(kind, settings, state, masks, n)
+        state, row = _acted(kind, settings, state, params, masks, n, acts)
+        log = jax.tree.map(
+            lambda rows, one: jax.lax.dynamic_update_index_in_dim(rows, one, n - begin, 0), log, row
+        )
+        return state, log
+
+    real, flag = jnp.zeros((_PIECE, lanes), params.r_min.dtype), jnp.zeros((_PIECE, lanes), bool)
+    begun = state, (real, real, real, flag, flag)
+    ended: tuple[OffPolicyState, Log] = jax.lax.fori_loop(begin, end, body, begun)
+    return ended
+
+
+def _updated(
+    kind: type[OffPolicyProgram],
+    settings: Any,
+    state: OffPolicyState,
+    masks: jax.Array,
+    n: jax.Array,
+) -> OffPolicyState:
+    """The state after the updates that follow step n, where they are due and not yet made."""
+    starts, every = settings.learning_starts, settings.train_freq
+    count = settings.gradient_steps if settings.gradient_steps >= 0 else every
+    before = (n // every - starts // every - 1) * count
+    observation_dim = state.observation.shape[-1]
+
+    def one(index: jax.Array, learner: Any) -> Any:
+        keys = _keys(state.keys, n, 2 + index)
+        drawn, noise = jax.vmap(jax.random.split, out_axes=1)(keys)
+        capacity = len(state.buffer)
+        rows = jax.vmap(lambda key: replay.sample_rows(key, settings.batch_size, n, capacity))
+        batch = replay.read(state.buffer, rows(drawn), observation_dim)
+        update = jax.vmap(functools.partial(kind.update, settings), (0, 0, 0, 0, None, None))
+        return update(learner, batch, noise, masks, before + index + 1, index)
+
+    due = (n > starts) & (n % every == 0) & (n > state.updated)
+    learner = jax.lax.cond(
+        due,
+        lambda learner: jax.lax.fori_loop(0, count, one, learner),
+        lambda learner: learner,
+        state.learner,
+    )
+    return state._replace(learner=learner, updated=jnp.where(due, n, state.updated))
+
+
+def _acted(
+    kind: type[OffPolicyProgram],
+    settings: Any,
+    state: OffPolicyState,
+    params: TaskParams,
+    masks: jax.Array,
+    n: jax.Array,
+    acts: jax.Array,
+) -> tuple[OffPolicyState, Log]:
+    """The state after step n + 1, and its row of the log; the same state if not `acts`."""
+    starts, noise = _keys(state.keys, n, 0), _keys(state.keys, n, 1)
+
+    def random(observation: jax.Array) -> jax.Array:
+        width = masks.shape[-1:]
+        draw = functools.partial(jax.random.uniform, shape=width, dtype=jnp.float32, minval=-1.0)
+        return jnp.where(masks, jax.vmap(draw)(noise), 0.0)
+
+    def chosen(observation: jax.Array) -> jax.Array:
+        return jax.vmap(kind.explore)(state.learner.weights, observation, noise, masks)
+
+    action = jax.lax.cond(n < settings.learning_starts, random, chosen, state.observation)
+    unit = to_unit(action, symmetric=True)
+    observation, episode, reward, _, info = jax.vmap(step)(starts, state.episode, unit, params)
+    final = info["final_observation"]
+    terminated = info["terminated"]
+    written = Transitions(state.observation, action, final, reward, terminated)
+    row = reward, info["regret"], info["similarity"], terminated, info["truncated"]
+    after = state._replace(
+        buffer=replay.write(state.buffer, n, written, acts),
+        episode=_chosen(acts, episode, state.episode),
+        observation=_chosen(acts, observation, state.observation),
+    )
+    return after, row
+
+
+def _chosen(acts: jax.Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(acts, x, y), new, old)
+
+
+def _keys(keys: jax.Array, n: jax.Array, use: int | jax.Array) -> jax.Array:
+    """The key of each lane for one use in step n."""
+    return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, n), use))(keys)

@@ -1,0 +1,153 @@
+"""TD3 and SAC of Stable-Baselines3 in mid-run, and their batches and noise for a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+
+from sme_registry.jax.networks import Adam
+from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.replay import Transitions
+from sme_registry.sb3 import SMEVecEnv
+from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
+
+NET_ARCH = (96, 64)
+BATCH = 64
+COUNTS = (1, 10)
+# One program serves both: the smaller one is padded to the widths of the larger one.
+WIDTHS = (Widths(8, 16), Widths(3, 4))
+
+
+def model_in_mid_run(algorithm: str, widths: Widths, steps: int = 280, **settings: Any) -> Any:
+    """A model after some updates; its episodes have terminated and been truncated."""
+    spec = {"state_dim": widths.state_dim, "action_dim": widths.action_dim, "seed": 5}
+    env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if widths.action_dim < 9 else 0.0}, 1)
+    with quiet(), one_thread():
+        model = load_algorithm(algorithm)(
+            "MlpPolicy", env, seed=3, batch_size=BATCH, buffer_size=1000, device="cpu",
+            policy_kwargs={"net_arch": list(NET_ARCH)}, **settings,
+        )  # fmt: skip
+        model.learn(steps)
+    return model
+
+
+class Replayed(NamedTuple):
+    """Weights of one model: before, and after each of `COUNTS` updates."""
+
+    before: dict[str, np.ndarray]
+    theirs: dict[int, dict[str, np.ndarray]]
+    ours: dict[int, dict[str, np.ndarray]]
+    padded: dict[int, dict[str, np.ndarray]]  # ours, with their padding
+
+
+def replay(module: ModuleType, settings: Any, update: Callable[..., Any]) -> list[Replayed]:
+    """Let SB3 and us make the same updates, of one model for each of `WIDTHS`, in mid-run.
+
+    Args:
+      module: `td3` or `sac`.
+      settings: hyperparameters.
+      update: of all lanes: from learners, batches, noise `[lanes, A, draws, B]`, masks and the
+        number of updates that SB3 has made by then, to learners.
+    """
+    full = WIDTHS[0]
+    models = [model_in_mid_run(type(settings).__name__, own) for own in WIDTHS]
+    padding = Padding(partial(module.initial_weights, settings=settings), full)
+    lanes = [_learner(module, model, padding, own) for model, own in _zip(models)]
+    learner = _stacked(lanes)
+    masks = jnp.stack([jnp.arange(full.action_dim) < own.action_dim for own in WIDTHS])
+    results = [Replayed(_weights(model), {}, {}, {}) for model in models]
+    for count in range(1, max(COUNTS) + 1):
+        inputs = _stacked([_one_update(model, own, full, count) for model, own in _zip(models)])
+        learner = update(learner, *inputs, masks, models[0]._n_updates)
+        if count in COUNTS:
+            for lane, (result, own) in enumerate(_zip(results)):
+                result.theirs[count] = _weights(models[lane])
+                result.padded[count] = {n: np.array(w[lane]) for n, w in learner.weights.items()}
+                result.ours[count] = padding.remove(result.padded[count], own)
+    return results
+
+
+def greatest_difference(weights: dict[str, np.ndarray], others: dict[str, np.ndarray]) -> float:
+    """Over all weights of the same names."""
+    assert weights.keys() == others.keys()
+    return max(float(np.abs(weight - others[name]).max()) for name, weight in weights.items())
+
+
+def _one_update(model: Any, own: Widths, full: Widths, seed: int) -> tuple[Transitions, np.ndarray]:
+    """Let SB3 make one update; the batch and the noise that it drew, padded.
+
+    NumPy's generator draws the batch and Torch's the noise. Noise of padded channels is 1.
+    """
+    _seed(seed)
+    drawn = model.replay_buffer.sample(BATCH)
+    draws = [torch.randn(BATCH, own.action_dim).numpy().T for _ in range(2)]
+    noise = np.ones((full.action_dim, 2, BATCH), np.float32)
+    noise[: own.action_dim] = np.stack(draws, axis=1)
+    _seed(seed)
+    model.train(1, BATCH)
+
+    def observations(x: torch.Tensor) -> np.ndarray:
+        wider = np.zeros((BATCH, full.observation_dim), np.float32)
+        wider[:, : own.state_dim], wider[:, full.state_dim :] = x[:, :-2], x[:, -2:]
+        return wider
+
+    action = np.zeros((BATCH, full.action_dim), np.float32)
+    action[:, : own.action_dim] = drawn.actions
+    batch = Transitions(
+        observations(drawn.observations),
+        action,
+        observations(drawn.next_observations),
+        drawn.rewards.numpy()[:, 0],
+        drawn.dones.numpy()[:, 0],
+    )
+    return batch, noise
+
+
+def _weights(model: Any) -> dict[str, np.ndarray]:
+    """All weights by the names of the policy's state_dict, and log α of SAC."""
+    weights = {name: w.numpy().copy() for name, w in model.policy.state_dict().items()}
+    if hasattr(model, "log_ent_coef"):
+        weights["log_ent_coef"] = model.log_ent_coef.detach().numpy().copy()
+    return weights
+
+
+def _learner(module: ModuleType, model: Any, padding: Padding, own: Widths) -> Any:
+    """The model's weights and Adam states, padded."""
+    optimisers = [
+        (getattr(model, each).optimizer, [f"{each}.{n}" for n, _ in network.named_parameters()])
+        for each, network in (("actor", model.actor), ("critic", model.critic))
+    ]
+    if hasattr(model, "log_ent_coef"):
+        optimisers.append((model.ent_coef_optimizer, ["log_ent_coef"]))
+    adams = [_adam(*each, padding, own) for each in optimisers]
+    return module.Learner(padding.add(_weights(model), own), *adams)
+
+
+def _adam(optimiser: Any, names: list[str], padding: Padding, own: Widths) -> Adam:
+    """The state of a Torch optimiser whose parameters have these names, in their order."""
+    state = list(optimiser.state_dict()["state"].values())
+    mean, square = (
+        padding.add({n: each[key].numpy() for n, each in zip(names, state, strict=True)}, own)
+        for key in ("exp_avg", "exp_avg_sq")
+    )
+    return Adam(mean, square, np.int32(state[0]["step"].item()))
+
+
+def _stacked(lanes: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+
+
+def _zip(each: list[Any]) -> list[tuple[Any, Widths]]:
+    return list(zip(each, WIDTHS, strict=True))
+
+
+def _seed(seed: int) -> None:
+    np.random.seed(seed)  # noqa: NPY002  (SB3 uses the global generator)
+    torch.manual_seed(seed)

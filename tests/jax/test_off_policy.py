@@ -1,0 +1,176 @@
+"""Programs of TD3 and SAC: the order of steps, updates and evaluations, replay, resuming, NaN."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sme_registry.errors import OptionError
+from sme_registry.jax import replay
+from sme_registry.jax.off_policy import OffPolicyProgram
+from sme_registry.jax.sac import SAC, SACProgram
+from sme_registry.jax.task import Shape
+from sme_registry.jax.td3 import TD3, TD3Program
+from sme_registry.spec import SMESpec
+
+STARTS, BUDGET = 6, 30
+TINY: dict[str, Any] = {"learning_starts": STARTS, "batch_size": 8, "net_arch": (8,)}
+KINDS = [(TD3Program, TD3(**TINY)), (SACProgram, SAC(**TINY))]
+SPECS = [SMESpec(seed=i, state_dim=3, action_dim=2, horizon=7, D=0.2 * i) for i in range(2)]
+
+
+@pytest.fixture(params=KINDS, ids=["TD3", "SAC"])
+def new(request: pytest.FixtureRequest) -> Any:
+    """Makes a program of two lanes; all of an algorithm share their compiled code."""
+    kind, settings = request.param
+    return partial(kind, settings, SPECS, [3, 4], steps=BUDGET)
+
+
+def test_pieces_of_any_length_give_the_same_bits(new: Any) -> None:
+    whole, pieces = new(), new()
+    log = whole.advance(BUDGET)
+    parts = [pieces.advance(limit) for limit in (1, STARTS + 1, STARTS + 2, BUDGET)]
+    whole.finish()
+    pieces.finish()
+    assert pieces.steps == BUDGET
+    for name in log._fields:
+        assert np.array_equal(getattr(log, name), np.concatenate([getattr(p, name) for p in parts]))
+    assert_equal(whole.save(), pieces.save())
+
+
+def test_the_update_after_the_last_step_waits(new: Any) -> None:
+    program = new()
+    initial = program.weights(0)
+    program.advance(STARTS + 1)
+    assert_equal(program.weights(0), initial)
+    program.finish()
+    assert not np.array_equal(program.weights(0)[CRITIC], initial[CRITIC])
+    finished = program.save()
+    program.finish()
+    assert_equal(program.save(), finished)
+
+
+def test_no_update_before_the_learning_starts(new: Any) -> None:
+    program = new()
+    initial = program.weights(0)
+    program.advance(STARTS)
+    program.finish()
+    assert_equal(program.weights(0), initial)
+
+
+def test_td3_moves_its_policy_at_every_second_update() -> None:
+    kind, settings = KINDS[0]
+    program = kind(settings, SPECS, [3, 4], steps=BUDGET)
+    program.advance(STARTS + 1)
+    initial = program.weights(0)
+    changed = []
+    for steps in range(STARTS + 2, STARTS + 6):
+        program.advance(steps)  # with the updates up to that after the step before
+        weights = program.weights(0)
+        changed.append({name for name in weights if (weights[name] != initial[name]).any()})
+        initial = weights
+    critic = {name for name in initial if name.startswith("critic.")}
+    assert changed == [critic, set(initial), critic, set(initial)]
+
+
+def test_td3_acts_at_random_until_the_learning_starts() -> None:
+    kind, settings = KINDS[0]
+    program = kind(settings, SPECS, [3, 4], steps=BUDGET)
+    program.advance(STARTS + 1)
+    act = jax.vmap(partial(kind.act, settings, symmetric=True), (0, 1), 1)
+    stored = rows(program)
+    policy = np.asarray(act(program.state.weights, jnp.asarray(stored.observation)))
+    assert np.allclose(stored.action[STARTS], policy[STARTS], atol=1e-6)
+    assert not np.isclose(stored.action[:STARTS], policy[:STARTS], atol=1e-3).any()
+    assert 0.2 < np.abs(stored.action[:STARTS]).mean() < 0.8
+
+
+def test_an_episode_that_was_truncated_is_not_done(new: Any) -> None:
+    program = new()
+    log = program.advance(BUDGET)
+    stored = rows(program)
+    assert log.truncated.any()
+    assert log.terminated.any()
+    assert np.array_equal(stored.done, log.terminated)
+    assert np.array_equal(stored.reward, log.reward.astype(np.float32))
+    ended = log.terminated | log.truncated
+    joined = (stored.next_observation[:-1] == stored.observation[1:]).all(axis=-1)
+    assert np.array_equal(joined, ~ended[:-1])
+    time = stored.next_observation[..., -2]
+    assert (time[log.truncated] == 1.0).all()
+
+
+def test_a_restored_program_goes_on_with_the_same_bits(new: Any) -> None:
+    program = new()
+    program.advance(STARTS + 5)
+    saved = program.save()
+    copies = {name: array.copy() for name, array in saved.items()}
+    log = program.advance(BUDGET)
+    assert_equal(saved, copies)
+    resumed = new()
+    resumed.restore(copies)
+    assert_equal(resumed.advance(BUDGET)._asdict(), log._asdict())
+    assert_equal(resumed.save(), program.save())
+
+
+def test_a_lane_that_fails_leaves_the_others_alone(new: Any) -> None:
+    program, failing = new(), new()
+    weights = failing.state.weights
+    first = next(iter(weights))
+    broken = weights | {first: weights[first].at[1].set(jnp.nan)}
+    failing.state = failing.state._replace(learner=failing.state.learner._replace(weights=broken))
+    log, other = program.advance(BUDGET), failing.advance(BUDGET)
+    assert failing.failed().tolist() == [False, True]
+    assert np.array_equal(log.regret[:, 0], other.regret[:, 0])
+    assert_equal(program.weights(0), failing.weights(0))
+
+
+def test_padding_changes_no_step() -> None:
+    kind, settings = KINDS[1]
+    exact = kind(settings, SPECS, [3, 4], steps=BUDGET)
+    padded = kind(settings, SPECS, [3, 4], steps=BUDGET, shape=Shape(5, 4, 1, 0))
+    log, other = exact.advance(BUDGET), padded.advance(BUDGET)
+    assert np.allclose(log.regret, other.regret, atol=1e-4)
+    for name, weight in exact.weights(0).items():
+        assert np.allclose(weight, padded.weights(0)[name], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (TD3, {"batch_size": 0}),
+        (TD3, {"learning_starts": -1}),
+        (TD3, {"policy_delay": 0}),
+        (TD3, {"gradient_steps": -2}),
+        (TD3, {"net_arch": ()}),
+        (SAC, {"tau": 1.5}),
+        (SAC, {"ent_coef": "automatic"}),
+        (SAC, {"ent_coef": "auto_0"}),
+        (SAC, {"target_entropy": "auto_1"}),
+    ],
+)
+def test_hyperparameters_out_of_range_are_refused_by_name(kind: Any, values: Any) -> None:
+    with pytest.raises(OptionError, match=next(iter(values))):
+        kind(**values)
+
+
+CRITIC = "critic.qf0.0.weight"
+
+
+def rows(program: OffPolicyProgram) -> replay.Transitions:
+    """The buffer, `[steps, lanes, ...]`."""
+    stored = program.state.buffer[: program.steps]
+    lanes = jnp.arange(program.steps)[None].repeat(stored.shape[1], axis=0)
+    read = replay.read(stored, lanes, program.state.observation.shape[-1])
+    return jax.tree.map(lambda array: np.asarray(array).swapaxes(0, 1), read)
+
+
+def assert_equal(arrays: dict[str, Any], others: dict[str, Any]) -> None:
+    assert arrays.keys() == others.keys()
+    for name, array in arrays.items():
+        assert np.array_equal(array, others[name]), name

@@ -1,0 +1,38 @@
+"""SAC's updates equal Stable-Baselines3's, in wide actions and in padded ones."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from sme_registry.jax import sac
+from sme_registry.jax.sac import SAC
+from tests.jax import sb3_replay
+from tests.jax.sb3_replay import BATCH, NET_ARCH, Replayed
+
+SETTINGS = SAC(net_arch=NET_ARCH, batch_size=BATCH)
+
+
+@pytest.fixture(scope="module")
+def lanes() -> list[Replayed]:
+    one = jax.jit(jax.vmap(partial(sac.update, settings=SETTINGS)))
+    return sb3_replay.replay(sac, SETTINGS, lambda *arguments: one(*arguments[:4]))
+
+
+@pytest.mark.parametrize("lane", [0, 1], ids=["A=16", "padded"])
+@pytest.mark.parametrize(("updates", "tolerance"), [(1, 1e-6), (10, 1e-5)])
+def test_updates_equal_those_of_stable_baselines3(
+    lanes: list[Replayed], lane: int, updates: int, tolerance: float
+) -> None:
+    replayed = lanes[lane]
+    theirs = replayed.theirs[updates]
+    assert sb3_replay.greatest_difference(theirs, replayed.before) > 100 * tolerance
+    assert sb3_replay.greatest_difference(theirs, replayed.ours[updates]) < tolerance
+
+
+def test_padded_weights_remain_zero(lanes: list[Replayed]) -> None:
+    for name, weight in lanes[1].padded[10].items():
+        assert np.count_nonzero(weight) == np.count_nonzero(lanes[1].ours[10][name])
