@@ -83,9 +83,7 @@ def step_env(
 
     `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`.
     """
-    optimal = oracle.optimal_action(params, state.s)
-    similarity = oracle.similarity(params, action, optimal)
-    step_reward = oracle.step_reward(params, similarity)
+    similarity, step_reward = oracle.judge(params, state.s, action)
 
     total = state.accumulated_reward + step_reward
     t = state.t + 1

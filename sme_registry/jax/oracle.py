@@ -22,6 +22,12 @@ from sme_registry.jax.task import Layer, TaskParams
 from sme_registry.jax.transition import States
 
 
+def judge(params: TaskParams, s: States, a: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """r̃ and r `[...]` of states `[..., S]` and actions `[..., A]`, clipped to [0, 1]."""
+    similarities = similarity(params, a, optimal_action(params, s))
+    return similarities, step_reward(params, similarities)
+
+
 def optimal_action(params: TaskParams, s: States) -> jax.Array:
     """π*(s) of states `[..., S]`, any real numbers: `[..., A]` in [0, 1]; ½ where padded."""
     x = pairs.to_float32(s) if isinstance(s, Pair) else s

@@ -305,7 +305,7 @@ def _episodes(
             return state._replace(s=s, t=state.t + 1), (state.s, a)
 
         state, (s, a) = jax.lax.scan(move, now.state, length=_PIECE)
-        judge = jax.vmap(_judged, (0, 1, 1), (1, 1))
+        judge = jax.vmap(oracle.judge, (0, 1, 1), (1, 1))
         similarity, reward = judge(params, s, a)  # [piece, lanes, episodes]
         horizon = params.horizon[:, None]
         counted = now.state.t + jnp.arange(_PIECE)[:, None, None] < horizon
@@ -334,9 +334,3 @@ def _each(function: Any, *arguments: Any, params: TaskParams) -> Any:
     """`function(*arguments, params)` of each episode `[lanes, episodes]`."""
     episodes = jax.vmap(function, (*[0] * len(arguments), None))
     return jax.vmap(episodes)(*arguments, params)
-
-
-def _judged(params: TaskParams, s: States, a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """r̃ and r `[...]` of states and actions of one task."""
-    similarity = oracle.similarity(params, a, oracle.optimal_action(params, s))
-    return similarity, oracle.step_reward(params, similarity)

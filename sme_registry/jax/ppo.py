@@ -1,0 +1,456 @@
+"""PPO as in Stable-Baselines3: hyperparameters, weights, advantages, updates, and `PPOProgram`.
+
+Source: Schulman et al. (2017), Proximal Policy Optimization Algorithms; defaults and order of
+operations: SB3's `PPO` with `MlpPolicy`. `n` steps of a rollout, `O` observation width, `A` action
+channels, `B` steps of a minibatch. Functions are of one lane, and vmapped.
+
+    a ~ N(μ(o), σ²)                      clipped to the action range for the environment alone
+    δ_t = R_t + γ V(o_{t+1}) − V(o_t)    after an episode's end V(o_{t+1}) and Â_{t+1} are 0;
+    Â_t = δ_t + γ λ Â_{t+1}              at a truncation R_t includes γ V(last observation)
+    loss = −mean min(ρ Â, clip(ρ, 1 ± ε) Â) + c_V mean (Â + V_old − V)² − c_H entropy
+
+ρ is the ratio of π(a) now and when the action was taken. Padded observations are 0, and padded
+action channels are masked in log π and in the entropy, so the weights of both get no gradients.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.jax import oracle
+from sme_registry.jax.env import EnvState, observe, reset, step_env, to_unit
+from sme_registry.jax.networks import (
+    Adam,
+    HostWeights,
+    Weights,
+    adam,
+    clipped,
+    initial_orthogonal,
+    linear,
+    perceptron,
+)
+from sme_registry.jax.program import Program, StepLog
+from sme_registry.jax.task import TaskParams
+
+_LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
+_ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
+_NO_KEY: Any = None  # `step_env` draws nothing
+
+
+@dataclass(frozen=True)
+class PPO:
+    """Hyperparameters, with the names and defaults of `stable_baselines3.PPO`.
+
+    `net_arch` is the widths of the hidden layers of each network (`policy_kwargs.net_arch`).
+
+    Raises:
+      OptionError: minibatches of one step, or that do not divide a rollout.
+    """
+
+    learning_rate: float = 3e-4
+    n_steps: int = 2048
+    batch_size: int = 64
+    n_epochs: int = 10
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    clip_range_vf: float | None = None
+    normalize_advantage: bool = True
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    net_arch: tuple[int, ...] = (64, 64)
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 2 or self.n_steps % self.batch_size:
+            raise OptionError(
+                f"hyperparameters.batch_size={self.batch_size}: must be at least 2 and divide "
+                f"n_steps ({self.n_steps}); minibatches here are of equal size."
+            )
+
+
+class Learner(NamedTuple):
+    """What an update changes: weights by SB3's names, and the optimiser's state."""
+
+    weights: Weights
+    optimiser: Adam
+
+
+class Steps(NamedTuple):
+    """The steps of a rollout, as the environment answered.
+
+    Attributes:
+      observation: `[n, O]` before the step.
+      action: `[n, A]`, not clipped.
+      reward: `[n]` R, float32.
+      terminated: `[n]`.
+      truncated: `[n]`.
+      last_observation: `[n, O]` after the step, and before the next episode begins.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    last_observation: jax.Array
+
+
+class Rollout(NamedTuple):
+    """What updates learn from.
+
+    Attributes:
+      observation: `[n, O]`.
+      action: `[n, A]`, not clipped.
+      log_density: `[n]` log π of the action when it was taken.
+      value: `[n]` V when it was taken.
+      advantage: `[n]` Â.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    log_density: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+
+
+class State(NamedTuple):
+    """All that changes in a `PPOProgram`; each array has a leading axis of lanes.
+
+    Attributes:
+      weights: by SB3's names.
+      optimiser: Adam's state.
+      key: of all random numbers to come.
+      episode: the environment.
+      steps: of the last rollout.
+    """
+
+    weights: Weights
+    optimiser: Adam
+    key: jax.Array
+    episode: EnvState
+    steps: Steps
+
+
+def initial_weights(
+    settings: PPO, rng: np.random.Generator, observation_dim: int, action_dim: int
+) -> HostWeights:
+    """SB3's initial weights: orthogonal; biases and log σ are 0."""
+    weights: HostWeights = {"log_std": np.zeros(action_dim, np.float32)}
+    for network, head, outputs, gain in (
+        ("policy_net", "action_net", action_dim, 0.01),
+        ("value_net", "value_net", 1, 1.0),
+    ):
+        width = observation_dim
+        for i, units in enumerate(settings.net_arch):
+            name = f"mlp_extractor.{network}.{2 * i}"
+            weights |= initial_orthogonal(rng, name, width, units, math.sqrt(2.0))
+            width = units
+        weights |= initial_orthogonal(rng, head, width, outputs, gain)
+    return weights
+
+
+def act(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
+    """μ `[..., A]` of observations `[..., O]`: the deterministic action before it is clipped."""
+    return linear(weights, "action_net", _latent(settings, weights, "policy_net", observation))
+
+
+def value(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
+    """V `[...]` of observations `[..., O]`."""
+    latent = _latent(settings, weights, "value_net", observation)
+    return linear(weights, "value_net", latent)[..., 0]
+
+
+def log_density(
+    settings: PPO, weights: Weights, observation: jax.Array, action: jax.Array, mask: jax.Array
+) -> jax.Array:
+    """log π `[...]` of actions `[..., A]`; only the channels of the mask `[A]` count."""
+    log_std = weights["log_std"]
+    z = (action - act(settings, weights, observation)) * jnp.exp(-log_std)
+    return jnp.sum(jnp.where(mask, -0.5 * z**2 - log_std - _LOG_ROOT_TAU, 0.0), axis=-1)
+
+
+def collect(
+    settings: PPO,
+    weights: Weights,
+    params: TaskParams,
+    episode: EnvState,
+    noise: jax.Array,
+    fresh: EnvState,
+    *,
+    symmetric: bool,
+    separable: bool,
+) -> tuple[EnvState, Steps, StepLog]:
+    """The steps of a rollout.
+
+    Args:
+      settings: the hyperparameters.
+      weights: the policy's.
+      params: one task.
+      episode: the environment before the first step.
+      noise: `[A, n]` standard normal.
+      fresh: `[n]` the environment after each step if an episode ends there.
+      symmetric: whether actions are in [−1, 1] instead of [0, 1].
+      separable: whether k = 1 and D = 0, so that no reward changes an observation or ends an
+        episode. The oracle is then asked once for all steps.
+
+    Returns:
+      The environment after the last step, the steps, and their log, `[n]`.
+    """
+    sigma = jnp.exp(weights["log_std"])
+
+    def one(episode: EnvState, drawn: tuple[jax.Array, EnvState]) -> tuple[EnvState, Any]:
+        noise, fresh = drawn
+        observation = observe(episode, params)
+        action = act(settings, weights, observation) + sigma * noise
+        a = to_unit(action, symmetric)
+        _, after, reward, ended, info = step_env(_NO_KEY, episode, a, params)
+        judged: Any = info["similarity"], info["step_reward"], reward, info["terminated"]
+        if separable:  # XLA drops the oracle from the loop, since no result of it is used
+            after = after._replace(accumulated_reward=episode.accumulated_reward)
+            ended, judged = info["truncated"], (episode.s, a)
+        taken = observation, action, info["truncated"], observe(after, params)
+        after = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
+        return after, (taken, judged)
+
+    episode, (taken, judged) = jax.lax.scan(one, episode, (noise.T, fresh))
+    observation, action, truncated, last_observation = taken
+    if separable:
+        similarity, step_reward = oracle.judge(params, *judged)
+        judged = similarity, step_reward, step_reward, jnp.zeros_like(truncated)
+    similarity, step_reward, reward, terminated = judged
+    log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated)
+    reward = reward.astype(jnp.float32)
+    steps = Steps(observation, action, reward, terminated, truncated, last_observation)
+    return episode, steps, log
+
+
+def rollout(
+    settings: PPO, weights: Weights, steps: Steps, next_observation: jax.Array, mask: jax.Array
+) -> Rollout:
+    """Densities, values and advantages of the steps of one lane.
+
+    An episode that was truncated would have gone on: the value of its last observation is added to
+    its last reward.
+
+    Args:
+      settings: the hyperparameters.
+      weights: with which the actions were drawn.
+      steps: the steps.
+      next_observation: `[O]` with which the next rollout begins.
+      mask: `[A]` which action channels exist.
+    """
+    values = value(settings, weights, steps.observation)
+    cut = steps.truncated & ~steps.terminated
+    last_value = value(settings, weights, steps.last_observation)
+    reward = steps.reward + jnp.where(cut, settings.gamma * last_value, 0.0)
+    ended = steps.terminated | steps.truncated
+    next_value = value(settings, weights, next_observation)
+    return Rollout(
+        steps.observation,
+        steps.action,
+        log_density(settings, weights, steps.observation, steps.action, mask),
+        values,
+        advantages(settings, reward, values, next_value, ended),
+    )
+
+
+def advantages(
+    settings: PPO, reward: jax.Array, values: jax.Array, next_value: jax.Array, ended: jax.Array
+) -> jax.Array:
+    """Generalised advantage estimates Â `[n]` (Schulman et al. 2016).
+
+    Args:
+      settings: γ and λ.
+      reward: `[n]` R, with the value of the last observation where an episode was truncated.
+      values: `[n]` V of the observations.
+      next_value: V of the observation after the last step.
+      ended: `[n]` whether the step ended an episode.
+    """
+    goes_on = 1.0 - ended.astype(jnp.float32)
+    following = jnp.append(values[1:], next_value)
+    delta = reward + settings.gamma * following * goes_on - values
+    decay = settings.gamma * settings.gae_lambda * goes_on
+
+    def step(later: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        advantage = now[0] + now[1] * later
+        return advantage, advantage
+
+    return jax.lax.scan(step, jnp.zeros((), jnp.float32), (delta, decay), reverse=True)[1]
+
+
+def update(
+    settings: PPO,
+    learner: Learner,
+    rollout: Rollout,
+    batches: jax.Array,
+    mask: jax.Array,
+) -> Learner:
+    """One update for each minibatch.
+
+    Args:
+      settings: the hyperparameters.
+      learner: the state before.
+      rollout: the steps.
+      batches: `[updates, B]` which steps are in each minibatch.
+      mask: `[A]` which action channels exist.
+    """
+
+    def one(learner: Learner, batch: jax.Array) -> tuple[Learner, None]:
+        weights, optimiser = learner
+        chosen = Rollout(*(each[batch] for each in rollout))
+        gradients = jax.grad(_loss, argnums=1)(settings, weights, chosen, mask)
+        gradients = clipped(gradients, settings.max_grad_norm)
+        rate = settings.learning_rate
+        optimiser, weights = adam(optimiser, weights, gradients, rate, _ADAM_EPSILON)
+        return Learner(weights, optimiser), None
+
+    return jax.lax.scan(one, learner, batches)[0]
+
+
+def permutations(key: jax.Array, count: int, n: int) -> jax.Array:
+    """`[count, n]` random orders of 0 … n − 1.
+
+    Random words are sorted whose last bits are the index, in a sixth of the time of
+    `jax.random.permutation` on a CPU. That two words agree in all other bits has a probability
+    below n³ 2⁻⁶⁴.
+    """
+    bits = n.bit_length()
+    words = jax.random.bits(key, (count, n), jnp.uint64) << bits | jnp.arange(n, dtype=jnp.uint64)
+    orders: jax.Array = jnp.sort(words, axis=-1) % 2**bits
+    return orders.astype(jnp.int32)
+
+
+def _loss(settings: PPO, weights: Weights, batch: Rollout, mask: jax.Array) -> jax.Array:
+    density = log_density(settings, weights, batch.observation, batch.action, mask)
+    ratio = jnp.exp(density - batch.log_density)
+    advantage = batch.advantage
+    if settings.normalize_advantage:
+        advantage = (advantage - advantage.mean()) / (advantage.std(ddof=1) + 1e-8)
+    limited = jnp.clip(ratio, 1.0 - settings.clip_range, 1.0 + settings.clip_range)
+    policy_loss = -jnp.minimum(advantage * ratio, advantage * limited).mean()
+
+    values = value(settings, weights, batch.observation)
+    if settings.clip_range_vf is not None:
+        change = jnp.clip(values - batch.value, -settings.clip_range_vf, settings.clip_range_vf)
+        values = batch.value + change
+    value_loss = ((batch.advantage + batch.value - values) ** 2).mean()
+    entropy = jnp.sum(jnp.where(mask, 0.5 + _LOG_ROOT_TAU + weights["log_std"], 0.0))
+    return policy_loss + settings.vf_coef * value_loss - settings.ent_coef * entropy
+
+
+def _latent(settings: PPO, weights: Weights, network: str, observation: jax.Array) -> jax.Array:
+    """The last hidden layer of the policy's or the value's perceptron."""
+    layers = len(settings.net_arch)
+    hidden = perceptron(weights, f"mlp_extractor.{network}", observation, layers, jnp.tanh)
+    return jnp.tanh(hidden)
+
+
+class PPOProgram(Program):
+    """Lanes of PPO; see `Program`."""
+
+    def __init__(self, settings: PPO, *arguments: Any, **options: Any) -> None:
+        self.rollout = settings.n_steps
+        super().__init__(settings, *arguments, **options)
+
+    def initial_weights(
+        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        """SB3's; see `initial_weights`."""
+        return initial_weights(self.settings, rng, observation_dim, action_dim)
+
+    def initial_state(self, weights: Weights, keys: jax.Array) -> State:
+        """Lanes at the start of their first episode."""
+        state: State = _begin(self.settings, self.params, weights, keys)
+        return state
+
+    @staticmethod
+    def act(settings: PPO, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
+        """μ; see `act`."""
+        return act(settings, weights, observations)
+
+    def advance(self, limit: int) -> StepLog:
+        """Whole rollouts until `limit` is reached, and the updates between them."""
+        none = np.zeros((0, self.lanes))
+        logs = [StepLog(none, none, none, none > 0, none > 0)]
+        while self.steps < limit:
+            self.finish()
+            self.state, log = _collect(
+                self.settings,
+                self.symmetric,
+                self.separable and self.params.inner is not None,
+                self.params,
+                self.state,
+            )
+            self.steps += self.rollout
+            logs.append(log)
+        return StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+
+    def finish(self) -> None:
+        """Learn from the last rollout, unless that is done."""
+        settings = self.settings
+        updates = self.steps // settings.batch_size * settings.n_epochs
+        if self.state.optimiser.updates[0] < updates:
+            self.state = _learn(settings, self.params, self.state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array) -> State:
+    def lane(params: TaskParams, weights: Weights, key: jax.Array) -> State:
+        key, own = jax.random.split(key)
+        observation, episode = reset(own, params)
+        flag, number = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
+        none = Steps(observation, weights["log_std"], number, flag, flag, observation)
+        steps = jax.tree.map(lambda x: jnp.zeros((settings.n_steps, *x.shape), x.dtype), none)
+        return State(weights, Adam.initial(weights), key, episode, steps)
+
+    return jax.vmap(lane)(params, weights, keys)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _collect(
+    settings: PPO, symmetric: bool, separable: bool, params: TaskParams, state: State
+) -> tuple[State, StepLog]:
+    """A rollout of all lanes, and its log `[n, lanes]`."""
+
+    def lane(params: TaskParams, state: State) -> tuple[State, StepLog]:
+        key, of_noise, of_starts = jax.random.split(state.key, 3)
+        n, A = settings.n_steps, params.W.shape[0]
+        noise = jax.random.normal(of_noise, (A, n), jnp.float32)
+        _, fresh = jax.vmap(reset, (0, None))(jax.random.split(of_starts, n), params)
+        episode, steps, log = collect(
+            settings, state.weights, params, state.episode, noise, fresh,
+            symmetric=symmetric, separable=separable,
+        )  # fmt: skip
+        return state._replace(key=key, episode=episode, steps=steps), log
+
+    return jax.vmap(lane, out_axes=(0, 1))(params, state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _learn(settings: PPO, params: TaskParams, state: State) -> State:
+    """The updates of all lanes on their last rollout."""
+
+    def lane(params: TaskParams, state: State) -> State:
+        key, of_batches = jax.random.split(state.key)
+        batches = permutations(of_batches, settings.n_epochs, settings.n_steps)
+        mask = params.action_mask
+        following = observe(state.episode, params)
+        learner = update(
+            settings,
+            Learner(state.weights, state.optimiser),
+            rollout(settings, state.weights, state.steps, following, mask),
+            batches.reshape(-1, settings.batch_size),
+            mask,
+        )
+        return state._replace(weights=learner.weights, optimiser=learner.optimiser, key=key)
+
+    return jax.vmap(lane)(params, state)

@@ -1,0 +1,310 @@
+"""PPO against Stable-Baselines3 from its weights and Adam's state in mid-run, and its program."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("jax")
+pytest.importorskip("stable_baselines3")
+
+import jax
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from sme_registry import SMESpec, make
+from sme_registry.errors import OptionError
+from sme_registry.jax import ppo
+from sme_registry.jax.env import EnvState, start
+from sme_registry.jax.networks import Adam
+from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.task import Shape, task_params
+from sme_registry.training.algorithms import silence
+from sme_registry.training.monitored_env import MonitoredVecEnv
+
+Weights = dict[str, npt.NDArray[np.float32]]
+
+# Episodes end by D, by T, and by both on one step; payouts are delayed.
+SPEC = SMESpec(k=2, D=0.01, horizon=2)
+MANY_ACTIONS = SMESpec(action_dim=16, k=10, horizon=25)
+SETTINGS = ppo.PPO(n_steps=512, n_epochs=40, clip_range_vf=0.2, ent_coef=0.01)
+UPDATES = SETTINGS.n_steps // SETTINGS.batch_size * SETTINGS.n_epochs  # 320
+
+
+class Recording(NamedTuple):
+    """SB3 in mid-run: a rollout, the learner before it, and the weights after each update."""
+
+    spec: SMESpec
+    learner: ppo.Learner
+    steps: ppo.Steps
+    next_observation: npt.NDArray[np.float32]
+    rollout: ppo.Rollout
+    batches: npt.NDArray[np.int64]
+    weights: list[Weights]
+
+
+class RecordingEnv(MonitoredVecEnv):
+    """An environment that keeps the answers to its steps."""
+
+    def step_wait(self) -> Any:
+        answer = observation, rewards, dones, (info,) = super().step_wait()
+        truncated = info["TimeLimit.truncated"]
+        last = info.get("terminal_observation", observation[0])
+        self.rows.append((float(rewards[0]), bool(dones[0]) and not truncated, truncated, last))
+        return answer
+
+
+class RecordingBuffer(RolloutBuffer):
+    """A rollout that keeps which steps are in each minibatch."""
+
+    def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
+        self.batches.append(batch_inds)
+        return super()._get_samples(batch_inds, env)
+
+
+@pytest.fixture(scope="module", params=[SPEC, MANY_ACTIONS], ids=["ends", "many_actions"])
+def recording(request: Any) -> Recording:
+    spec = request.param
+    env = RecordingEnv(spec, action_range="symmetric")
+    names = ("n_steps", "n_epochs", "clip_range_vf", "ent_coef")
+    chosen = {name: getattr(SETTINGS, name) for name in names}
+    model = PPO(
+        "MlpPolicy", env, seed=3, device="cpu", rollout_buffer_class=RecordingBuffer, **chosen
+    )
+    silence(model)
+    model.rollout_buffer.batches, env.rows = [], []
+    model.learn(SETTINGS.n_steps)
+    env.rows = []
+    callback = model._setup_learn(SETTINGS.n_steps, None, False)[1]
+    model.collect_rollouts(env, callback, model.rollout_buffer, SETTINGS.n_steps)
+    buffer = model.rollout_buffer
+    rollout = ppo.Rollout(
+        buffer.observations[:, 0], buffer.actions[:, 0], buffer.log_probs[:, 0],
+        buffer.values[:, 0], buffer.advantages[:, 0],
+    )  # fmt: skip
+    rewards, *ends, last = (np.array(column) for column in zip(*env.rows, strict=True))
+    steps = ppo.Steps(*rollout[:2], rewards.astype(np.float32), *ends, last)
+    learner, weights = learner_of(model), []
+    model.policy.optimizer.register_step_post_hook(lambda *_: weights.append(weights_of(model)))
+    buffer.batches = []
+    model.train()
+    batches = np.array(buffer.batches)
+    return Recording(spec, learner, steps, model._last_obs[0], rollout, batches, weights)
+
+
+def weights_of(model: Any) -> Weights:
+    return {name: w.detach().numpy().copy() for name, w in model.policy.named_parameters()}
+
+
+def learner_of(model: Any) -> ppo.Learner:
+    weights, moments = weights_of(model), model.policy.optimizer.state_dict()["state"]
+    mean, square = (
+        {name: moments[i][key].numpy().copy() for i, name in enumerate(weights)}
+        for key in ("exp_avg", "exp_avg_sq")
+    )
+    return ppo.Learner(weights, Adam(mean, square, np.int32(moments[0]["step"])))
+
+
+@functools.cache
+def one_update() -> Any:
+    return jax.jit(functools.partial(ppo.update, SETTINGS))
+
+
+def after_updates(
+    learner: ppo.Learner, rollout: ppo.Rollout, recording: Recording, mask: Any
+) -> list[Weights]:
+    """The weights after the first and after the last update."""
+    weights = []
+    for i in range(UPDATES):
+        learner = one_update()(learner, rollout, recording.batches[i : i + 1], mask)
+        if i in (0, UPDATES - 1):
+            weights.append({name: np.asarray(w) for name, w in learner.weights.items()})
+    return weights
+
+
+def largest_difference(one: Weights, other: Weights) -> float:
+    assert one.keys() == other.keys()
+    return max(np.abs(one[name] - other[name]).max() for name in one)
+
+
+def test_initial_weights_have_the_names_and_shapes_of_sb3(recording: Recording) -> None:
+    rng = np.random.default_rng(0)
+    weights = ppo.initial_weights(SETTINGS, rng, 10, recording.spec.action_dim)
+    theirs = recording.learner.weights
+    assert {n: w.shape for n, w in weights.items()} == {n: w.shape for n, w in theirs.items()}
+    gains = {"mlp_extractor.value_net.2": 2**0.5, "action_net": 0.01, "value_net": 1.0}
+    for name, gain in gains.items():
+        singular = np.linalg.svd(weights[f"{name}.weight"], compute_uv=False)
+        np.testing.assert_allclose(singular, gain, rtol=1e-5)
+        assert not weights[f"{name}.bias"].any()
+
+
+def test_advantages_equal_those_of_sb3(recording: Recording) -> None:
+    assert recording.steps.truncated.sum() > 5
+    assert recording.steps.terminated.any() == (recording.spec.D > 0)
+    ours = jax.jit(functools.partial(ppo.rollout, SETTINGS))(
+        recording.learner.weights, recording.steps, recording.next_observation,
+        np.ones(recording.spec.action_dim, bool),
+    )  # fmt: skip
+    for name in ("log_density", "value", "advantage"):
+        theirs = getattr(recording.rollout, name)
+        tolerance = 1e-6 * max(1.0, np.abs(theirs).max())
+        np.testing.assert_allclose(getattr(ours, name), theirs, rtol=0, atol=tolerance)
+
+
+def test_weights_equal_those_of_sb3_after_1_and_320_updates(recording: Recording) -> None:
+    mask = np.ones(recording.spec.action_dim, bool)
+    first, last = after_updates(recording.learner, recording.rollout, recording, mask)
+    assert len(recording.weights) == UPDATES
+    assert largest_difference(first, recording.weights[0]) < 1e-6
+    assert largest_difference(last, recording.weights[-1]) < 1e-5
+    assert largest_difference(last, recording.learner.weights) > 1e-2
+
+
+def test_padding_changes_no_weight(recording: Recording) -> None:
+    if recording.spec != SPEC:
+        pytest.skip("one shape is enough")
+    own, full = Widths(8, 4), Widths(11, 6)
+    padding = Padding(functools.partial(ppo.initial_weights, SETTINGS), full)
+    weights, (mean, square, updates) = recording.learner
+    learner = ppo.Learner(
+        padding.add(weights, own), Adam(padding.add(mean, own), padding.add(square, own), updates)
+    )
+    observation = np.insert(recording.rollout.observation, [8] * 3, 0.0, axis=1)
+    rng = np.random.default_rng(0)  # whatever is in padded channels of actions
+    noise = rng.standard_normal((SETTINGS.n_steps, 2), np.float32)
+    action = np.concatenate([recording.rollout.action, noise], axis=1)
+    rollout = recording.rollout._replace(observation=observation, action=action)
+    first, last = after_updates(learner, rollout, recording, np.arange(6) < 4)
+    assert largest_difference(padding.remove(first, own), recording.weights[0]) < 1e-6
+    assert largest_difference(padding.remove(last, own), recording.weights[-1]) < 1e-5
+    assert largest_difference(padding.add(padding.remove(last, own), own), last) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("spec", "separable"), [(SPEC, False), (SMESpec(complexity=2, hidden_width=4, horizon=7), True)]
+)
+@pytest.mark.parametrize("action_range", ["symmetric", "unit"])
+def test_collected_steps_are_those_of_the_environment(
+    spec: SMESpec, separable: bool, action_range: str
+) -> None:
+    n, rng = 32, np.random.default_rng(1)
+    params = task_params(spec)
+    weights = ppo.initial_weights(SETTINGS, rng, 10, 4)
+    weights["log_std"] += np.float32(0.1)
+    noise = rng.standard_normal((4, n), np.float32)
+    starts = rng.random((n + 1, 8))
+    fresh = jax.vmap(lambda s: start(s, params)[1])(starts)
+    begin = EnvState(*(x[0] for x in fresh))
+    after = EnvState(*(x[1:] for x in fresh))
+    symmetric = action_range == "symmetric"
+    collect = jax.jit(
+        functools.partial(ppo.collect, SETTINGS, symmetric=symmetric, separable=separable)
+    )
+    episode, steps, log = collect(weights, params, begin, noise, after)
+
+    env = make(spec, action_range=action_range)
+    observation, _ = env.reset(options={"state": starts[0]})
+    low, high = env.action_space.low, env.action_space.high
+    for i in range(n):
+        np.testing.assert_array_equal(steps.observation[i], observation)
+        mean = ppo.act(SETTINGS, weights, observation)
+        expected = mean + np.exp(np.float32(0.1)) * noise[:, i]
+        np.testing.assert_allclose(steps.action[i], expected, atol=1e-6)
+        action = np.clip(steps.action[i], low, high)
+        observation, reward, terminated, truncated, info = env.step(action)
+        np.testing.assert_array_equal(steps.last_observation[i], observation)
+        assert steps.reward[i] == pytest.approx(reward, abs=1e-6)
+        ends = steps.terminated[i], steps.truncated[i]
+        assert (terminated, truncated) == ends == (log.terminated[i], log.truncated[i])
+        row = log.reward[i], log.regret[i], log.similarity[i]
+        assert row == pytest.approx((reward, info["regret"], info["similarity"]), abs=1e-12)
+        if terminated or truncated:
+            observation, _ = env.reset(options={"state": starts[i + 1]})
+    np.testing.assert_array_equal(ppo.observe(episode, params), observation)
+
+
+def test_permutations_are_random_orders() -> None:
+    orders = np.asarray(ppo.permutations(jax.random.PRNGKey(0), 500, 12))
+    assert (np.sort(orders) == np.arange(12)).all()
+    assert len(np.unique(orders, axis=0)) == 500
+    np.testing.assert_allclose(orders.mean(axis=0), 5.5, atol=0.7)  # 4.5 standard errors
+
+
+@pytest.mark.parametrize("wrong", [{"batch_size": 60}, {"batch_size": 1}, {"n_steps": 100}])
+def test_unequal_minibatches_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(OptionError, match="must be at least 2 and divide n_steps"):
+        ppo.PPO(**wrong)
+
+
+SMALL = ppo.PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8, 8))
+
+
+def program(**options: Any) -> ppo.PPOProgram:
+    """Two lanes of tasks of unequal sizes and reward settings."""
+    specs = [SMESpec(k=10, r_min=0.5, seed=1), SMESpec(state_dim=5, action_dim=2, horizon=9)]
+    return ppo.PPOProgram(SMALL, specs, [4, 5], steps=96, **options)
+
+
+def test_a_program_collects_whole_rollouts_and_learns_between_them() -> None:
+    lanes = program()
+    before = lanes.weights(0)
+    log = lanes.advance(20)
+    assert lanes.steps == 32
+    assert {x.shape for x in log} == {(32, 2)}
+    assert largest_difference(lanes.weights(0), before) == 0.0  # stopped before the update
+    assert {x.shape for x in lanes.advance(32)} == {(0, 2)}
+    log = lanes.advance(96)
+    assert {x.shape for x in log} == {(64, 2)}
+    assert log.terminated.dtype == log.truncated.dtype == bool
+    assert lanes.state.optimiser.updates.tolist() == [8, 8]
+    lanes.finish()
+    lanes.finish()
+    assert lanes.state.optimiser.updates.tolist() == [12, 12]
+    assert largest_difference(lanes.weights(0), before) > 1e-4
+    assert lanes.weights(1)["action_net.weight"].shape == (2, 8)
+    padded = np.asarray(lanes.state.weights["mlp_extractor.policy_net.0.weight"][1])
+    assert not padded[:, 5:8].any()
+    assert padded[:, :5].all()
+    assert not lanes.failed().any()
+
+
+def test_a_program_goes_on_from_saved_state_bit_for_bit() -> None:
+    lanes = program()
+    lanes.advance(64)
+    again = program()
+    again.restore(lanes.save())
+    one, other = lanes.advance(96), again.advance(96)
+    for mine, theirs in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    lanes.finish()
+    again.finish()
+    assert largest_difference(lanes.weights(1), again.weights(1)) == 0.0
+
+
+def test_padding_changes_no_random_number() -> None:
+    lanes, padded = program(), program(shape=Shape(10, 5, 1, 0))
+    lanes.advance(1)
+    padded.advance(1)
+    for lane, (S, A) in enumerate([(8, 4), (5, 2)]):
+        ours, theirs = lanes.state.steps, padded.state.steps
+        begin = ours.observation[lane, 0, :S]
+        np.testing.assert_array_equal(theirs.observation[lane, 0, :S], begin)
+        first = ours.action[lane, 0, :A]
+        np.testing.assert_allclose(theirs.action[lane, 0, :A], first, atol=1e-6)
+
+
+def test_a_failed_lane_leaves_the_others_alone() -> None:
+    lanes, broken = program(), program()
+    weights = dict(broken.state.weights)
+    weights["action_net.bias"] = weights["action_net.bias"].at[0].set(np.nan)
+    broken.state = broken.state._replace(weights=weights)
+    for each in (lanes, broken):
+        each.advance(64)
+        each.finish()
+    assert broken.failed().tolist() == [True, False]
+    assert largest_difference(broken.weights(1), lanes.weights(1)) == 0.0
