@@ -18,11 +18,12 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
 
 from sme_registry.errors import OptionError
 from sme_registry.jax import oracle
@@ -45,35 +46,42 @@ _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
 _NO_KEY: Any = None  # `step_env` draws nothing
 
 
+Count = Annotated[int, Field(ge=1, strict=True)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Weight = Annotated[float, Field(allow_inf_nan=False)]
+
+
 @dataclass(frozen=True)
 class PPO:
     """Hyperparameters, with the names and defaults of `stable_baselines3.PPO`.
 
     `net_arch` is the widths of the hidden layers of each network (`policy_kwargs.net_arch`).
+    `run.settings_of` checks types and ranges.
 
     Raises:
       OptionError: minibatches of one step, or that do not divide a rollout.
     """
 
-    learning_rate: float = 3e-4
-    n_steps: int = 2048
-    batch_size: int = 64
-    n_epochs: int = 10
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_range: float = 0.2
-    clip_range_vf: float | None = None
+    learning_rate: Positive = 3e-4
+    n_steps: Count = 2048
+    batch_size: Count = 64
+    n_epochs: Count = 10
+    gamma: Share = 0.99
+    gae_lambda: Share = 0.95
+    clip_range: Positive = 0.2
+    clip_range_vf: Positive | None = None
     normalize_advantage: bool = True
-    ent_coef: float = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    net_arch: tuple[int, ...] = (64, 64)
+    ent_coef: Weight = 0.0
+    vf_coef: Weight = 0.5
+    max_grad_norm: Positive = 0.5
+    net_arch: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
 
     def __post_init__(self) -> None:
         if self.batch_size < 2 or self.n_steps % self.batch_size:
             raise OptionError(
                 f"hyperparameters.batch_size={self.batch_size}: must be at least 2 and divide "
-                f"n_steps ({self.n_steps}); minibatches here are of equal size."
+                f"n_steps={self.n_steps}, since minibatches here are of equal size."
             )
 
 

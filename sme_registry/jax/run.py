@@ -77,6 +77,9 @@ def settings_of(
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         fault = error.errors()[0]
+        own_error = fault.get("ctx", {}).get("error")
+        if isinstance(own_error, OptionError):  # of values that do not go together
+            raise own_error from None
         place = ".".join(str(part) for part in fault["loc"][:1])
         name = next((shown for shown, own in known.items() if own == place), place)
         raise OptionError(

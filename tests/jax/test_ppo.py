@@ -22,6 +22,7 @@ from sme_registry.jax import ppo
 from sme_registry.jax.env import EnvState, start
 from sme_registry.jax.networks import Adam
 from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.run import settings_of
 from sme_registry.jax.task import Shape, task_params
 from sme_registry.training.algorithms import silence
 from sme_registry.training.monitored_env import MonitoredVecEnv
@@ -165,9 +166,8 @@ def test_weights_equal_those_of_sb3_after_1_and_320_updates(recording: Recording
     assert largest_difference(last, recording.learner.weights) > 1e-2
 
 
+@pytest.mark.parametrize("recording", [SPEC], ids=["ends"], indirect=True)
 def test_padding_changes_no_weight(recording: Recording) -> None:
-    if recording.spec != SPEC:
-        pytest.skip("one shape is enough")
     own, full = Widths(8, 4), Widths(11, 6)
     padding = Padding(functools.partial(ppo.initial_weights, SETTINGS), full)
     weights, (mean, square, updates) = recording.learner
@@ -235,10 +235,19 @@ def test_permutations_are_random_orders() -> None:
     np.testing.assert_allclose(orders.mean(axis=0), 5.5, atol=0.7)  # 4.5 standard errors
 
 
-@pytest.mark.parametrize("wrong", [{"batch_size": 60}, {"batch_size": 1}, {"n_steps": 100}])
-def test_unequal_minibatches_are_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(OptionError, match="must be at least 2 and divide n_steps"):
-        ppo.PPO(**wrong)
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"gamma": 1.5}, r"hyperparameters.gamma=1.5: Input should be less than or equal to 1"),
+        ({"n_epochs": 0}, r"hyperparameters.n_epochs=0: Input should be greater than or equal"),
+        ({"policy_kwargs": {"net_arch": [8, 0]}}, r"hyperparameters.policy_kwargs.net_arch=\[8, 0"),
+        ({"batch_size": 60}, r"hyperparameters.batch_size=60: must be at least 2 and divide"),
+        ({"target_kl": 0.1}, r"hyperparameters.target_kl: jax:PPO has no such hyperparameter"),
+    ],
+)
+def test_hyperparameters_are_checked(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        settings_of("jax:PPO", values)
 
 
 SMALL = ppo.PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8, 8))
