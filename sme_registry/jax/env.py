@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
 
 from sme_registry.jax import oracle, pairs
 from sme_registry.jax.pairs import Pair
@@ -70,8 +72,8 @@ def step(
       and `final_observation`, that of the ended episode.
     """
     observation, after, reward, done, info = step_env(key, state, action, params)
-    fresh_observation, fresh = reset(key, params)
     info["final_observation"] = observation
+    fresh_observation, fresh = _reset_where(done, key, params)
     after = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
     return jnp.where(done, fresh_observation, observation), after, reward, done, info
 
@@ -103,6 +105,35 @@ def step_env(
 
 reset_env = reset
 """gymnax's name of the same."""
+
+
+@custom_vmap
+def _reset_where(done: jax.Array, key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
+    """`reset`, or anything else where not done.
+
+    Drawing a start costs a CPU more than all the rest of a step, so that a batch draws only if an
+    episode ended in it. On a GPU the draw is cheaper than the branch.
+    """
+    return reset(key, params)
+
+
+@_reset_where.def_vmap
+def _reset_lanes_where(
+    lanes: int, batched: Any, done: jax.Array, key: jax.Array, params: TaskParams
+) -> tuple[Any, Any]:
+    axes = jax.tree.map(lambda each: 0 if each else None, batched[1:])
+
+    def draw(key: jax.Array, params: TaskParams) -> Any:
+        return jax.vmap(reset, axes, axis_size=lanes)(key, params)
+
+    shapes = jax.eval_shape(draw, key, params)
+
+    def draw_if_any(key: jax.Array, params: TaskParams) -> Any:
+        zeros = jax.tree.map(lambda each: jnp.zeros(each.shape, each.dtype), shapes)
+        return lax.cond(done.any(), draw, lambda *_: zeros, key, params)
+
+    drawn = lax.platform_dependent(key, params, cpu=draw_if_any, default=draw)
+    return drawn, jax.tree.map(lambda _: True, shapes)
 
 
 def observe(state: EnvState, params: TaskParams) -> jax.Array:

@@ -50,7 +50,7 @@ def to_float64(pair: Pair) -> npt.NDArray[np.float64]:
 
 def from_fraction(bits: jax.Array) -> Pair:
     """The numbers bits · 2⁻³², from uint32."""
-    return _normalised((jnp.zeros_like(bits), bits), jnp.int32(1043))
+    return _normalised((jnp.zeros_like(bits), bits), jnp.uint32(1043))
 
 
 def to_float32(x: Pair) -> jax.Array:
@@ -66,7 +66,7 @@ def to_float32(x: Pair) -> jax.Array:
 def product(W: jax.Array, a: jax.Array) -> Pair:
     """W a, exact: W uint32 in units of 2⁻²⁹, at most 2²⁹, and a float32 in [0, 1]."""
     bits = lax.bitcast_convert_type(a, jnp.uint32)
-    exponent = (bits >> 23).astype(jnp.int32)
+    exponent = bits >> 23
     # Zero for a below 2⁻¹²⁶: such a number changes no sum with an offset b of at least 2⁻⁵³.
     m = jnp.where(exponent > 0, bits & 0x7FFFFF | 0x800000, jnp.uint32(0))
     W, m = jnp.broadcast_arrays(W, m)
@@ -78,46 +78,49 @@ def product(W: jax.Array, a: jax.Array) -> Pair:
 
 
 def add(x: Pair, y: Pair) -> Pair:
-    """x + y as float64 rounds it."""
+    """x + y as float64 rounds it; both 0, or one of them at least 2⁻¹⁰²²."""
     swap = (y.high > x.high) | ((y.high == x.high) & (y.low > x.low))
     large = Pair(jnp.where(swap, y.high, x.high), jnp.where(swap, y.low, x.low))
     small = Pair(jnp.where(swap, x.high, y.high), jnp.where(swap, x.low, y.low))
-    distance = (large.high >> 20) - (small.high >> 20)
-    low2 = _left(_significand(large), jnp.uint32(2))
-    shifted = _right_sticky(_left(_significand(small), jnp.uint32(2)), distance)
-    high, low = _sum(low2, shifted)
-    carry = high >> 23  # 1 if the sum has 56 bits
-    high, low = _right_sticky((high, low), carry)
-    up = ((low & 3) == 3) | ((low & 7) == 6)
-    high, low = _sum(_right((high, low), jnp.uint32(2)), (jnp.uint32(0), up.astype(jnp.uint32)))
-    # The significand's leading bit adds 1 to the exponent, and so does a carry out of rounding.
-    exponent = (large.high >> 20) + carry
-    zero = exponent == 0
-    return Pair(jnp.where(zero, 0, (exponent - 1 << 20) + high), jnp.where(zero, 0, low))
+    exponent, leading, (high, low) = _unpacked(large)
+    other_exponent, _, (other_high, other_low) = _unpacked(small)
+    other = other_high << 2 | other_low >> 30, other_low << 2
+    other = _right_sticky(other, exponent - other_exponent)
+    high, low = _sum((high << 2 | low >> 30, low << 2), other)
+
+    carry = high >> 23  # 1 if the sum has 56 bits, of which 53 are kept
+    extra, half = 2 + carry, jnp.uint32(2) << carry
+    lost = low & (2 * half - 1)
+    high, low = high >> extra, low >> extra | high << (32 - extra)
+    up = (lost > half) | ((lost == half) & (low & 1 == 1))
+    high, low = _sum((high, low), (jnp.uint32(0), up.astype(jnp.uint32)))
+    # Added, not joined: the leading bit, or a carry out of rounding, adds 1 to the exponent.
+    return Pair((exponent + carry - leading << 20) + high, low)
 
 
 def fold(x: Pair) -> Pair:
     """2 |x − rint x| of x below 2²¹."""
-    exponent = x.high >> 20
+    exponent, leading, (high, low) = _unpacked(x)
     below_half = exponent < 1022
-    doubled = jnp.where(exponent > 0, x.high + jnp.uint32(1 << 20), x.high)
     # The bits below the point: all of `low`, and `places` bits of `high`.
     places = jnp.where(below_half, jnp.uint32(0), 1043 - exponent)
     one = jnp.uint32(1) << places
-    high, low = _significand(x)[0] & (one - 1), x.low
+    high = high & (one - 1)
     other_high, other_low = one - high - (low != 0), jnp.uint32(0) - low
     nearer = (other_high < high) | ((other_high == high) & (other_low < low))
     distance = jnp.where(nearer, other_high, high), jnp.where(nearer, other_low, low)
-    folded = _normalised(distance, exponent.astype(jnp.int32) + 1)
+    folded = _normalised(distance, exponent + 1)
+    doubled = x.high + (leading << 20)
     return Pair(
         jnp.where(below_half, doubled, folded.high), jnp.where(below_half, x.low, folded.low)
     )
 
 
-def _significand(x: Pair) -> Words:
-    """The 53 bits with the leading one, which 0 (and what is below 2⁻¹⁰²²) does not have."""
-    leading = jnp.where(x.high >> 20 > 0, jnp.uint32(1 << 20), jnp.uint32(0))
-    return x.high & 0xFFFFF | leading, x.low
+def _unpacked(x: Pair) -> tuple[jax.Array, jax.Array, Words]:
+    """The exponent, the leading bit, which only 0 does not have, and the 53-bit significand."""
+    exponent = x.high >> 20
+    leading = jnp.minimum(exponent, 1)
+    return exponent, leading, (x.high & 0xFFFFF | leading << 20, x.low)
 
 
 def _normalised(words: Words, exponent: jax.Array) -> Pair:
@@ -125,9 +128,8 @@ def _normalised(words: Words, exponent: jax.Array) -> Pair:
     high, low = words
     shift = jnp.where(high > 0, lax.clz(high), 32 + lax.clz(low)) - 11
     zero = (high | low) == 0
-    high, low = _left(words, jnp.where(zero, 0, shift))
-    biased = exponent.astype(jnp.uint32) - shift.astype(jnp.uint32)
-    return Pair(jnp.where(zero, 0, (biased - 1 << 20) + high), jnp.where(zero, 0, low))
+    high, low = _left(words, shift)
+    return Pair(jnp.where(zero, jnp.uint32(0), (exponent - shift - 1 << 20) + high), low)
 
 
 def _sum(x: Words, y: Words) -> Words:
