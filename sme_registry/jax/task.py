@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, SpecError
+from sme_registry.io import choice
 from sme_registry.jax import pairs
 from sme_registry.jax.pairs import Pair
 from sme_registry.spec import SMESpec, SpecLike
@@ -120,6 +121,11 @@ class TaskParams(NamedTuple):
     output: Layer
 
     @property
+    def max_steps_in_episode(self) -> jax.Array:
+        """The horizon, by gymnax's name."""
+        return self.horizon
+
+    @property
     def action_mask(self) -> jax.Array:
         """`[A]` bool, False for padded channels; of one task."""
         return jnp.arange(self.W.shape[-2]) < self.action_dim
@@ -150,9 +156,14 @@ def task_params(
 
     Raises:
       SpecError: a field that only NumPy implements, such as `team`; or see `load_task`.
-      OptionError: no task, a task larger than `shape`, or L = 1 beside L > 1.
+      OptionError: no task, a task larger than `shape`, L = 1 beside L > 1, or another dtype or
+        kind of states.
       UnknownNameError, ResourceLimitError, FingerprintMismatchError: see `load_task`.
     """
+    as_pairs = choice("states", states, ("float64", "pairs")) == "pairs"
+    dtype = np.dtype(dtype)
+    if dtype not in (np.float64, np.float32):
+        raise OptionError(f"dtype={dtype.name}: must be float64 or float32.")
     single = isinstance(specs, SMESpec | dict | str | os.PathLike)
     listed: Any = [specs] if single else specs
     tasks = [load_task(spec) for spec in listed]
@@ -162,7 +173,7 @@ def task_params(
     if shape is None:
         shape = smallest
     _check_covered(smallest, shape)
-    lanes = [_padded(task, shape, np.dtype(dtype), states == "pairs") for task in tasks]
+    lanes = [_padded(task, shape, dtype, as_pairs) for task in tasks]
     params = lanes[0] if single else jax.tree.map(lambda *parts: np.stack(parts), *lanes)
     return cast(TaskParams, jax.tree.map(jnp.asarray, params))
 

@@ -1,0 +1,115 @@
+"""Drawn tasks as pytrees: lanes, padding, and specs that are refused."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, materialize
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.jax.task import SUPPORTED_FIELDS, Shape, check_supported, task_params
+
+
+def test_one_task_has_the_numbers_of_its_draw() -> None:
+    task = materialize(SMESpec(complexity=4, hidden_width=5, k=3, r_min=0.25, D=0.5, horizon=7))
+    params = task_params(task.spec)
+    assert (params.k, params.r_min, params.D, params.horizon) == (3, 0.25, 0.5, 7)
+    assert (params.state_dim, params.action_dim) == (8, 4)
+    assert params.inner is not None
+    stacked = params.inner.stacked
+    layers = [params.inner.first, *zip(stacked.W, stacked.b, strict=True), params.output]
+    for computed, drawn in zip(
+        [(params.W, params.b), *layers], [(task.W, task.b), *task.layers], strict=True
+    ):
+        assert (np.asarray(computed[0]) == drawn[0]).all()
+        assert (np.asarray(computed[1]) == drawn[1]).all()
+
+
+def test_lanes_are_padded_to_the_smallest_shape_that_covers_them() -> None:
+    specs = [
+        SMESpec(state_dim=3, action_dim=5, complexity=2, hidden_width=4),
+        SMESpec(state_dim=6, action_dim=2, complexity=4, hidden_width=3),
+    ]
+    params = task_params(specs)
+    assert params.W.shape == (2, 5, 6)
+    assert params.inner is not None
+    assert params.inner.stacked.W.shape == (2, 2, 4, 4)
+    assert params.inner.active.tolist() == [[False, False], [True, True]]
+    assert params.output.W.shape == (2, 5, 4)
+    first = jax.tree.map(lambda part: part[0], params)
+    assert first.action_mask.tolist() == [True] * 5
+    assert first.state_mask.tolist() == [True] * 3 + [False] * 3
+    assert (first.W[:, 3:] == 0).all()
+    assert (first.b[3:] == 0).all()
+
+
+def test_a_list_of_one_task_has_an_axis_of_lanes() -> None:
+    assert task_params([SMESpec()]).W.shape == (1, 4, 8)
+    assert task_params(SMESpec()).W.shape == (4, 8)
+
+
+def test_names_digests_and_fields_are_tasks_too() -> None:
+    named = task_params(["SME/Default-v1", {"seed": 0}])
+    assert named.W.shape == (2, 4, 8)
+
+
+def test_dtypes_are_those_of_the_oracle_and_of_states() -> None:
+    params = task_params(SMESpec(), dtype=jnp.float32)
+    assert params.output.W.dtype == params.D.dtype == jnp.float32
+    assert params.W.dtype == jnp.float64
+    assert task_params(SMESpec(), states="pairs").W.dtype == jnp.uint32
+
+
+def test_hidden_width_of_a_task_without_inner_layers_does_not_split_groups() -> None:
+    assert Shape.of(SMESpec(hidden_width=16)) == Shape.of(SMESpec(hidden_width=64))
+    assert Shape.of(SMESpec(complexity=2, hidden_width=16)) == Shape(8, 4, 2, 16)
+
+
+def test_tasks_with_and_without_inner_layers_share_no_program() -> None:
+    with pytest.raises(OptionError, match=r"complexity=1 .* 2: must be 1 for all"):
+        task_params([SMESpec(), SMESpec(complexity=2)])
+
+
+def test_a_task_larger_than_the_shape_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"shape.action_dim=3: must be at least 4"):
+        task_params(SMESpec(), shape=Shape(8, 3, 1, 0))
+
+
+def test_no_task_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"specs=\[\]: must have at least one"):
+        task_params([])
+
+
+def test_unknown_kinds_of_states_are_refused() -> None:
+    with pytest.raises(OptionError, match=r"states='int': must be 'float64' or 'pairs'"):
+        task_params(SMESpec(), states="int")
+
+
+def test_oracles_in_half_precision_are_refused() -> None:
+    with pytest.raises(OptionError, match=r"dtype=.*: must be float64 or float32"):
+        task_params(SMESpec(), dtype=jnp.bfloat16)
+
+
+def test_teams_are_refused_by_name() -> None:
+    team = SMESpec.from_dict({"action_dim": 2, "team": {"agents": [{"action_dim": 1}] * 2}})
+    with pytest.raises(SpecError, match=r"^team=.*must be absent, since tasks in JAX have no team"):
+        task_params(team)
+
+
+class FutureSpec(SMESpec):
+    """A spec with a field of a later version."""
+
+    rotation: float = 0.0
+
+
+def test_fields_of_later_versions_are_refused_unless_they_have_their_default() -> None:
+    check_supported(FutureSpec())
+    with pytest.raises(SpecError, match=r"^rotation=0.3: must be absent"):
+        check_supported(FutureSpec(rotation=0.3))
+
+
+def test_every_field_is_supported_or_refused_on_purpose() -> None:
+    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
+    assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS
