@@ -5,7 +5,7 @@ VENV := .venv
 BOARD := runs/board
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
-FRAMEWORKS := rllib sbx tianshou
+FRAMEWORKS := gymnax rllib sbx tianshou
 SITE := 'import site; print(site.getsitepackages()[0])'
 
 # The first sufficiently new interpreter; override with `make PYTHON=/path/to/python3.11 test`.
@@ -51,10 +51,11 @@ lowest:          ## run the core's tests with the lowest versions that pyproject
 docs: $(INSTALLED)     ## regenerate the generated pages of docs/
 	$(PY) docs/generate.py
 
-frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for RLlib, sbx and Tianshou, each in an environment of its own
+frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for gymnax, RLlib, sbx and Tianshou, each in an environment of its own
 
 # Each environment sees the packages of .venv; pip adds the framework, and replaces what it needs in
 # another version. These versions were tried last. TorchRL is in .venv.
+framework-gymnax: PACKAGES := "gymnax==1.0.1" "rejax==0.1.3"
 framework-rllib: PACKAGES := "ray[rllib]==2.60.0"
 framework-sbx: PACKAGES := "sbx-rl==0.28.0"
 framework-tianshou: PACKAGES := "tianshou==2.0.1"

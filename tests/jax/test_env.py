@@ -1,0 +1,167 @@
+"""Reset and step, against the NumPy definition, lane by lane."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, materialize
+from sme_registry.envs import arguments
+from sme_registry.jax import env, pairs
+from sme_registry.jax.task import Shape, task_params
+from sme_registry.task import observe, step
+
+STEPS = 70
+
+SHALLOW = [
+    SMESpec(seed=1, horizon=30),
+    SMESpec(seed=2, k=7, r_min=0.3, horizon=30),
+    SMESpec(seed=3, D=0.25, horizon=40),
+    SMESpec(seed=4, k=4, D=0.3, r_min=0.1, horizon=6),
+    SMESpec(seed=5, state_dim=5, action_dim=3, k=40, horizon=33),
+]
+DEEP = [
+    SMESpec(seed=1, complexity=4, hidden_width=8, D=0.2, k=3, horizon=30),
+    SMESpec(seed=2, complexity=2, hidden_width=6, action_dim=2, horizon=50, k=3),
+]
+
+
+@functools.cache
+def rollout() -> Any:
+    """All steps of lanes with their own tasks: `[STEPS, lanes, …]`."""
+
+    def advance(carry: Any, inputs: Any) -> Any:
+        params, state = carry
+        keys, actions = inputs
+        observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
+        return (params, after), (state, observation, after, *others)
+
+    @jax.jit
+    def run(params: Any, keys: Any, actions: Any) -> Any:
+        observation, state = jax.vmap(env.reset)(keys[0], params)
+        return observation, jax.lax.scan(advance, (params, state), (keys[1:], actions))[1]
+
+    return run
+
+
+def near_optimal(specs: list[SMESpec], A: int) -> Any:
+    """Actions near ½, of which some earn and some end episodes."""
+    rng = np.random.default_rng(0)
+    return (0.5 + 0.2 * rng.standard_normal((STEPS, len(specs), A))).astype(np.float32)
+
+
+def float64(s: Any) -> Any:
+    return pairs.to_float64(s) if isinstance(s, pairs.Pair) else np.asarray(s)
+
+
+@pytest.mark.parametrize(
+    ("specs", "dtype", "states", "tolerance"),
+    [
+        (SHALLOW, jnp.float64, "float64", 1e-12),
+        (DEEP, jnp.float64, "float64", 1e-12),
+        (SHALLOW, jnp.float32, "pairs", 2e-5),
+    ],
+)
+def test_lanes_of_tasks_step_as_in_numpy(
+    specs: list[SMESpec], dtype: Any, states: str, tolerance: float
+) -> None:
+    params = task_params(specs, dtype=dtype, states=states)
+    keys = jax.random.split(jax.random.key(0), (STEPS + 1, len(specs)))
+    a = near_optimal(specs, 4)
+    first, (before, observed, after, reward, done, info) = rollout()(params, keys, a)
+    old, new = float64(before.s), float64(after.s)
+    ends = np.zeros(2, int)
+    for lane, spec in enumerate(specs):
+        S, task = spec.state_dim, materialize(spec)
+        channels = [*range(S), -2, -1]
+        s, t, accumulated = old[:1, lane, :S], np.zeros(1, np.int64), np.zeros((1, 1))
+        assert (first[lane, jnp.array(channels)] == observe(spec, s, t, accumulated)[0]).all()
+        for i in range(STEPS):
+            one = step(task, s, t, accumulated, a[i, [lane], : spec.action_dim].astype(float))
+            t += 1
+            for name in ("similarity", "step_reward"):
+                assert abs(info[name][i, lane] - getattr(one, name)[0, 0]) <= tolerance
+            assert info["regret"][i, lane] == 1 - info["step_reward"][i, lane]
+            assert abs(reward[i, lane] - one.reward[0, 0]) <= tolerance
+            assert info["terminated"][i, lane] == one.terminated[0]
+            assert info["truncated"][i, lane] == one.truncated[0]
+            seen = observe(spec, one.state, t, one.accumulated_reward)[0]
+            final = np.asarray(info["final_observation"][i, lane])[channels]
+            assert (final[:-1] == seen[:-1]).all()
+            assert abs(final[-1] - seen[-1]) <= max(tolerance, 6e-8)
+            s, accumulated = one.state, one.accumulated_reward
+            assert done[i, lane] == (one.terminated[0] or one.truncated[0])
+            if done[i, lane]:
+                ends += [one.terminated[0], one.truncated[0]]
+                s, t, accumulated = new[i, [lane], :S], np.zeros(1, np.int64), np.zeros((1, 1))
+                assert 0.0 <= s.min() <= s.max() < 1.0
+                seen = observe(spec, s, t, accumulated)[0]
+                assert (np.asarray(observed[i, lane])[channels] == seen).all()
+            assert (new[i, lane, :S] == s[0]).all()
+            assert (new[i, lane, S:] == 0.0).all()
+            assert after.t[i, lane] == t[0]
+            assert abs(after.accumulated_reward[i, lane] - accumulated[0, 0]) <= tolerance
+    assert (ends > 0).all()
+
+
+def test_a_step_without_a_batch_equals_its_lane() -> None:
+    """Starts are drawn in a batch only if an episode ended in it."""
+    params = task_params(SMESpec(horizon=2))
+    keys = jax.random.split(jax.random.key(0), 3)
+    _, states = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
+    states = states._replace(t=jnp.array([0, 1, 0], jnp.int32))
+    actions = jnp.full((3, 4), 0.5)
+    batch = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, states, actions, params)
+    for lane in range(3):
+        state = jax.tree.map(lambda part, lane=lane: part[lane], states)
+        single = jax.jit(env.step)(keys[lane], state, actions[lane], params)
+        for one, many in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_allclose(one, many[lane], rtol=0, atol=1e-15)
+
+
+def test_starts_are_uniform_and_do_not_depend_on_padding() -> None:
+    spec = SMESpec(state_dim=3)
+    keys = jax.random.split(jax.random.key(0), 4096)
+    draw = jax.jit(jax.vmap(env.reset, (0, None)))
+    starts = np.asarray(draw(keys, task_params(spec))[1].s)
+    padded = np.asarray(draw(keys, task_params(spec, shape=Shape(7, 4, 1, 0)))[1].s)
+    assert (padded[:, :3] == starts).all()
+    assert (padded[:, 3:] == 0.0).all()
+    quarters = np.stack([np.histogram(column, 4, (0, 1))[0] for column in starts.T])
+    assert abs(quarters - 1024).max() < 5 * np.sqrt(4096 * 3 / 16)
+    assert abs(np.corrcoef(starts.T) - np.eye(3)).max() < 5 / np.sqrt(4096)
+
+
+def test_an_episode_begins_at_any_state() -> None:
+    observation, state = env.start(jnp.full(8, 0.25), task_params(SMESpec()))
+    assert observation.tolist() == [0.25] * 8 + [0.0, 0.0]
+    assert (state.t, state.accumulated_reward) == (0, 0.0)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_actions_are_rescaled_with_the_bits_of_the_environments(symmetric: bool) -> None:
+    u = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 4)).astype(np.float32)
+    u[0] = 1e-30, -1e-9, 1.0, -1.0
+    expected = arguments.to_unit(u, u.shape, symmetric)
+    assert (np.asarray(env.to_unit(jnp.asarray(u), symmetric)) == expected).all()
+    single = env.to_unit(jnp.asarray(u), symmetric, jnp.float32)
+    assert (np.asarray(single) == expected.astype(np.float32)).all()
+
+
+def test_a_step_in_pairs_has_no_float64() -> None:
+    """So that a device without float64 runs it."""
+    params = task_params(SMESpec(complexity=3), dtype=jnp.float32, states="pairs")
+
+    def one_step(key: jax.Array, u: jax.Array, params: Any) -> Any:
+        _, state = env.reset(key, params)
+        return env.step(key, state, env.to_unit(u, True, jnp.float32), params)
+
+    key, u = jax.random.key(0), jnp.zeros(4, jnp.float32)
+    program = jax.jit(one_step).lower(key, u, params).compile()
+    assert "f64[" not in program.as_text()
+    assert "f32[" in program.as_text()

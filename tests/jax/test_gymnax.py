@@ -1,0 +1,108 @@
+"""A task behind gymnax's methods, called as gymnax's wrappers call them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.jax import env as functions
+from sme_registry.jax.gymnax import Environment
+from sme_registry.jax.task import task_params
+
+
+class LogState(NamedTuple):
+    inner: Any
+    total: jax.Array
+
+
+class LogWrapper:
+    """What gymnax's wrapper of the same name does: float32 sums in the carry of a scan."""
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, key: Any, params: Any = None) -> Any:
+        observation, state = self._env.reset(key, params)
+        return observation, LogState(state, jnp.zeros((), jnp.float32))
+
+    def step(self, key: Any, state: LogState, action: Any, params: Any = None) -> Any:
+        observation, inner, reward, terminated, truncated, info = self._env.step(
+            key, state.inner, action, params
+        )
+        total = state.total + reward
+        info["returned_episode_returns"] = total
+        state = LogState(inner, total * (1 - (terminated | truncated)))
+        return observation, state, reward, terminated, truncated, info
+
+
+def test_a_wrapped_environment_runs_in_a_compiled_scan() -> None:
+    env = LogWrapper(Environment("SME/Default-v1", horizon=5, k=2))
+    space = env.action_space(env.default_params)
+
+    def advance(carry: Any, key: jax.Array) -> Any:
+        observation, state = carry
+        observation, state, reward, _, truncated, info = env.step(key, state, space.sample(key))
+        assert observation.shape == env.observation_space(env.default_params).shape
+        logged = reward, truncated, info["returned_episode_returns"], info["discount"]
+        return (observation, state), logged
+
+    @jax.jit
+    @jax.vmap
+    def run(key: jax.Array) -> Any:
+        return jax.lax.scan(advance, env.reset(key), jax.random.split(key, 12))[1]
+
+    reward, truncated, total, discount = run(jax.random.split(jax.random.key(0), 3))
+    assert reward.dtype == jnp.float32
+    assert truncated.sum(axis=1).tolist() == [2, 2, 2]
+    np.testing.assert_allclose(total[:, 4], reward[:, :5].sum(axis=1), rtol=1e-6)
+    assert (discount == 1.0).all()
+
+
+def test_steps_are_those_of_the_functions_with_rescaled_actions() -> None:
+    key, action = jax.random.key(1), jnp.array([0.5, -1.0, 3.0, 0.0], jnp.float32)
+    params = task_params("SME/Default-v1")
+    for range_ in ("symmetric", "unit"):
+        env = Environment(action_range=range_)
+        observation, state = env.reset(key)
+        assert (observation == functions.reset(key, params)[0]).all()
+        unit = functions.to_unit(action, range_ == "symmetric")
+        expected = jax.jit(functions.step)(key, state, unit, params)
+        after, _, reward, terminated, truncated, info = env.step(key, state, action, params)
+        assert (after == expected[0]).all()
+        assert reward == expected[2].astype(jnp.float32)
+        assert not terminated
+        assert not truncated
+        assert abs(info["regret"] - expected[4]["regret"]) < 1e-15
+        same = env.step_env(key, state, action)
+        assert len(same) == 5
+        assert (same[0] == info["final_observation"]).all()
+        assert not env.is_truncated(same[1])
+
+
+def test_names_and_spaces_are_those_of_the_task() -> None:
+    env = Environment("SME/Default-v1", action_dim=2)
+    assert env.num_actions == 2
+    assert env.default_params.max_steps_in_episode == 100
+    assert Environment("SME/Default-v1").name == "SME/Default-v1"
+    actions, observations = env.action_space(), env.observation_space()
+    assert (actions.low, actions.high, actions.shape) == (-1.0, 1.0, (2,))
+    assert (observations.low, observations.high, observations.shape) == (0.0, 1.0, (10,))
+    sample = actions.sample(jax.random.key(0))
+    assert sample.shape == (2,)
+    assert actions.contains(sample)
+    assert not actions.contains(sample + 2)
+
+
+def test_unknown_ranges_and_teams_are_refused() -> None:
+    with pytest.raises(OptionError, match="action_range='wide': must be"):
+        Environment(action_range="wide")  # type: ignore[arg-type]
+    with pytest.raises(SpecError, match=r"^team="):
+        Environment("Team4")
