@@ -14,7 +14,7 @@ import typer
 
 from sme_registry import load
 from sme_registry.cli.arguments import Protocol, find_file, json_or_text
-from sme_registry.cli.study_plan import scaled_plan
+from sme_registry.cli.study_plan import Agents, scaled_plan
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import integer_in, parse_json
 from sme_registry.spec import (
@@ -90,8 +90,8 @@ class PlanOptions(ClassOptions):
             "--algorithm",
             "-a",
             metavar="[NAME=]USES",
-            help="PPO, TD3, SAC, … of Stable-Baselines3, module:function, reference:linear, "
-            "reference:constant, offline:bc, … Repeatable.",
+            help="PPO, TD3, SAC, … of Stable-Baselines3, jax:PPO, module:function, "
+            "reference:linear, reference:constant, offline:bc, … Repeatable.",
         ),
     ] = None
     steps: Annotated[
@@ -113,6 +113,7 @@ class PlanOptions(ClassOptions):
             help="A hyperparameter of an algorithm, such as slow.n_steps=64. Repeatable.",
         ),
     ] = None
+    agents: Agents = None
     protocol: Protocol = "paper-v1"
 
     def plan(self, source: str) -> StudyPlan:
@@ -129,7 +130,7 @@ class PlanOptions(ClassOptions):
         }
         plan = StudyPlan.from_dict(fields, source)
         draft = StudyFile(name="draft", digest=plan.digest, plan=plan)
-        return scaled_plan(draft, self.steps, None, None).plan
+        return scaled_plan(draft, self.steps, None, None, self.agents).plan
 
     def _algorithms(self) -> list[dict[str, Any]]:
         """Each `[NAME=]USES` with each action range."""
@@ -209,10 +210,12 @@ def with_options(options: type) -> Callable[[Callable[..., None]], Callable[...,
 
 
 def _short_name(uses: str) -> str:
-    """The name of an algorithm in a plan: `TQC`, `linear`, `independent PPO`."""
+    """The name of an algorithm in a plan: `TQC`, `linear`, `jax-PPO`, `independent PPO`."""
+    from sme_registry.training.algorithms import folder_name
+
     if uses.startswith(INDEPENDENT):
         return f"independent {_short_name(uses.removeprefix(INDEPENDENT))}"
-    return uses.rsplit(":", 1)[-1]
+    return folder_name(uses)
 
 
 def _hyperparameters(

@@ -12,7 +12,16 @@ from rich.markup import escape
 
 from sme_registry.cli import study_compare, study_new, study_plan, study_sweep
 from sme_registry.cli.arguments import Json, Out, find_file
-from sme_registry.cli.study_plan import Evaluations, Jobs, Only, Seeds, Steps, scaled_plan, unique
+from sme_registry.cli.study_plan import (
+    Agents,
+    Evaluations,
+    Jobs,
+    Only,
+    Seeds,
+    Steps,
+    scaled_plan,
+    unique,
+)
 from sme_registry.errors import OptionError
 from sme_registry.spec import StudyFile, catalogue
 from sme_registry.terminal import Table, duration_range, err, out, print_json
@@ -78,6 +87,19 @@ def run(
     steps: Steps = None,
     seeds: Seeds = None,
     evaluations: Evaluations = None,
+    agents: Agents = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="cpu|gpu|tpu", help="Of agents in JAX. Default a GPU if there is one."
+        ),
+    ] = None,
+    lanes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Most cells in one program of JAX. Default 10 on a CPU, 256 elsewhere."
+        ),
+    ] = None,
     only: Only = None,
     json: Json = False,
 ) -> None:
@@ -89,6 +111,11 @@ def run(
     another plan, or other --steps, --seeds or --evaluations, cells with the same content are
     reused. Failed cells are listed; --retry runs them again.
 
+    With --agents jax, PPO, TD3 and SAC are ours in JAX instead of Stable-Baselines3's: other
+    algorithms, so no result of the one counts as one of the other. Cells with tasks of one shape
+    run as lanes of one program, which goes on from its state of a few minutes before after a kill.
+    On a CPU, one program runs on each core; on a GPU, one at a time.
+
     A cluster needs this package and Ray in the same versions on every node, and no shared folder.
 
     Examples:
@@ -99,6 +126,8 @@ def run(
 
       sme study run paper-ablations -f runs/short --steps 20000 --steps PPO=100000 --jobs 8
 
+      sme study run paper-ablations -f runs/jax --agents jax --only algorithm=PPO
+
       sme study run paper-ablations -f runs/all --ray 10.0.0.1:6379
     """
     from sme_registry.studies.engine.runner import run_study
@@ -106,7 +135,7 @@ def run(
     if ray is not None and executor not in (None, "ray"):
         raise OptionError(f"--ray {ray}: contradicts --executor {executor}. Leave one out.")
     status = run_study(
-        scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations),
+        scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents),
         folder,
         executor=executor or ("processes" if ray is None else "ray"),
         jobs=jobs,
@@ -114,6 +143,8 @@ def run(
         retry_failed=retry,
         keep_models=keep_models,
         only=only or (),
+        device=device,
+        lanes=lanes,
         console=err(),
     )
     print_status(status, json)
@@ -195,7 +226,7 @@ def print_status(status: StudyStatus, json: bool) -> None:
     if json:
         print_json(status.to_dict())
         return
-    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.jobs import available_cores
     from sme_registry.studies.engine.status import STATES
 
     algorithms = unique(cell.planned.algorithm for cell in status.cells)

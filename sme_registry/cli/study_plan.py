@@ -26,6 +26,14 @@ Steps = Annotated[
 ]
 Seeds = Annotated[int | None, typer.Option(help="Runs of each algorithm on each class.")]
 Evaluations = Annotated[int | None, typer.Option(help="Evaluations during each training.")]
+Agents = Annotated[
+    str | None,
+    typer.Option(
+        metavar="sb3|jax",
+        help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3, or in JAX, with the "
+        "environment in one program. Default as in the plan.",
+    ),
+]
 Only = Annotated[
     list[str] | None,
     typer.Option(
@@ -59,6 +67,7 @@ def plan(
     steps: Steps = None,
     seeds: Seeds = None,
     evaluations: Evaluations = None,
+    agents: Agents = None,
     only: Only = None,
     json: Json = False,
 ) -> None:
@@ -78,14 +87,14 @@ def plan(
       sme study plan smoke --folder runs/smoke --json
     """
     from sme_registry.studies.engine.estimate import Estimator, Span, makespan
-    from sme_registry.studies.engine.executors import available_cores
+    from sme_registry.studies.engine.jobs import available_cores
     from sme_registry.studies.engine.ledger import Ledger
     from sme_registry.studies.engine.scaling import selected
 
     if plan is None:
         _list_plans(json)
         return
-    file = scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations)
+    file = scaled_plan(find_file(StudyFile, plan), steps, seeds, evaluations, agents)
     planned = selected(file.plan.cells, only or ())
     cells = {cell.cell.digest: cell.cell for cell in planned}
     results = {} if folder is None else Ledger(folder).results()
@@ -170,15 +179,20 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
 
 
 def scaled_plan(
-    file: StudyFile, steps: list[str] | None, seeds: int | None, evaluations: int | None
+    file: StudyFile,
+    steps: list[str] | None,
+    seeds: int | None,
+    evaluations: int | None,
+    agents: str | None = None,
 ) -> StudyFile:
-    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`.
+    """A plan with the budgets of `--steps`, `--seeds` and `--evaluations`, and `--agents`.
 
     Raises:
       OptionError: `--steps` is not a number, or is given twice for an algorithm.
       UnknownNameError, SpecError: see `scaling.scaled`.
+      SMEError: see `scaling.with_agents`.
     """
-    from sme_registry.studies.engine.scaling import scaled
+    from sme_registry.studies.engine.scaling import scaled, with_agents
 
     budgets: dict[str, int] = {}
     for text in steps or ():
@@ -191,7 +205,8 @@ def scaled_plan(
             raise OptionError(f"--steps {text!r}: {name or 'N'} is given twice. Remove one.")
         budgets[name] = int(number)
     every = budgets.pop("", None)
-    return scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
+    file = scaled(file, steps=every, steps_of=budgets, seeds=seeds, evaluations=evaluations)
+    return file if agents is None else with_agents(file, agents)
 
 
 def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError]) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -195,6 +195,21 @@ class Program(ABC):
         )
         return Evaluation(*(np.asarray(each) for each in sums))
 
+    def policy(self, lane: int) -> Callable[[Array], Array]:
+        """A lane's present deterministic policy.
+
+        It maps observations `[B, S + 2]` float32 to actions `[B, A]` in the action range, or beyond
+        it, without padding.
+        """
+        weights = jax.device_put(self.weights(lane), self.device)
+
+        def act(observations: Array) -> Array:
+            settings = self.settings
+            actions = _actions(type(self).act, settings, self.symmetric, weights, observations)
+            return np.asarray(actions)
+
+        return act
+
     def weights(self, lane: int) -> dict[str, Array]:
         """A lane's weights without padding, by SB3's names, as NumPy arrays."""
         padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
@@ -262,6 +277,14 @@ class Program(ABC):
 
 def _widths(spec: SMESpec) -> Widths:
     return Widths(spec.state_dim, spec.action_dim)
+
+
+@functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))
+def _actions(
+    act: Any, settings: Any, symmetric: bool, weights: Weights, observations: Array
+) -> jax.Array:
+    actions: jax.Array = act(settings, weights, observations, symmetric)
+    return actions
 
 
 @jax.jit

@@ -44,6 +44,11 @@ def _check_task(uses: str, setting: Setting, field: str) -> None:
             f"{field}={uses!r}: needs a team, and this task has a single agent. Use "
             f"{uses.removeprefix(INDEPENDENT)!r}."
         )
+    if uses.startswith(JAX) and setting.team is not None:
+        raise ValueError(
+            f"{field}={uses!r}: cannot learn a task for {len(setting.team.agents)} agents. Use an "
+            f"algorithm of Stable-Baselines3, such as {uses.removeprefix(JAX)!r}."
+        )
 
 
 class StudyAlgorithm(StrictModel):
@@ -51,10 +56,10 @@ class StudyAlgorithm(StrictModel):
 
     Attributes:
       name: its name in reports, unique in the plan.
-      uses: an algorithm of Stable-Baselines3 ("PPO"), an installed entry point of the group
-        `sme_registry.algorithms`, `module:function`, or `reference:constant`, `reference:linear`,
-        `reference:random`, `reference:optimal`, which learn nothing. The agents of a team share
-        one model; `independent:PPO` has one for each.
+      uses: an algorithm of Stable-Baselines3 ("PPO"), the same in a program of JAX ("jax:PPO"), an
+        installed entry point of the group `sme_registry.algorithms`, `module:function`, or
+        `reference:constant`, `reference:linear`, `reference:random`, `reference:optimal`, which
+        learn nothing. The agents of a team share one model; `independent:PPO` has one for each.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
       steps: its budget; null takes the plan's.

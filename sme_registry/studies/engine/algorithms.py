@@ -2,6 +2,7 @@
 
     reference:constant, …   a reference policy
     independent:PPO         an algorithm with one model for each agent of a team
+    jax:PPO                 an algorithm of `sme_registry.jax`, in a program with its environment
 
 A learner gets a `VecEnv` of one environment. The cell counts its steps and evaluates the learner
 through `predict` whenever an evaluation is due, so a learner needs no callbacks.

@@ -19,9 +19,12 @@ from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.io import write_atomically
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
 from sme_registry.studies.engine.checks import refuse_of_reference
+from sme_registry.studies.engine.jobs import Lanes, uses_jax
+from sme_registry.studies.engine.lanes import run_lanes
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.studies.engine.training import training
@@ -60,6 +63,8 @@ def run_cell(
     """
     start = time.thread_time()
     progress = progress or (lambda done, total: None)
+    if uses_jax(cell):
+        return _run_alone(cell, progress, model_path)
     learner = offline_name(cell.uses)
     if learner is not None:
         return run_offline(cell, learner, progress)
@@ -84,6 +89,16 @@ def run_cell(
         timing=recorder.timing(time.thread_time() - start),
         versions=versions_for(cell.uses),
     )
+
+
+def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
+    """Run a cell that uses JAX as the only lane of a program."""
+    ((_, ended, model),) = run_lanes((cell,), Lanes(1), progress, model_path is not None)
+    if isinstance(ended, PolicyError):
+        raise ended
+    if model_path is not None and model is not None:
+        write_atomically(model_path, model)
+    return ended
 
 
 class _Recorder:

@@ -12,14 +12,15 @@ from typing import Any
 
 from sme_registry.errors import OptionError
 from sme_registry.offline.hyperparameters import resolve_hyperparameters
-from sme_registry.spec import StudyAlgorithm
+from sme_registry.spec import Cell, StudyAlgorithm
+from sme_registry.spec.study import JAX
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
 from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
 from sme_registry.training import ALGORITHMS
 from sme_registry.training.algorithms import is_on_policy, require_sb3
 from sme_registry.training.hyperparameters import refuse_unknown
 
-__all__ = ["check_hyperparameters", "find"]
+__all__ = ["check_hyperparameters", "check_task", "find"]
 
 
 def find(uses: str) -> None:
@@ -29,6 +30,11 @@ def find(uses: str) -> None:
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
     if reference_name(uses) is not None or offline_name(uses) is not None:
+        return
+    if uses.startswith(JAX):
+        from sme_registry.jax.run import full_name
+
+        full_name(uses)
         return
     independent = independent_name(uses)
     if (independent or uses).casefold() in (name.casefold() for name in ALGORITHMS):
@@ -53,11 +59,27 @@ def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
     learner = offline_name(uses)
     if reference_name(uses) is not None:
         refuse_of_reference(uses, chosen)
+    elif uses.startswith(JAX):
+        from sme_registry.jax.run import settings_of
+
+        settings_of(uses, chosen, field)
     elif learner is not None:
         own = {name: value for name, value in chosen.items() if name not in DATA_SETTINGS}
         resolve_hyperparameters(learner, own)
     else:
         refuse_unknown(find_algorithm(uses), uses, chosen, field)
+
+
+def check_task(cell: Cell) -> None:
+    """Check that the algorithm of a cell has such tasks, where that depends on more than a team.
+
+    Raises:
+      SpecError: JAX does not have one of the fields.
+    """
+    if cell.uses.startswith(JAX):
+        from sme_registry.jax.task import check_supported
+
+        check_supported(cell.spec)
 
 
 def refuse_of_reference(uses: str, hyperparameters: Mapping[str, Any]) -> None:

@@ -1,13 +1,13 @@
-"""Where a study's cells run: in this process, in a process each, or as tasks of a Ray cluster.
+"""Where a study's cells run: in this process, in processes, or as tasks of a Ray cluster.
 
-Every executor is one `map`: it takes the next cell when a worker is free, and yields the outcomes
-in the order in which cells end. Its caller writes them: only the driver touches the study's folder.
+Every executor is one `map`: it takes the next job when a worker is free, a cell or the cells of one
+program, and yields the outcomes in the order in which cells end. Its caller writes them: only the
+driver touches the study's folder, except for the states of programs, which may be gigabytes.
 """
 
 from __future__ import annotations
 
 import functools
-import os
 import tempfile
 import time
 import traceback
@@ -18,15 +18,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from sme_registry.io import versions
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.jobs import Job
+from sme_registry.studies.engine.lanes import run_lanes
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.training.record import PACKAGES
+from sme_registry.training.record import versions_for
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
-ReportProgress = Callable[[Cell, int, int], None]
-Cells = Iterator[Cell | None]
+ReportProgress = Callable[[Job, int, int], None]
+Jobs = Iterator[Job | None]
 
 POLL_SECONDS = 0.2
 TRACEBACK_CHARACTERS = 4000  # kept of a failed cell's traceback or output
@@ -45,42 +46,63 @@ class Executor(Protocol):
 
     @property
     def workers(self) -> int:
-        """Cells that can run at once."""
+        """Jobs that can run at once."""
 
-    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
+    def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """Run cells. When the iterator is closed or raises, no cell is left running.
 
         Args:
-          cells: asked for the next cell whenever a worker is free; None means that no cell is
+          jobs: asked for the next job whenever a worker is free; None means that no job is
             available now, and it is asked again soon.
-          progress: called with a running cell, the steps done and the steps in all.
+          progress: called with a running job, the steps done and the steps in all.
 
         Yields:
           Outcomes, in the order in which cells end.
         """
 
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def run_job(
+    run: RunCell, job: Job, keep_models: bool, progress: Callable[[int, int], None]
+) -> Iterator[Outcome]:
+    """Run a job; an exception becomes the failure of its cells, so that the process goes on.
 
+    Args:
+      run: runs a cell that is no lane of a program.
+      job: to run.
+      keep_models: whether outcomes carry the trained models.
+      progress: called with the steps done and the steps in all.
 
-def run_one(
-    run: RunCell, cell: Cell, keep_model: bool, progress: Callable[[int, int], None]
-) -> Outcome:
-    """Run a cell; an exception becomes its failure, so that the process goes on."""
+    Yields:
+      Outcomes, one for each cell.
+    """
+    report, unfinished = _throttled(progress), {cell.digest: cell for cell in job.cells}
     try:
-        with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
-            path = Path(folder) / "model.zip"
-            result = run(cell, _throttled(progress), path if keep_model else None)
-            model = path.read_bytes() if path.exists() else None
-        if result.key != cell.digest:
-            raise RuntimeError(f"the result belongs to another cell, {result.key}")
-        return Outcome(result, model)
+        for outcome in _outcomes(run, job, keep_models, report):
+            del unfinished[outcome.entry.key]
+            yield outcome
     except (Exception, SystemExit) as error:
-        return failed(cell, f"{type(error).__name__}: {error}", traceback.format_exc())
+        for cell in unfinished.values():
+            yield failed(cell, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def _outcomes(
+    run: RunCell, job: Job, keep_models: bool, progress: Callable[[int, int], None]
+) -> Iterator[Outcome]:
+    if job.lanes is not None:
+        for cell, ended, model in run_lanes(job.cells, job.lanes, progress, keep_models):
+            if isinstance(ended, CellResult):
+                yield Outcome(ended, model)
+            else:
+                yield failed(cell, f"{type(ended).__name__}: {ended}", "")
+        return
+    (cell,) = job.cells
+    with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
+        path = Path(folder) / "model.zip"
+        result = run(cell, progress, path if keep_models else None)
+        saved = path.read_bytes() if path.exists() else None
+    if result.key != cell.digest:
+        raise RuntimeError(f"the result belongs to another cell, {result.key}")
+    yield Outcome(result, saved)
 
 
 def failed(cell: Cell, error: str, details: str) -> Outcome:
@@ -90,7 +112,7 @@ def failed(cell: Cell, error: str, details: str) -> Outcome:
         cell=cell,
         error=error,
         traceback=details[-TRACEBACK_CHARACTERS:],
-        versions=versions(PACKAGES),
+        versions=versions_for(cell.uses),
     )
     return Outcome(failure)
 
@@ -111,27 +133,26 @@ def _throttled(report: Callable[[int, int], None]) -> Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class InProcess:
-    """One cell after the other in this process: for debugging, or where processes are forbidden."""
+    """One job after the other in this process: for debugging, or where processes are forbidden."""
 
     run: RunCell = run_cell
     keep_models: bool = False
     workers: int = 1
 
-    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
+    def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """See `Executor.map`."""
-        for cell in cells:
-            if cell is None:
+        for job in jobs:
+            if job is None:
                 time.sleep(POLL_SECONDS)
                 continue
-            report = functools.partial(progress, cell)
-            yield run_one(self.run, cell, self.keep_models, report)
+            yield from run_job(self.run, job, self.keep_models, functools.partial(progress, job))
 
 
 class ConcurrentExecutor(ABC):
-    """Keeps as many cells running as there are workers.
+    """Keeps as many jobs running as there are workers.
 
     Args:
-      jobs: cells at once; None for one per core that can be used.
+      jobs: at once; None for one per core that can be used.
       run: runs a cell; importable by name.
       keep_models: whether outcomes carry the trained model.
     """
@@ -145,31 +166,31 @@ class ConcurrentExecutor(ABC):
     @property
     @abstractmethod
     def workers(self) -> int:
-        """Cells that can run at once."""
+        """Jobs that can run at once."""
 
     @abstractmethod
     def _session(self) -> AbstractContextManager[None]:
-        """Open what cells run in; leaving it ends those that are still running."""
+        """Open what jobs run in; leaving it ends those that are still running."""
 
     @abstractmethod
-    def _start(self, cell: Cell) -> None:
-        """Start a cell and add it to those running."""
+    def _start(self, job: Job) -> None:
+        """Start a job and add it to those running."""
 
     @abstractmethod
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
-        """Wait up to `POLL_SECONDS`, report progress, and remove the cells that have ended."""
+        """Wait up to `POLL_SECONDS`, report progress, and remove the jobs that have ended."""
 
-    def map(self, cells: Cells, progress: ReportProgress) -> Generator[Outcome, None, None]:
+    def map(self, jobs: Jobs, progress: ReportProgress) -> Generator[Outcome, None, None]:
         """See `Executor.map`."""
         exhausted = False
         with self._session():
             while not exhausted or self._running:
                 while not exhausted and len(self._running) < self.workers:
-                    cell = next(cells, _END)
-                    exhausted = cell is _END
-                    if not isinstance(cell, Cell):
+                    job = next(jobs, _END)
+                    exhausted = job is _END
+                    if not isinstance(job, Job):
                         break
-                    self._start(cell)
+                    self._start(job)
                 if self._running:
                     yield from self._ended(progress)
                 elif not exhausted:

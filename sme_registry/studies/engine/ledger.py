@@ -14,17 +14,27 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import Lock, file_lock, is_locked, read_json, to_json, write_atomically
 from sme_registry.spec import StudyFile
+from sme_registry.studies.engine.program_state import read_header
 from sme_registry.studies.engine.result import CellFailure, CellResult
 
 PLAN = "plan.json"
 CELLS, FAILED, LOCKS, MODELS, REPORT = "cells", "failed", "locks", "models", "report"
 REQUESTS = "requests"  # selections of cells that were asked for, a file each
-_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT, REQUESTS}
+STATES = "states"  # of programs that run, or were killed
+_STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT, REQUESTS, STATES}
+
+
+class SavedState(NamedTuple):
+    """The state of a program in a file, and the keys of the cells that are its lanes."""
+
+    path: Path
+    keys: list[str]
+
 
 _Entry = TypeVar("_Entry", CellResult, CellFailure)
 
@@ -148,6 +158,38 @@ class Ledger:
     def is_running(self, key: str) -> bool:
         """Whether any process holds the cell's lock. Creates no file."""
         return is_locked(self.folder / LOCKS / _hex(key))
+
+    def claim_lock(self) -> Lock | None:
+        """A lock to hold while claiming the cells of a program; None if another run claims now.
+
+        Two runs that claim the cells of one program at once would divide them, and both would run
+        it.
+
+        Raises:
+          OptionError: the lock file cannot be created.
+        """
+        return file_lock(self.folder / LOCKS / "programs")
+
+    def state_path(self, keys: Iterable[str]) -> Path:
+        """Where the state of a new program of these cells goes."""
+        name = hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
+        return self.folder / STATES / f"{name}.npz"
+
+    def state_of(self, key: str) -> SavedState | None:
+        """A saved state of a program that has this cell as a lane."""
+        for path in sorted((self.folder / STATES).glob("*.npz")):
+            keys = (read_header(path) or {}).get("cells", [])
+            if key in keys:
+                return SavedState(path, list(keys))
+        return None
+
+    def remove_state(self, path: Path) -> None:
+        """Remove a state, unless a cell has yet to end, or all failed: a retry goes on from it."""
+        keys = (read_header(path) or {}).get("cells", [])
+        done = [key for key in keys if self._path(CELLS, key).exists()]
+        failed = [key for key in keys if self.failure_path(key).exists()]
+        if len(done) + len(failed) == len(keys) and (done or not keys):
+            path.unlink(missing_ok=True)
 
     def set_aside(self, key: str) -> None:
         """Rename a cell's result or failure if it is invalid. The caller must hold the lock.

@@ -1,8 +1,8 @@
-"""`Processes`: a process for each cell.
+"""`Processes`: a process for each job.
 
 Not a pool of workers. With `concurrent.futures`, one dead worker fails every cell that is running.
 The workers of `pebble` survive a killed driver and would go on with cells whose locks are free
-again. Here each process has its own pipe, so its death fails only its cell, and ends with the
+again. Here each process has its own pipe, so its death fails only its cells, and ends with the
 driver.
 """
 
@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.executors import (
@@ -29,24 +29,24 @@ from sme_registry.studies.engine.executors import (
     Outcome,
     ReportProgress,
     RunCell,
-    available_cores,
     failed,
-    run_one,
+    run_job,
 )
+from sme_registry.studies.engine.jobs import Job, available_cores
 from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts
 
 _SECONDS_TO_END = 10.0
-# One thread for each library that would take every core: the cells share the cores, one each.
+# One thread for each library that would take every core: the jobs share the cores, one each.
 _ONE_THREAD = {
     f"{library}_NUM_THREADS": "1"
     for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR", "NUMBA")
-}
+} | {"NPROC": "1"}  # of XLA on a CPU
 
 
 class Processes(ConcurrentExecutor):
-    """A new process (`spawn`) with one thread for each cell.
+    """A new process (`spawn`) with one thread for each job.
 
-    A cell whose process is killed is a failed cell. The processes end with this one, however it
+    The cells of a process that is killed have failed. The processes end with this one, however it
     ends, and ignore Ctrl-C, which this process handles.
     """
 
@@ -67,71 +67,86 @@ class Processes(ConcurrentExecutor):
                         process.kill()
                     self._running.clear()
 
-    def _start(self, cell: Cell) -> None:
+    def _start(self, job: Job) -> None:
         with defer_interrupts():  # or a process that has just started would have no owner
-            process = _CellProcess.start(self._run, cell, self._keep_models, self._scratch)
+            process = _JobProcess.start(self._run, job, self._keep_models, self._scratch)
             self._running[process.pipe] = process
 
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         for pipe in connection.wait(list(self._running), POLL_SECONDS):
             process = self._running[pipe]
             received = process.receive()
-            if isinstance(received, Outcome):
+            if isinstance(received, _Steps):
+                progress(process.job, *received)
+                continue
+            if not process.unfinished:
                 del self._running[pipe]
-                yield received
-            else:
-                progress(process.cell, *received)
+            yield from received
+
+
+class _Steps(NamedTuple):
+    """How far a process is."""
+
+    done: int
+    total: int
 
 
 @dataclass(frozen=True)
-class _CellProcess:
-    """A cell in a process of its own."""
+class _JobProcess:
+    """A job in a process of its own."""
 
-    cell: Cell
+    job: Job
     process: Any
     pipe: Any  # a Connection, on Windows a PipeConnection
     log: Path
+    unfinished: dict[str, Cell]
 
     @classmethod
-    def start(cls, run: RunCell, cell: Cell, keep_model: bool, scratch: Path) -> _CellProcess:
+    def start(cls, run: RunCell, job: Job, keep_models: bool, scratch: Path) -> _JobProcess:
         spawn = multiprocessing.get_context("spawn")
         pipe, child_end = spawn.Pipe(duplex=False)
-        log = scratch / f"{cell.digest.removeprefix('sha256:')}.log"
-        process = spawn.Process(target=_child, args=(child_end, run, cell, keep_model, log))
+        unfinished = {cell.digest: cell for cell in job.cells}
+        log = scratch / f"{next(iter(unfinished)).removeprefix('sha256:')}.log"
+        process = spawn.Process(target=_child, args=(child_end, run, job, keep_models, log))
         with _one_thread(), block_interrupts():
             process.start()
         child_end.close()  # so that the pipe ends when the process does
-        return cls(cell, process, pipe, log)
+        return cls(job, process, pipe, log, unfinished)
 
-    def receive(self) -> Outcome | tuple[int, int]:
-        """Its next steps done and in all, or its outcome once the process has ended."""
+    def receive(self) -> list[Outcome] | _Steps:
+        """How far it is, or the outcomes of cells that have ended since."""
         try:
             received = self.pipe.recv()
         except (EOFError, OSError):
             self.kill()
-            return self._death()
-        if isinstance(received, Outcome):
+            deaths = [self._death(cell) for cell in self.unfinished.values()]
+            self.unfinished.clear()
+            return deaths
+        if isinstance(received, _Steps):
+            return received
+        del self.unfinished[received.entry.key]
+        if not self.unfinished:
             self.process.join(_SECONDS_TO_END)
             self.kill()
-        return received  # type: ignore[no-any-return]
+        return [received]
 
     def kill(self) -> None:
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
-    def _death(self) -> Outcome:
+    def _death(self, cell: Cell) -> Outcome:
         code = self.process.exitcode
         killed_by = next((each.name for each in signal.Signals if each == -code), None)
         how = f"was killed by {killed_by}" if killed_by else f"ended with exit code {code}"
         hint = " Memory may have run out: try fewer --jobs." if killed_by == "SIGKILL" else ""
         output = self.log.read_text(errors="replace") if self.log.exists() else ""
         error = f"the cell's process {how}.{hint} Run it again with --retry."
-        return failed(self.cell, error, output)
+        return failed(cell, error, output)
 
 
-def _child(pipe: Any, run: RunCell, cell: Cell, keep_model: bool, log: Path) -> None:
-    """Run one cell: the main function of its process."""
+def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> None:
+    """Run one job: the main function of its process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with_parent()
     # Studies run for days, and many machines remove old files from the temporary folder.
@@ -141,7 +156,8 @@ def _child(pipe: Any, run: RunCell, cell: Cell, keep_model: bool, log: Path) -> 
         os.dup2(handle, 1)
         os.dup2(handle, 2)
     tempfile.tempdir = str(log.parent)  # which the driver removes, also after a kill
-    pipe.send(run_one(run, cell, keep_model, lambda done, total: pipe.send((done, total))))
+    for outcome in run_job(run, job, keep_models, lambda *steps: pipe.send(_Steps(*steps))):
+        pipe.send(outcome)
 
 
 def _end_with_parent() -> None:

@@ -1,4 +1,4 @@
-"""`OnRay`: a task of a Ray cluster for each cell."""
+"""`OnRay`: a task of a Ray cluster for each job."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import os
 import socket
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from sme_registry.errors import OptionError
 from sme_registry.io import require_packages
-from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.executors import (
     POLL_SECONDS,
@@ -21,10 +21,10 @@ from sme_registry.studies.engine.executors import (
     Outcome,
     ReportProgress,
     RunCell,
-    available_cores,
     failed,
-    run_one,
+    run_job,
 )
+from sme_registry.studies.engine.jobs import Job, available_cores
 
 _RETRIES = 3  # of a cell whose worker or node is lost
 _SECONDS_TO_ANSWER = 10.0
@@ -37,14 +37,14 @@ _ADDRESSES = "Give 'local', or the host:port of a running cluster of this Ray ve
 
 
 class OnRay(ConcurrentExecutor):
-    """A task on one core of a Ray cluster for each cell; a cell whose node is lost runs again.
+    """A task on one core of a Ray cluster for each job; one whose node is lost runs again.
 
     This process keeps the locks and writes the files, so the nodes need no shared file system,
-    only Ray and this package in the same versions.
+    only Ray and this package in the same versions. So programs save no states here.
 
     Args:
       address: of a running cluster, or "local" to start one here until `map` ends.
-      jobs: cells at once; None for the cluster's cores, as many as it has at the time.
+      jobs: at once; None for the cluster's cores, as many as it has at the time.
       run: runs a cell.
       keep_models: whether outcomes carry the trained model.
 
@@ -68,7 +68,7 @@ class OnRay(ConcurrentExecutor):
 
     @property
     def workers(self) -> int:
-        """Cells that can run at once: `jobs`, else the cluster's cores as of now."""
+        """Jobs that can run at once: `jobs`, else the cluster's cores as of now."""
         if self._jobs is not None:
             return self._jobs
         if not self._ray.is_initialized():
@@ -90,15 +90,17 @@ class OnRay(ConcurrentExecutor):
                 self._ray.shutdown()
                 self._connected_here = False
 
-    def _start(self, cell: Cell) -> None:
-        task = self._task.remote(self._steps, self._run, cell, self._keep_models)
-        self._running[task] = cell
+    def _start(self, job: Job) -> None:
+        if job.lanes is not None:
+            job = replace(job, lanes=replace(job.lanes, state=None))
+        task = self._task.remote(self._steps, self._run, job, self._keep_models)
+        self._running[task] = job
 
     def _ended(self, progress: ReportProgress) -> Iterator[Outcome]:
         ready, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
         for reference in ready:
-            yield self._outcome(reference, self._running.pop(reference))
-        by_key = {cell.digest: cell for cell in self._running.values()}
+            yield from self._outcomes(reference, self._running.pop(reference))
+        by_key = {job.cells[0].digest: job for job in self._running.values()}
         for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
             if key in by_key:
                 progress(by_key[key], done, total)
@@ -120,23 +122,22 @@ class OnRay(ConcurrentExecutor):
             ) from None
         self._connected_here = True
 
-    def _outcome(self, reference: Any, cell: Cell) -> Outcome:
+    def _outcomes(self, reference: Any, job: Job) -> list[Outcome]:
         try:
-            return Outcome(*self._ray.get(reference))
+            return [Outcome(*ended) for ended in self._ray.get(reference)]
         except self._ray.exceptions.RayError as error:
             text = str(error).strip()
-            return failed(
-                cell,
+            message = (
                 f"{type(error).__name__}: lost {_RETRIES + 1} times: {text.splitlines()[0]} "
-                "Run it again with --retry.",
-                text,
+                "Run it again with --retry."
             )
+            return [failed(cell, message, text) for cell in job.cells]
 
 
-def _task(steps: Any, run: RunCell, cell: Cell, keep_model: bool) -> tuple[Any, ...]:
-    """Run one cell on a Ray worker."""
-    report = functools.partial(steps.put.remote, cell.digest)
-    return tuple(run_one(run, cell, keep_model, report))
+def _task(steps: Any, run: RunCell, job: Job, keep_models: bool) -> list[tuple[Any, ...]]:
+    """Run one job on a Ray worker."""
+    report = functools.partial(steps.put.remote, job.cells[0].digest)
+    return [tuple(outcome) for outcome in run_job(run, job, keep_models, report)]
 
 
 class _StepCounts:

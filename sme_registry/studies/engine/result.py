@@ -6,6 +6,7 @@ STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place 
 STUDY/failed/<64 hex>.json    cells that failed, with the error; a successful retry removes it
 STUDY/locks/<64 hex>          locked by the operating system while a cell runs
 STUDY/models/<64 hex>.zip     trained models, if they are kept
+STUDY/states/<16 hex>.npz     states of programs of JAX that run, or were killed
 STUDY/report/                 what `sme study report` writes
 """
 
@@ -22,9 +23,9 @@ from sme_registry.spec.study import Cell
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
 
 
-def without_empty(plain: dict[str, Any], name: str) -> dict[str, Any]:
-    """Plain data without a field that is empty, as files were before the field existed."""
-    return plain if plain[name] else {key: value for key, value in plain.items() if key != name}
+def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Plain data without those of these fields that are empty, as before the fields existed."""
+    return {key: value for key, value in plain.items() if value or key not in names}
 
 
 class LearningCurve(StrictModel):
@@ -54,13 +55,31 @@ class LearningCurve(StrictModel):
 
 
 class Timing(StrictModel):
-    """CPU seconds of a run, by task; the only part of a result that is not reproducible."""
+    """CPU seconds of a run, by task; the only part of a result that is not reproducible.
+
+    Of a lane of a program: the program's CPU seconds (on another device, its wall time) divided
+    by its cells. `environment` is 0 there: environment and learner are one program.
+    """
 
     total: Real
     training: Real
     environment: Real
     evaluation: Real
     steps_per_second: Real
+
+
+class ProgramResult(StrictModel):
+    """In what program a cell of JAX was a lane: its bits depend on all of it.
+
+    Attributes:
+      device: its kind, such as "cpu" or "NVIDIA H200".
+      lanes: their number.
+      shape: S, A, L and H to which the tasks of all lanes were padded; H is 0 where L = 1.
+    """
+
+    device: str
+    lanes: Annotated[Integer, Field(ge=1)]
+    shape: Annotated[tuple[Integer, Integer, Integer, Integer], Field(strict=False)]
 
 
 class OfflineResult(StrictModel):
@@ -98,6 +117,7 @@ class CellResult(StrictModel):
       agents_online_regret: the same of each agent of a team, by name. A single agent's JSON omits
         it.
       offline: similarities of an offline cell; null for all others.
+      program: of a cell that uses `jax:…`. The JSON of any other omits it.
       timing: CPU seconds by task.
       versions: versions of the packages that the numbers depend on.
     """
@@ -110,12 +130,13 @@ class CellResult(StrictModel):
     online_regret: Real | None = None
     agents_online_regret: dict[str, Real] = Field(default_factory=dict)
     offline: OfflineResult | None = None
+    program: ProgramResult | None = None
     timing: Timing
     versions: dict[str, str]
 
     @model_serializer(mode="wrap")
-    def _omit_no_agents(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return without_empty(handler(self), "agents_online_regret")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_empty(handler(self), "agents_online_regret", "program")
 
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""

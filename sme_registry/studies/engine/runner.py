@@ -1,7 +1,8 @@
 """`run_study`: run the cells of a plan that have no result yet.
 
 Any number of runs may share a folder at once, on one machine or on several that share it: the lock
-of a cell decides who runs it, and its result file says that it is done.
+of a cell decides who runs it, and its result file says that it is done. Cells are claimed when a
+worker is free: one, or as many as a program has lanes, so that the others are left to other runs.
 """
 
 from __future__ import annotations
@@ -10,18 +11,20 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
 
 from rich.console import Console
 
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, integer_in
-from sme_registry.spec import Cell, PlannedCell, StudyFile
+from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
 from sme_registry.studies.engine import checks
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
-from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.jobs import Job, Programs, platform_of, uses_jax
+from sme_registry.studies.engine.ledger import Ledger, SavedState
 from sme_registry.studies.engine.processes import Processes
 from sme_registry.studies.engine.ray_executor import OnRay
 from sme_registry.studies.engine.result import CellFailure, CellResult
@@ -43,6 +46,8 @@ def run_study(
     retry_failed: bool = False,
     keep_models: bool = False,
     only: Sequence[str] = (),
+    device: str | None = None,
+    lanes: int | None = None,
     progress: bool = True,
     console: Console | None = None,
     run: RunCell = run_cell,
@@ -52,16 +57,21 @@ def run_study(
     Each result is written as soon as its cell ends. If this process ends early, for any reason, the
     same call continues. Cells that another process is running are waited for at the end.
 
+    Cells that use `jax:…` run together, as lanes of one program, in any executor: on a CPU a
+    program on each core, on another device one at a time.
+
     Args:
       plan_file: the plan; it becomes the folder's, and results of earlier plans stay.
       folder: of the study; created if it does not exist.
       executor: "processes", one for each cell; "in-process"; "ray"; or an `Executor`.
-      jobs: cells at once; None for one per core, of this machine or of the cluster.
+      jobs: cells or programs at once; None for one per core, of this machine or of the cluster.
       ray: "local", or the address of a Ray cluster.
       retry_failed: also run the cells that failed before.
       keep_models: keep the trained models of the cells that run now. Finished cells without a model
         are reported and not run again.
       only: `class=GLOB`, `algorithm=GLOB`: the cells to run now; see `scaling.selected`.
+      device: where programs of JAX run, "cpu", "gpu" or "tpu"; None for JAX's default.
+      lanes: most lanes of a program; None for a number that suits the device.
       progress: whether to show progress.
       console: where to show it; None for standard error.
       run: runs a cell; for processes and Ray importable by name.
@@ -70,28 +80,37 @@ def run_study(
       The state of the selected cells at the end.
 
     Raises:
-      OptionError: the folder contains other files or cannot be written to, or an argument is out
-        of range. Finished cells stay.
+      OptionError: the folder contains other files or cannot be written to, an argument is out of
+        range, or there is no such device. Finished cells stay.
       UnknownNameError: a pattern matches nothing, or an algorithm cannot be found.
       MissingDependencyError: an algorithm, or Ray, needs a package that is not installed.
       KeyboardInterrupt: interrupted; says how to continue.
     """
     if jobs is not None:
         jobs = integer_in("jobs", jobs, 1)
+    if lanes is not None:
+        lanes = integer_in("lanes", lanes, 1, 100_000)
     planned = {cell.cell.digest: cell for cell in selected(plan_file.plan.cells, only)}
+    programs = None
     if run is run_cell:
-        names = {cell.algorithm for cell in planned.values()}
-        for algorithm in plan_file.plan.algorithms:
-            if algorithm.name in names:
-                checks.find(algorithm.uses)
-                checks.check_hyperparameters(algorithm)
+        _check(plan_file.plan, planned.values())
+        if any(uses_jax(cell.cell) for cell in planned.values()):
+            every = (cell.cell for cell in plan_file.plan.cells)
+            programs = Programs(every, platform_of(device), device, lanes)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
     if earlier_plan is None or earlier_plan != plan_file:
         ledger.write_plan(plan_file)
     study = _StudyRun(
-        plan_file, ledger, planned, runs_on, console or Console(stderr=True), retry_failed, progress
+        plan_file,
+        ledger,
+        planned,
+        runs_on,
+        programs,
+        console or Console(stderr=True),
+        retry_failed,
+        progress,
     )
     if study.finished < len(planned):
         ledger.write_request(plan_file, only)
@@ -104,6 +123,17 @@ def run_study(
             f"{ledger.folder}. Run the same command to continue."
         ) from None
     return plan_status(ledger, plan_file, only)
+
+
+def _check(plan: StudyPlan, planned: Collection[PlannedCell]) -> None:
+    """Check the algorithms of these cells, and that they have such tasks."""
+    names = {cell.algorithm for cell in planned}
+    for algorithm in plan.algorithms:
+        if algorithm.name in names:
+            checks.find(algorithm.uses)
+            checks.check_hyperparameters(algorithm)
+    for cell in planned:
+        checks.check_task(cell.cell)
 
 
 def _executor(
@@ -120,6 +150,14 @@ def _executor(
     raise UnknownNameError(f"executor={executor!r}: must be one of {', '.join(EXECUTORS)}.")
 
 
+class _Running(NamedTuple):
+    """A cell that runs: its lock, when its job started, and the job."""
+
+    lock: Lock
+    started: float
+    job: Job
+
+
 class _StudyRun:
     """The cells of one `run_study`: waiting, running, or ended and not yet written."""
 
@@ -129,12 +167,13 @@ class _StudyRun:
         ledger: Ledger,
         planned: dict[str, PlannedCell],
         executor: Executor,
+        programs: Programs | None,
         console: Console,
         retry_failed: bool,
         progress: bool,
     ) -> None:
         self._file, self._ledger, self._executor = file, ledger, executor
-        self._planned = planned
+        self._planned, self._programs = planned, programs
         self._results = ledger.results(planned)
         self._failures = ledger.failures(planned.keys() - self._results.keys())
         self.finished, self._failed = len(self._results), 0
@@ -144,7 +183,7 @@ class _StudyRun:
             for key, cell in planned.items()
             if key not in self._results and (retry_failed or key not in self._failures)
         }
-        self._running: dict[str, tuple[Lock, float]] = {}  # the cell's lock, and when it started
+        self._running: dict[str, _Running] = {}
         self._shares: dict[str, float] = {}  # of a running cell's steps, done
         self._unwritten: list[Outcome] = []
         self._progress = Progress(
@@ -217,72 +256,135 @@ class _StudyRun:
         """Run every waiting cell."""
         if not self._waiting:
             return
-        outcomes = self._executor.map(self._cells(), self._report)
+        outcomes = self._executor.map(self._jobs(), self._report)
         with self._progress:
             try:
                 with contextlib.closing(outcomes):  # ends running cells before their locks go
                     for outcome in outcomes:
                         self._handle(outcome)
             finally:
-                for lock, _ in self._running.values():
-                    lock.release()
+                for running in self._running.values():
+                    running.lock.release()
 
     def seconds_left(self) -> float:
         """Seconds to the end, as estimated now."""
+        seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
+        for key in (*self._running, *self._waiting):
+            cell = self._planned[key].cell
+            span = self._estimator.seconds(cell)
+            rest = (span.low + span.high) / 2 * (1 - self._shares.get(key, 0.0))
+            seconds[self._one_at_a_time(cell)].append(rest)
+        return max(sum(seconds[True]), makespan(seconds[False], self._executor.workers))
 
-        def seconds(key: str) -> float:
-            span = self._estimator.seconds(self._planned[key].cell)
-            return (span.low + span.high) / 2
+    def _one_at_a_time(self, cell: Cell) -> bool:
+        """Whether a cell's program has the device to itself."""
+        programs = self._programs
+        return programs is not None and programs.one_at_a_time and uses_jax(cell)
 
-        rest = [seconds(key) * (1 - self._shares.get(key, 0.0)) for key in self._running]
-        return makespan([*rest, *map(seconds, self._waiting)], self._executor.workers)
-
-    def _cells(self) -> Iterator[Cell | None]:
-        """Locked cells for the executor; None while no cell is available."""
+    def _jobs(self) -> Iterator[Job | None]:
+        """Jobs of locked cells for the executor; None while no cell is available."""
         while self._waiting or self._unwritten:
             try:
                 for outcome in list(self._unwritten):
                     self._write(outcome)
                     self._unwritten.remove(outcome)
-                cell = self._claim()
+                job = self._next_job()
             except OptionError:
                 # The folder cannot be written to. Running cells are left to finish: there may be
                 # space again by then, and their outcomes are kept in memory until they are written.
                 if len(self._running) == len(self._unwritten):
                     raise
-                cell = None
-            yield cell
+                job = None
+            yield job
 
-    def _claim(self) -> Cell | None:
-        """Lock the next cell that still has to run; None if other processes hold them all."""
+    def _next_job(self) -> Job | None:
+        """Claim the next cells that still have to run; None if there are none to claim now."""
+        occupied = any(self._one_at_a_time(c) for r in self._running.values() for c in r.job.cells)
         for key, planned in list(self._waiting.items()):
-            lock = self._ledger.lock(key)
-            if lock is None:
+            if occupied and self._one_at_a_time(planned.cell):
                 continue
-            try:
-                self._ledger.set_aside(key)
-                result, failure = self._ledger.result(key), self._ledger.failure(key)
-            except BaseException:
-                lock.release()
-                raise
-            del self._waiting[key]
-            earlier = self._failures.get(key)
-            attempts = earlier.attempts if earlier else 0
-            failed_since = failure is not None and failure.attempts > attempts
-            if result is None and not failed_since:
-                self._running[key] = lock, time.monotonic()
-                self._progress.start_part(label(planned))
-                return planned.cell
-            lock.release()
-            self.finished += result is not None
-            self._show_end(planned, failed=result is None)
+            if self._programs is not None and uses_jax(planned.cell):
+                job = self._claim_program(self._programs, key)
+            elif (lock := self._claim(key)) is not None:
+                job = self._started(Job((planned.cell,)), [lock])
+            else:
+                job = None
+            if job is not None:
+                return job
         return None
 
-    def _report(self, cell: Cell, done: int, total: int) -> None:
+    def _claim_program(self, programs: Programs, first: str) -> Job | None:
+        """Claim a cell and the others of its program: those of a saved state, or the next ones."""
+        alone = self._ledger.claim_lock()
+        if alone is None:
+            return None
+        with alone, contextlib.ExitStack() as stack:  # releases all of them if one raises
+            cells, locks = list[Cell](), list[Lock]()
+            saved = self._ledger.state_of(first)
+            for key in self._candidates(programs, first, saved):
+                if len(cells) < programs.lanes(self._planned[first].cell):
+                    lock = self._claim(key)
+                    if lock is not None:
+                        locks.append(stack.enter_context(lock))
+                        cells.append(self._planned[key].cell)
+                if not cells:
+                    return None
+            state = saved.path if saved else self._ledger.state_path(c.digest for c in cells)
+            stack.pop_all()
+        return self._started(Job(tuple(cells), programs.program(cells[0], state)), locks)
+
+    def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
+        """The waiting cells that may be lanes of the program of the first one, which leads."""
+        group = programs.group(self._planned[first].cell)
+        others = self._waiting if saved is None else saved.keys
+        return [first] + [
+            key
+            for key in others
+            if key != first
+            and key in self._waiting
+            and programs.group(self._planned[key].cell) == group
+        ]
+
+    def _claim(self, key: str) -> Lock | None:
+        """Lock a waiting cell; None if another process holds it, or has run it."""
+        lock = self._ledger.lock(key)
+        if lock is None:
+            return None
+        try:
+            self._ledger.set_aside(key)
+            result, failure = self._ledger.result(key), self._ledger.failure(key)
+        except BaseException:
+            lock.release()
+            raise
+        earlier = self._failures.get(key)
+        attempts = earlier.attempts if earlier else 0
+        failed_since = failure is not None and failure.attempts > attempts
+        if result is None and not failed_since:
+            return lock
+        lock.release()
+        del self._waiting[key]
+        self.finished += result is not None
+        self._show(failed=result is None)
+        return None
+
+    def _started(self, job: Job, locks: Sequence[Lock]) -> Job:
+        now = time.monotonic()
+        for cell, lock in zip(job.cells, locks, strict=True):
+            del self._waiting[cell.digest]
+            self._running[cell.digest] = _Running(lock, now, job)
+        self._progress.start_part(self._name(job))
+        return job
+
+    def _name(self, job: Job) -> str:
+        """What people call a job: `PPO on k-25, run 3`, or `…, and 9 more`."""
+        first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
+        return f"{first}, and {len(others)} more" if others else first
+
+    def _report(self, job: Job, done: int, total: int) -> None:
         share = done / total if total else 1.0
-        self._shares[cell.digest] = share
+        self._shares |= {cell.digest: share for cell in job.cells}
         note = f"{done:,} of {total:,} steps" if done < total else "evaluating"
-        self._progress.update_part(label(self._planned[cell.digest]), share, note)
+        self._progress.update_part(self._name(job), share, note)
 
     def _handle(self, outcome: Outcome) -> None:
         entry = outcome.entry
@@ -304,14 +406,21 @@ class _StudyRun:
             attempts = self._failures[key].attempts + 1
             entry = entry.model_copy(update={"attempts": attempts})
         self._ledger.write(entry, outcome.model)
-        lock, started = self._running.pop(key)
+        lock, started, job = self._running.pop(key)
         lock.release()
         if isinstance(entry, CellResult):
             self.finished += 1
-            self._estimator.observe(entry, time.monotonic() - started)
-        self._show_end(self._planned[key], failed=isinstance(entry, CellFailure))
+            self._estimator.observe(entry, (time.monotonic() - started) / len(job.cells))
+        if not any(cell.digest in self._running for cell in job.cells):
+            self._end(job)
+        self._show(failed=isinstance(entry, CellFailure))
 
-    def _show_end(self, planned: PlannedCell, *, failed: bool) -> None:
+    def _end(self, job: Job) -> None:
+        """Remove a job of which every cell has been written, and its state if it is of no use."""
+        self._progress.end_part(self._name(job))
+        if job.lanes is not None and job.lanes.state is not None:
+            self._ledger.remove_state(job.lanes.state)
+
+    def _show(self, *, failed: bool) -> None:
         self._failed += failed
-        self._progress.end_part(label(planned))
         self._progress.update(self.finished, f"{self._failed} failed" if self._failed else "")

@@ -1,7 +1,7 @@
-"""Fit a plan to the time available: other budgets, fewer seeds, some of its cells.
+"""Fit a plan to the time available: other budgets, fewer seeds, agents in JAX, some of its cells.
 
-Budgets are part of a cell's content, so a plan with another budget is another plan with its own
-digest and name. The selection of the cells to run now is not: `selected` works on any plan.
+Budgets and algorithms are part of a cell's content, so a plan with others is another plan with its
+own digest and name. The selection of the cells to run now is not: `selected` works on any plan.
 """
 
 from __future__ import annotations
@@ -10,9 +10,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.io import choice
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
+from sme_registry.spec.study import JAX, OFFLINE
+from sme_registry.studies.engine.algorithms import REFERENCE
+from sme_registry.training.algorithms import AGENTS
 
-_SUFFIX, _LONGEST_NAME = "-scaled", 64
+_LONGEST_NAME = 64
 _KINDS: dict[str, Callable[[PlannedCell], str]] = {
     "class": lambda planned: planned.class_name,
     "algorithm": lambda planned: planned.algorithm,
@@ -60,9 +64,47 @@ def scaled(
         elif steps is not None and budget != 0:  # 0: a reference, which does not train
             algorithm["steps"] = None
     plan = StudyPlan.from_dict(fields, "the scaled plan")
+    return _renamed(file, plan, "-scaled")
+
+
+def with_agents(file: StudyFile, agents: str) -> StudyFile:
+    """The plan with other implementations of its algorithms.
+
+    References and offline learners stay, and so do the names: the algorithm PPO of the new plan
+    uses `jax:PPO`.
+
+    Args:
+      file: the plan.
+      agents: "jax" for programs of JAX, "sb3" for Stable-Baselines3.
+
+    Returns:
+      The same file if nothing changes, otherwise one named `<name>-jax` or `<name>-sb3`.
+
+    Raises:
+      OptionError: it is neither.
+      UnknownNameError: JAX does not have an algorithm of the plan.
+      SpecError: JAX does not have a task of the plan, such as a team's.
+      MissingDependencyError: JAX is not installed.
+    """
+    choice("agents", agents, AGENTS)
+    fields = file.plan.to_dict()
+    for algorithm in fields["algorithms"]:
+        uses = algorithm["uses"]
+        if agents == "sb3":
+            algorithm["uses"] = uses.removeprefix(JAX)
+        elif not uses.startswith((REFERENCE, OFFLINE)):
+            from sme_registry.jax.run import full_name
+
+            algorithm["uses"] = full_name(uses, f"algorithm {algorithm['name']!r}: uses")
+    plan = StudyPlan.from_dict(fields, f"the plan with agents={agents}")
+    return _renamed(file, plan, f"-{agents}")
+
+
+def _renamed(file: StudyFile, plan: StudyPlan, suffix: str) -> StudyFile:
+    """The file with another plan, and a name that says so; the same file for the same plan."""
     if plan == file.plan:
         return file
-    name = file.name.removesuffix(_SUFFIX)[: _LONGEST_NAME - len(_SUFFIX)] + _SUFFIX
+    name = file.name.removesuffix(suffix)[: _LONGEST_NAME - len(suffix)] + suffix
     return file.model_copy(update={"name": name, "plan": plan, "digest": plan.digest})
 
 

@@ -1,0 +1,162 @@
+"""`Job`: what an executor runs at once, a cell alone or the lanes of one program.
+
+Cells that use `jax:…` and differ in nothing but task, seed and protocol are lanes of a program, if
+their tasks have the same shape. The number of its lanes follows from the whole plan: whatever was
+run before, is left out by `only` or runs elsewhere, a cell's program has the same number of lanes,
+and so its result the same bits.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import multiprocessing
+import os
+from collections import defaultdict
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sme_registry.io import to_json
+from sme_registry.spec import Cell, SMESpec
+from sme_registry.spec.study import JAX
+
+if TYPE_CHECKING:
+    from sme_registry.jax.task import Shape
+
+CPU = "cpu"
+_MOST_LANES = 10  # on a CPU: more save little time, and the last of a study would run alone longer
+_MOST_LANES_ELSEWHERE = 256
+# Elsewhere a step costs about as much for few lanes as for many, so shapes are padded to these.
+_BUCKETS = {"state_dim": (8, 64), "action_dim": (4, 16)}
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """How the cells of a job run as lanes of one program.
+
+    Attributes:
+      count: its lanes; those without a cell repeat the first.
+      shape: to which the tasks are padded.
+      device: "cpu", "gpu" or "tpu"; None for JAX's default.
+      state: the file of its state, written every few minutes; None to write none.
+      processes: that evaluate the trained policies.
+    """
+
+    count: int
+    shape: Shape | None = None
+    device: str | None = None
+    state: Path | None = None
+    processes: int = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """Cells that run together: any number as lanes of a program, or a single one by itself."""
+
+    cells: tuple[Cell, ...]
+    lanes: Lanes | None = None
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def uses_jax(cell: Cell) -> bool:
+    """Whether a cell is a lane of a program."""
+    return cell.uses.startswith(JAX)
+
+
+class Programs:
+    """Which cells of a plan share a program, and how many lanes it has.
+
+    Args:
+      cells: all cells of the plan; those that do not use JAX are left out.
+      platform: where they run: "cpu", "gpu" or "tpu".
+      device: the same as it was asked for; None for JAX's default.
+      most_lanes: of a program; None for a number that suits the platform.
+    """
+
+    def __init__(
+        self,
+        cells: Iterable[Cell],
+        platform: str = CPU,
+        device: str | None = None,
+        most_lanes: int | None = None,
+    ) -> None:
+        self.platform, self._device = platform, device
+        self._most = most_lanes or (_MOST_LANES if platform == CPU else _MOST_LANES_ELSEWHERE)
+        self._shapes: dict[Hashable, dict[str, Shape]] = defaultdict(dict)
+        for cell in filter(uses_jax, cells):
+            self._shapes[self.group(cell)][cell.digest] = _shape(cell.spec)
+
+    @property
+    def one_at_a_time(self) -> bool:
+        """Whether a second program would only slow the first one down."""
+        return self.platform != CPU
+
+    def lanes(self, cell: Cell) -> int:
+        """The number of lanes of a cell's program: all programs of a group have the same."""
+        size = len(self._shapes[self.group(cell)])
+        return math.ceil(size / math.ceil(size / self._most))
+
+    def program(self, cell: Cell, state: Path | None = None) -> Lanes:
+        """The program of a cell."""
+        from sme_registry.jax.task import Shape
+
+        shape = Shape.covering(self._shapes[self.group(cell)].values())
+        processes = available_cores() if self.one_at_a_time else 1
+        return Lanes(self.lanes(cell), shape, self._device, state, processes)
+
+    def group(self, cell: Cell) -> Hashable:
+        """What the cells of a program have in common."""
+        spec = cell.spec
+        return (
+            cell.uses,
+            to_json(dict(sorted(cell.hyperparameters.items()))),
+            cell.action_range,
+            cell.steps,
+            cell.evaluations,
+            cell.evaluation_episodes,
+            # Rewards that change no observation and end no episode are computed in another way.
+            spec.k == 1 and spec.D == 0,
+            _shape(spec) if self.platform == CPU else _bucket(spec),
+        )
+
+
+def platform_of(device: str | None) -> str:
+    """The platform of a device, or of JAX's default: "cpu", "gpu" or "tpu".
+
+    Raises:
+      OptionError: there is no such device.
+      MissingDependencyError: JAX is not installed.
+    """
+    if not importlib.metadata.entry_points(group="jax_plugins"):
+        return _platform(device)
+    # In a process of its own: to look for a GPU takes most of its memory.
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_platform, (device,))
+
+
+def _platform(device: str | None) -> str:
+    from sme_registry.jax.device import find_device
+
+    return str(find_device(device).platform)
+
+
+def _shape(spec: SMESpec) -> Shape:
+    from sme_registry.jax.task import Shape
+
+    return Shape.of(spec)
+
+
+def _bucket(spec: SMESpec) -> Hashable:
+    widths = (
+        next((width for width in widths if getattr(spec, name) <= width), getattr(spec, name))
+        for name, widths in _BUCKETS.items()
+    )
+    return *widths, spec.complexity > 1, _shape(spec).hidden_width

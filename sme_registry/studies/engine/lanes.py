@@ -1,0 +1,266 @@
+"""`run_lanes`: cells that use `jax:…` as lanes of one program, to their results.
+
+What a lane learns, when it is evaluated and from which states are as in `cell.run_cell`, so curve,
+regret and report mean the same. A lane whose weights are no longer finite fails, and the others go
+on. The state of the program is written every few minutes: after a kill, it goes on from there with
+the same bits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.evaluation import evaluate
+from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.evaluation.rollouts import start_states
+from sme_registry.spec import Cell
+from sme_registry.studies.engine.jobs import CPU, Lanes
+from sme_registry.studies.engine.program_state import Arrays, read_header, read_state, write_state
+from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
+from sme_registry.training.record import versions_for
+
+if TYPE_CHECKING:
+    from sme_registry.jax.program import Evaluation, Program, StepLog
+
+Ended = tuple[Cell, CellResult | PolicyError, bytes | None]
+"""A cell, its result or the reason why it has none, and its model's .zip if that is kept."""
+
+SECONDS_BETWEEN_STATES = 180.0
+_TRAINING, _EVALUATION = 0, 1  # what a program's time is for
+
+
+def run_lanes(
+    cells: Sequence[Cell],
+    lanes: Lanes,
+    progress: Callable[[int, int], None],
+    keep_models: bool = False,
+) -> Iterator[Ended]:
+    """Train cells as lanes of one program, and evaluate them as `run_cell` does.
+
+    Args:
+      cells: of one group; see `jobs.Programs`.
+      lanes: the program.
+      progress: called with the steps done and the steps in all.
+      keep_models: whether to give each model as a .zip of Stable-Baselines3.
+
+    Yields:
+      Each cell as it ends.
+
+    Raises:
+      OptionError, MissingDependencyError: the algorithm, a hyperparameter or the device does not
+        exist here, or a model cannot be kept.
+      SpecError: JAX does not have one of the tasks.
+    """
+    run = _Run(cells, lanes, progress)
+    run.train()
+    yield from run.results(keep_models)
+
+
+class _Run:
+    """A program, the cells of its lanes, and the records of what they did."""
+
+    def __init__(
+        self, cells: Sequence[Cell], lanes: Lanes, progress: Callable[[int, int], None]
+    ) -> None:
+        from sme_registry.jax.run import new_program
+        from sme_registry.jax.task import Shape
+
+        cell = self._cell = cells[0]
+        self._state, self._progress = lanes.state, progress
+        self._own = {cell.digest: cell for cell in cells}
+        self._keys = _keys_of_lanes(list(self._own), lanes.state)
+        # Of a lane whose cell ended elsewhere, only the place remains.
+        self._cells = [self._own.get(key, cell) for key in self._keys]
+        self._program: Program = new_program(
+            cell.uses,
+            [each.spec for each in self._cells],
+            [each.seed for each in self._cells],
+            hyperparameters=cell.hyperparameters,
+            action_range=cell.action_range,
+            steps=cell.steps,
+            lanes=lanes.count,
+            shape=lanes.shape,
+            device=lanes.device,
+        )
+        self._made = ProgramResult(
+            device=str(self._program.device.device_kind),
+            lanes=lanes.count,
+            shape=lanes.shape or Shape.of(cell.spec),
+        )
+        self._versions = versions_for(cell.uses)
+        n = cell.evaluations
+        self._due = [round(cell.steps * k / n) for k in range(1, n + 1)]
+        self._clock = time.process_time if self._program.device.platform == CPU else time.monotonic
+        self._mark = self._clock()
+        # Saved with the program's state. `failed_at`: the step at which a lane was seen to have
+        # failed, or −1.
+        self._records: Arrays = {
+            "rows": np.zeros((n, 5, lanes.count)),  # the fields of a `LearningCurve`
+            "regret": np.zeros(lanes.count),  # over all steps of training
+            "failed_at": np.full(lanes.count, -1),
+            "seconds": np.zeros(2),
+        }
+        self._restore()
+        self._last_state = time.monotonic()
+
+    def train(self) -> None:
+        """Go on to the end of the budget, with every evaluation."""
+        from sme_registry.jax.run import run
+
+        run(
+            self._program,
+            due=self._due,
+            start_states=self._start_states,
+            on_log=self._on_log,
+            on_evaluation=self._on_evaluation,
+            after_piece=self._after_piece,
+        )
+        self._note_failures()
+
+    def results(self, keep_models: bool) -> Iterator[Ended]:
+        """Evaluate the trained policies within and out of distribution."""
+        for lane, key in enumerate(self._keys):
+            if key not in self._own:
+                continue
+            cell, step = self._own[key], int(self._records["failed_at"][lane])
+            if step >= 0:
+                yield cell, _not_finite(step), None
+                continue
+            start = self._clock()
+            report = evaluate(
+                self._program.policy(lane),
+                cell.spec,
+                cell.protocol,
+                action_range=cell.action_range,
+                name=cell.uses,
+            )
+            result = CellResult(
+                key=key,
+                cell=cell,
+                curve=self._curve(lane),
+                report=report,
+                online_regret=self._online_regret(lane),
+                program=self._made,
+                timing=self._timing(self._clock() - start),
+                versions=self._versions,
+            )
+            yield cell, result, self._model(lane) if keep_models else None
+
+    def _start_states(self, k: int) -> list[Any]:
+        return [
+            start_states(cell.seed, k, cell.evaluation_episodes, cell.spec.state_dim)
+            for cell in self._cells
+        ]
+
+    def _on_log(self, log: StepLog) -> None:
+        self._records["regret"] += log.regret.sum(axis=0)
+        self._spend(_TRAINING)
+
+    def _on_evaluation(self, k: int, step: int, done: Evaluation) -> None:
+        steps = done.length.sum(axis=1)
+        self._records["rows"][k] = (
+            np.full(len(steps), step),
+            done.episode_return.mean(axis=1),
+            done.regret.sum(axis=1) / steps,
+            done.similarity.sum(axis=1) / steps,
+            done.length.mean(axis=1),
+        )
+        self._spend(_EVALUATION)
+
+    def _after_piece(self) -> None:
+        self._note_failures()
+        if time.monotonic() - self._last_state >= SECONDS_BETWEEN_STATES:
+            self._save()
+            self._last_state = time.monotonic()
+        self._progress(min(self._program.steps, self._cell.steps), self._cell.steps)
+
+    def _note_failures(self) -> None:
+        failed_at = self._records["failed_at"]
+        failed_at[self._program.failed() & (failed_at < 0)] = self._program.steps
+
+    def _spend(self, purpose: int) -> None:
+        """Count the time since the last call."""
+        now = self._clock()
+        self._records["seconds"][purpose] += now - self._mark
+        self._mark = now
+
+    def _curve(self, lane: int) -> LearningCurve:
+        if not self._due:
+            return LearningCurve()
+        steps, *others = self._records["rows"][:, :, lane].T.tolist()
+        columns: dict[str, Any] = dict(
+            zip(list(LearningCurve.model_fields)[1:], others, strict=False)
+        )
+        return LearningCurve(steps=tuple(int(step) for step in steps), **columns)
+
+    def _model(self, lane: int) -> bytes:
+        """A lane's model as Stable-Baselines3 saves it."""
+        from sme_registry.training.sb3_models import sb3_model
+
+        cell = self._cells[lane]
+        model = sb3_model(
+            cell.uses,
+            self._program.weights(lane),
+            cell.spec,
+            seed=cell.seed,
+            action_range=cell.action_range,
+            hyperparameters=cell.hyperparameters,
+            steps=self._program.steps,
+        )
+        return saved_sb3(model)
+
+    def _online_regret(self, lane: int) -> float | None:
+        steps = self._program.steps
+        return float(self._records["regret"][lane]) / steps if steps else None
+
+    def _timing(self, at_the_end: float) -> Timing:
+        """A cell's share of the program's time, and that of its evaluation at the end."""
+        training, evaluation = (self._records["seconds"] / len(self._own)).tolist()
+        return Timing(
+            total=training + evaluation + at_the_end,
+            training=training,
+            environment=0.0,
+            evaluation=evaluation + at_the_end,
+            steps_per_second=self._program.steps / training if training else 0.0,
+        )
+
+    def _header(self) -> dict[str, Any]:
+        """What a state must have been made with to be gone on from."""
+        program = self._made.to_dict()
+        return {"cells": self._keys, "program": program, "versions": self._versions}
+
+    def _save(self) -> None:
+        if self._state is None:
+            return
+        arrays = {f"program/{name}": array for name, array in self._program.save().items()}
+        arrays |= {f"records/{name}": array for name, array in self._records.items()}
+        with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
+            write_state(self._state, self._header(), arrays)
+
+    def _restore(self) -> None:
+        arrays = None if self._state is None else read_state(self._state, self._header())
+        if arrays is None:
+            return
+        self._records = {name: arrays.pop(f"records/{name}") for name in self._records}
+        self._program.restore({name.removeprefix("program/"): a for name, a in arrays.items()})
+
+
+def _keys_of_lanes(keys: list[str], state: Path | None) -> list[str]:
+    """The cells of the lanes, in order: those of a saved state that includes all of `keys`."""
+    saved = None if state is None else read_header(state)
+    in_state: list[str] = [] if saved is None else saved["cells"]
+    return in_state if set(keys) <= set(in_state) else keys
+
+
+def _not_finite(step: int) -> PolicyError:
+    return PolicyError(
+        f"its weights were not finite after step {step:,}. Choose a lower learning_rate, or look "
+        "at the other runs of this algorithm."
+    )

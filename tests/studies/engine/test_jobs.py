@@ -1,0 +1,205 @@
+"""Which cells are lanes of one program, and how a run claims them beside others."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.studies.engine.executors import Outcome, failed
+from sme_registry.studies.engine.jobs import Job, Programs
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.program_state import write_state
+from sme_registry.studies.engine.runner import run_study
+
+pytest.importorskip("jax")
+
+
+def plan_file(seeds: int = 3, **fields: Any) -> StudyFile:
+    """Two classes of one group and a third that cannot share their program, and a reference."""
+    small = {"state_dim": 2, "action_dim": 2}
+    plan = StudyPlan.from_dict(
+        {
+            "classes": [
+                {"name": "small", "setting": small, "seeds": [1, 2]},
+                {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
+                {"name": "delayed", "setting": small | {"k": 5}, "seeds": [1, 2]},
+            ],
+            "algorithms": [
+                {"name": "PPO", "uses": "jax:PPO"},
+                {"name": "linear", "uses": "reference:linear", "steps": 0},
+            ],
+            "seeds": seeds,
+            "evaluations": 0,
+            **fields,
+        }
+    )
+    return StudyFile(name="lanes", digest=plan.digest, plan=plan)
+
+
+def cells(file: StudyFile, *classes: str) -> list[Cell]:
+    """Those that use JAX, in the plan's order."""
+    return [
+        planned.cell
+        for planned in file.plan.cells
+        if planned.algorithm == "PPO" and (not classes or planned.class_name in classes)
+    ]
+
+
+@dataclass
+class Refusing:
+    """An executor that records jobs, and fails their cells."""
+
+    workers: int = 1
+    jobs: list[Job] = field(default_factory=list)
+    meanwhile: Any = None  # called with the number of jobs so far
+
+    def map(self, jobs: Iterator[Job | None], progress: Any) -> Iterator[Outcome]:
+        for job in jobs:
+            assert job is not None
+            self.jobs.append(job)
+            if self.meanwhile is not None:
+                self.meanwhile(len(self.jobs))
+            yield from (failed(cell, "refused", "") for cell in job.cells)
+
+
+def claimed(file: StudyFile, study: Path, **options: Any) -> list[Job]:
+    """The jobs of a run, those of a program first."""
+    executor = Refusing(meanwhile=options.pop("meanwhile", None))
+    run_study(
+        file, study, executor=executor, console=Console(file=io.StringIO()), device="cpu", **options
+    )
+    return sorted(executor.jobs, key=lambda job: job.lanes is None)
+
+
+def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not() -> None:
+    file = plan_file()
+    programs = Programs(cells(file))
+    small, gated, delayed = (cells(file, name)[0] for name in ("small", "gated", "delayed"))
+    assert programs.group(small) == programs.group(gated) == programs.group(cells(file, "small")[2])
+    assert programs.group(small) != programs.group(delayed)
+    for change in (
+        {"steps": 10},
+        {"uses": "jax:TD3"},
+        {"hyperparameters": {"n_steps": 8}},
+        {"action_range": "unit"},
+        {"evaluations": 3},
+        {"evaluation_episodes": 3},
+        {"spec": small.spec.model_copy(update={"state_dim": 3})},
+        {"spec": small.spec.model_copy(update={"complexity": 2})},
+    ):
+        assert programs.group(small.model_copy(update=change)) != programs.group(small), change
+    for change in ({"seed": 9}, {"spec": small.spec.model_copy(update={"horizon": 7})}):
+        assert programs.group(small.model_copy(update=change)) == programs.group(small), change
+
+
+@pytest.mark.parametrize(
+    ("seeds", "most", "lanes"), [(3, 10, 6), (5, 10, 10), (6, 10, 6), (13, 10, 9), (3, 4, 3)]
+)
+def test_the_programs_of_a_group_have_equally_many_lanes_at_most_the_limit(
+    seeds: int, most: int, lanes: int
+) -> None:
+    file = plan_file(seeds)
+    programs = Programs(cells(file), most_lanes=most)
+    assert {programs.lanes(cell) for cell in cells(file, "small", "gated")} == {lanes}
+
+
+def test_elsewhere_than_on_a_cpu_few_shapes_cover_the_ablations() -> None:
+    settings = [
+        *({"state_dim": S} for S in (2, 4, 8, 16, 32, 64)),
+        *({"action_dim": A} for A in (1, 2, 4, 8, 16)),
+        *({"complexity": L} for L in (2, 5, 10, 50)),
+    ]
+    classes = [{"name": str(i), "setting": s, "seeds": [1]} for i, s in enumerate(settings)]
+    file = plan_file(seeds=1, classes=classes)
+    everywhere, gpu = Programs(cells(file)), Programs(cells(file), platform="gpu")
+    assert (everywhere.one_at_a_time, gpu.one_at_a_time) == (False, True)
+    shapes = {gpu.program(cell).shape for cell in cells(file)}
+    assert shapes == {(8, 4, 1, 0), (64, 4, 1, 0), (8, 16, 1, 0), (8, 4, 50, 64)}
+    assert len({everywhere.program(cell).shape for cell in cells(file)}) == 14
+
+
+def test_a_run_claims_the_cells_of_one_program_at_a_time_and_references_alone(
+    tmp_path: Path,
+) -> None:
+    file = plan_file()
+    jobs = claimed(file, tmp_path)
+    *programs, first, _ = jobs[:2], *jobs[2:]
+    together, delayed = programs[0]
+    assert [cell.digest for cell in together.cells] == [
+        cell.digest for cell in cells(file, "small", "gated")
+    ]
+    assert list(delayed.cells) == cells(file, "delayed")
+    assert together.lanes is not None
+    assert (together.lanes.count, together.lanes.shape) == (6, (2, 2, 1, 0))
+    assert first.lanes is None
+    assert {len(job.cells) for job in jobs[2:]} == {1}
+
+
+def test_the_number_of_lanes_depends_neither_on_a_selection_nor_on_what_is_done(
+    tmp_path: Path,
+) -> None:
+    file = plan_file()
+    (job,) = claimed(file, tmp_path, only=["class=gated", "algorithm=PPO"])
+    assert list(job.cells) == cells(file, "gated")
+    assert job.lanes is not None
+    assert job.lanes.count == 6
+    jobs = claimed(file, tmp_path, only=["algorithm=PPO"])
+    assert list(jobs[0].cells) == cells(file, "small")
+    assert {job.lanes.count for job in jobs if job.lanes} == {6, 3}
+
+
+def test_cells_that_another_run_holds_are_left_to_it_and_the_rest_to_others(
+    tmp_path: Path,
+) -> None:
+    file = plan_file(seeds=4)
+    of_group = cells(file, "small", "gated")
+    ledger = Ledger(tmp_path)
+    with contextlib.ExitStack() as held:
+        theirs = [ledger.lock(cell.digest) for cell in of_group[1:3]]
+        free: list[bool] = []
+
+        def meanwhile(jobs: int) -> None:
+            if jobs == 1:
+                others = [ledger.is_running(cell.digest) for cell in of_group[6:]]
+                free.extend(not running for running in others)
+            for lock in theirs:
+                if lock is not None:
+                    lock.release()
+
+        held.callback(lambda: [lock.release() for lock in theirs if lock])
+        first, *_ = claimed(file, tmp_path, only=["algorithm=PPO"], lanes=4, meanwhile=meanwhile)
+    assert list(first.cells) == [of_group[0], *of_group[3:6]]
+    assert free == [True, True]
+
+
+def test_while_another_run_claims_a_program_this_one_waits(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path)
+    claiming = ledger.claim_lock()
+    assert claiming is not None
+    assert ledger.claim_lock() is None
+    claiming.release()
+    assert ledger.claim_lock() is not None
+
+
+def test_a_saved_state_decides_which_cells_go_on_together(tmp_path: Path) -> None:
+    file = plan_file(seeds=4)
+    of_group = cells(file, "small", "gated")
+    ledger = Ledger(tmp_path)
+    keys = [of_group[i].digest for i in (6, 0, 3)]
+    saved = ledger.state_path(keys)
+    write_state(saved, {"cells": keys}, {})
+    (tmp_path / "states" / "broken.npz").write_bytes(b"PK")
+    first, second, *_ = claimed(file, tmp_path, only=["algorithm=PPO"])
+    assert {cell.digest for cell in first.cells} == set(keys)
+    assert first.lanes is not None
+    assert first.lanes.state == saved
+    assert list(second.cells) == [of_group[i] for i in (1, 2, 4, 5, 7)]
+    assert saved.exists()  # a retry goes on from it

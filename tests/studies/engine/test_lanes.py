@@ -1,0 +1,256 @@
+"""Cells that use JAX: as in `run_cell`, in one program, resumed with the same bits."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sme_registry.evaluation import evaluate
+from sme_registry.spec import StudyFile, StudyPlan
+from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.executors import InProcess
+from sme_registry.studies.engine.jobs import Job
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.program_state import read_header, read_state, write_state
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.engine.runner import run_study
+
+pytest.importorskip("jax")
+pytest.importorskip("stable_baselines3")
+
+ROOT = Path(__file__).resolve().parents[3]
+STEPS = 96
+
+# Kills itself after the first of three rollouts, when its state has been written.
+KILLED = """
+import os, signal, sys
+from tests.studies.engine import test_lanes
+from sme_registry.studies.engine import lanes
+
+lanes.SECONDS_BETWEEN_STATES = 0.0
+test_lanes.ran(sys.argv[1], on_steps=lambda done: os.kill(os.getpid(), signal.SIGKILL))
+"""
+
+
+def plan_file(uses: str = "jax:PPO", **fields: Any) -> StudyFile:
+    """Two seeds on two classes of one group, and a reference."""
+    small = {"state_dim": 2, "action_dim": 2, "horizon": 20}
+    settings = {"policy_kwargs": {"net_arch": [8, 8]}} | (
+        {"n_steps": 32, "batch_size": 16, "n_epochs": 2} if "PPO" in uses else {"batch_size": 16}
+    )
+    plan = StudyPlan.from_dict(
+        {
+            "classes": [
+                {"name": "small", "setting": small, "seeds": [1, 2]},
+                {"name": "gated", "setting": small | {"r_min": 0.5}, "seeds": [1, 2]},
+            ],
+            "algorithms": [
+                {"name": "agent", "uses": uses, "hyperparameters": settings},
+                {"name": "linear", "uses": "reference:linear", "steps": 0},
+            ],
+            "seeds": 2,
+            "steps": STEPS,
+            "evaluations": 4,
+            "evaluation_episodes": 2,
+            "protocol": {"states_per_region": 20, "epsilons": [1.0]},
+        }
+        | fields
+    )
+    return StudyFile(name="lanes", digest=plan.digest, plan=plan)
+
+
+@dataclass(frozen=True)
+class Watched(InProcess):
+    """Says how far a program is."""
+
+    on_steps: Any = None
+
+    def map(self, jobs: Iterator[Job | None], progress: Any) -> Any:
+        def report(job: Job, done: int, total: int) -> None:
+            progress(job, done, total)
+            if job.lanes is not None:
+                self.on_steps(done)
+
+        return super().map(jobs, report)
+
+
+def ran(study: str | Path, file: StudyFile | None = None, **options: Any) -> Any:
+    """The status of a run in this process, of agents alone."""
+    on_steps = options.pop("on_steps", lambda done: None)
+    keep = options.pop("keep_models", False)
+    options = {"only": ["algorithm=agent"], "device": "cpu"} | options
+    return run_study(
+        file or plan_file(),
+        study,
+        executor=options.pop("executor", Watched(keep_models=keep, on_steps=on_steps)),
+        console=Console(file=io.StringIO()),
+        keep_models=keep,
+        **options,
+    )
+
+
+def numbers(study: Path) -> dict[str, dict[str, Any]]:
+    """All results but their times, and the versions of what else this process has loaded."""
+    return {
+        key: json.loads(
+            result.model_copy(
+                update={"report": result.report.model_copy(update={"versions": {}})}
+            ).model_dump_json(exclude={"timing"})
+        )
+        for key, result in Ledger(study).results().items()
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study that was never interrupted, with its models."""
+    study = tmp_path_factory.mktemp("whole")
+    status = ran(study, keep_models=True, only=())
+    assert status.count("done") == 8, status.failed
+    return study
+
+
+def agents(study: Path) -> list[CellResult]:
+    results = Ledger(study).results()
+    cells = (planned.cell.digest for planned in plan_file().plan.cells)
+    return [results[key] for key in cells if results[key].program is not None]
+
+
+def test_a_result_says_in_what_program_it_was_made_and_a_reference_s_does_not(whole: Path) -> None:
+    results = Ledger(whole).results().values()
+    for result in results:
+        document = result.to_dict()
+        if result.cell.uses == "jax:PPO":
+            assert document["program"] == {"device": "cpu", "lanes": 4, "shape": [2, 2, 1, 0]}
+            assert {"jax", "jaxlib"} <= result.versions.keys()
+        else:
+            assert "program" not in document
+        assert CellResult.from_dict(document) == result
+    assert len(agents(whole)) == 4
+    assert not list((whole / "states").glob("*"))
+
+
+def test_curve_and_regret_mean_what_they_mean_in_any_cell(whole: Path) -> None:
+    for result in agents(whole):
+        curve = result.curve
+        assert curve.steps == (24, 48, 72, 96)
+        assert curve.length == (20.0,) * 4
+        np.testing.assert_allclose(curve.episode_return, 20 * (1 - np.array(curve.regret)))
+        assert all(0.5 < similarity < 1.0 for similarity in curve.similarity)
+        assert result.online_regret is not None
+        assert 0.5 < result.online_regret < 1.0
+        assert result.timing.total > 0
+    assert len({result.curve.episode_return for result in agents(whole)}) == 4
+    assert len({result.online_regret for result in agents(whole)}) == 4
+
+
+def test_a_kept_model_is_one_of_stable_baselines3_and_scores_the_same(whole: Path) -> None:
+    result = agents(whole)[1]
+    model = Ledger(whole).model_path(result.key)
+    report = evaluate(str(model), result.cell.spec, result.cell.protocol)
+    for ours, theirs in zip(result.report.regions, report.regions, strict=True):
+        assert ours.similarity == pytest.approx(theirs.similarity, abs=1e-6)
+
+
+def test_after_kill_9_a_program_goes_on_from_its_state_with_the_same_bits(
+    whole: Path, tmp_path: Path
+) -> None:
+    process = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    ledger = Ledger(tmp_path)
+    (state,) = (tmp_path / "states").glob("*.npz")
+    assert not ledger.results()
+    steps: list[int] = []
+    status = ran(tmp_path, on_steps=steps.append)
+    assert status.count("done") == 4
+    assert steps[0] == 64  # after the next rollout; from the beginning, it would be 32
+    assert not state.exists()
+    uninterrupted = numbers(whole)
+    assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
+
+
+def saved(study: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The state that a run leaves that is interrupted after its first rollout."""
+    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+
+    def interrupt(done: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="Run the same command to continue"):
+        ran(study, on_steps=interrupt)
+    (state,) = (study / "states").glob("*.npz")
+    monkeypatch.undo()
+    return state
+
+
+def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = saved(tmp_path, monkeypatch)
+    header = read_header(state)
+    assert header is not None
+    arrays = read_state(state, header)
+    assert arrays is not None
+    for name in arrays:
+        if "action_net.bias" in name and "weights" in name:
+            arrays[name][1] = np.nan
+    write_state(state, header, arrays)
+    status = ran(tmp_path)
+    assert (status.count("done"), status.count("failed")) == (3, 1)
+    (failure,) = Ledger(tmp_path).failures().values()
+    assert failure.key == header["cells"][1]
+    assert failure.error.startswith("PolicyError: its weights were not finite after step 64.")
+    uninterrupted = numbers(whole)
+    assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
+
+
+def test_a_state_of_other_versions_is_not_used(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = saved(tmp_path, monkeypatch)
+    header = read_header(state)
+    assert header is not None
+    arrays = read_state(state, header)
+    assert arrays is not None
+    arrays["records/regret"] += 1000.0  # would show in the results
+    write_state(state, header | {"versions": {"jax": "0"}}, arrays)
+    assert ran(tmp_path).count("done") == 4
+    assert numbers(tmp_path).items() <= numbers(whole).items()
+
+
+def test_a_cell_by_itself_is_a_program_of_one_lane(tmp_path: Path) -> None:
+    cell = plan_file(steps=0, evaluations=0).plan.cells[0].cell
+    result = run_cell(cell, model_path=tmp_path / "model.zip")
+    assert result.program is not None
+    assert result.program.lanes == 1
+    assert (result.online_regret, result.curve.steps) == (None, ())
+    report = evaluate(str(tmp_path / "model.zip"), cell.spec, cell.protocol)
+    assert report.wd_regret == pytest.approx(result.report.wd_regret, abs=1e-6)
+
+
+def test_processes_give_the_same_bits(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    status = ran(tmp_path, executor="processes", jobs=1)
+    assert status.count("done") == 4
+    assert numbers(tmp_path).items() <= numbers(whole).items()
