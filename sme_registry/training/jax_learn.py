@@ -89,7 +89,8 @@ def learn(
             if log.is_checkpoint_due() or program.steps >= program.budget:
                 save()
 
-        jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=_PIECE)
+        piece = min(_PIECE, record.checkpoint_every)
+        jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=piece)
         _check_finite(program, folder)
     board.close()
     model = sb3_model(

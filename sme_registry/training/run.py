@@ -259,9 +259,11 @@ def _with_jax_algorithm(
     """The same for an agent in JAX."""
     require_sb3()  # `model.zip` is a model of it
     from sme_registry.jax.device import find_device
+    from sme_registry.jax.run import full_name as known_name
     from sme_registry.jax.run import settings_of
     from sme_registry.jax.task import check_supported
 
+    known_name(uses, "algorithm")
     check_supported(plan.spec)
     settings_of(uses, settings)
     if num_envs not in (None, 1):

@@ -1,0 +1,252 @@
+"""Runs of agents in JAX: the same folder, exact resumption, and models of Stable-Baselines3."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("jax")
+
+from sme_registry import SMESpec, evaluate
+from sme_registry.errors import (
+    MissingDependencyError,
+    OptionError,
+    PolicyError,
+    SMEError,
+)
+from sme_registry.evaluation import load_sb3
+from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.export import export_onnx
+from sme_registry.jax.run import new_program
+from sme_registry.training import RunRecord, TrainingResult, checkpoint, train
+from sme_registry.training.episodes import read_episodes
+from sme_registry.training.sb3_models import sb3_model
+from tests.training.runs import PROTOCOL, TINY
+
+NARROW = {"policy_kwargs": {"net_arch": [8]}}
+PPO = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, **NARROW}
+
+
+def jax_run(folder: Path, **changes: Any) -> TrainingResult:
+    settings: dict[str, Any] = {
+        "algorithm": "PPO",
+        "agents": "jax",
+        "steps": 120,
+        "hyperparameters": PPO,
+        "protocol": PROTOCOL,
+        "checkpoint_every": 50,
+        "progress": False,
+    }
+    return train(TINY, folder=folder, **{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+    return jax_run(tmp_path_factory.mktemp("jax"))
+
+
+def test_a_run_writes_the_same_files(run: TrainingResult) -> None:
+    names = {path.name for path in run.folder.iterdir()}
+    assert names >= {"run.json", "episodes.csv", "checkpoint.zip", "model.zip", "evaluation.json"}
+    assert {path.name for path in run.figures} <= names
+    record = RunRecord.read(run.folder)
+    assert record == run.record
+    assert (record.algorithm, record.device, record.status) == ("jax:PPO", "cpu", "finished")
+    assert (record.steps, record.steps_done, record.episodes) == (120, 128, 6)
+    assert record.hyperparameters == PPO
+    assert {"jax", "jaxlib", "torch", "stable_baselines3"} <= record.versions.keys()
+    assert run.report.policy == "PPO"
+
+
+def test_episodes_are_complete_and_their_regret_is_exact(run: TrainingResult) -> None:
+    assert [episode.step for episode in run.episodes] == [20, 40, 60, 80, 100, 120]
+    for episode in read_episodes(run.folder / "episodes.csv"):
+        # With k = 1 and r_min = 0 the return is the horizon less the sum of regrets.
+        assert episode.episode_return == pytest.approx(20 * (1 - episode.regret), abs=1e-6)
+        assert (episode.length, episode.terminated) == (20, 0)
+        assert 0 < episode.similarity < 1
+
+
+def test_tensorboard_has_the_regret(run: TrainingResult) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(run.folder / "tensorboard")).Reload()
+    (first, *_) = events.Scalars("rollout/regret")
+    finished = [episode.regret for episode in run.episodes[:3]]  # in the first piece, 64 steps
+    assert first.value == pytest.approx(np.mean(finished), abs=1e-6)
+
+
+def test_the_model_is_one_of_stable_baselines3(run: TrainingResult, tmp_path: Path) -> None:
+    model = load_sb3(run.model_path)
+    assert (type(model).__name__, model.num_timesteps, model.n_steps) == ("PPO", 128, 32)
+    assert evaluate(run.model_path, TINY, PROTOCOL, name="PPO").regions == run.report.regions
+    pytest.importorskip("onnxruntime")
+    exported = export_onnx(run.model_path, TINY, tmp_path / "policy.onnx")
+    of_onnx = evaluate(exported, TINY, PROTOCOL).regions[0].similarity
+    assert of_onnx == pytest.approx(run.report.regions[0].similarity, abs=1e-6)
+
+
+@pytest.mark.parametrize("action_range", ["symmetric", "unit"])
+@pytest.mark.parametrize("name", ["PPO", "TD3", "SAC"])
+def test_the_model_predicts_the_same_actions(name: str, action_range: Any, tmp_path: Path) -> None:
+    program = new_program(
+        f"jax:{name}", [TINY], [3], hyperparameters=NARROW, action_range=action_range, steps=64
+    )
+    model = sb3_model(
+        f"jax:{name}",
+        program.weights(0),
+        TINY,
+        seed=3,
+        action_range=action_range,
+        hyperparameters=NARROW,
+        steps=64,
+    )
+    (tmp_path / "model.zip").write_bytes(saved_sb3(model))
+    observations = np.random.default_rng(0).random((50, 4), np.float32)
+    weights = {name: weight[0] for name, weight in program.state.weights.items()}
+    acted = program.act(program.settings, weights, observations, action_range == "symmetric")
+    low = -1.0 if action_range == "symmetric" else 0.0
+    expected = np.clip(np.asarray(acted), low, 1.0)
+    for loaded in (model, load_sb3(tmp_path / "model.zip")):
+        predicted, _ = loaded.predict(observations, deterministic=True)
+        np.testing.assert_allclose(predicted, expected, rtol=0, atol=1e-6)
+    own = model.policy.state_dict()
+    assert all(np.array_equal(own[name].numpy(), w) for name, w in weights.items() if name in own)
+
+
+def interrupted(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> None:
+    """A run that Ctrl-C ends while it writes its first checkpoint."""
+    with monkeypatch.context() as patch:
+        save = checkpoint.save_arrays
+
+        def save_and_interrupt(*arguments: Any) -> None:
+            save(*arguments)
+            signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
+
+        patch.setattr(checkpoint, "save_arrays", save_and_interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            jax_run(folder, **changes)
+
+
+def without_times(result: TrainingResult) -> list[Any]:
+    rows = read_episodes(result.folder / "episodes.csv")
+    return [episode._replace(wall_seconds=0.0) for episode in rows]
+
+
+def same_bits(one: TrainingResult, other: TrainingResult) -> None:
+    assert without_times(one) == without_times(other)
+    assert one.report.regions == other.report.regions
+    with np.load(one.folder / checkpoint.FILE) as a, np.load(other.folder / checkpoint.FILE) as b:
+        assert a.files == b.files
+        assert all(np.array_equal(a[name], b[name]) for name in a.files)
+    weights, others = (load_sb3(each.model_path).policy.state_dict() for each in (one, other))
+    assert all((weights[name] == others[name]).all() for name in weights)
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(
+    run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    interrupted(folder, monkeypatch)
+    assert not (folder / "model.zip").exists()
+    with pytest.raises(OptionError, match="Use --resume"):
+        jax_run(folder)
+    shutil.copytree(folder, tmp_path / "longer")
+
+    resumed = jax_run(folder, resume=True, hyperparameters={})
+    assert resumed.record.sessions == 2
+    # The checkpoint came after 64 steps, in the middle of the fourth episode.
+    assert resumed.episodes[3].step == 80
+    same_bits(resumed, run)
+    assert jax_run(tmp_path / "longer", resume=True, steps=150).record.steps_done == 160
+
+
+def test_a_checkpoint_that_is_damaged_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tmp_path / "run", monkeypatch)
+    (tmp_path / "run" / checkpoint.FILE).write_bytes(b"PK")
+    with pytest.raises(PolicyError, match=r"cannot be loaded: .*--force"):
+        jax_run(tmp_path / "run", resume=True)
+
+
+def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
+    run: TrainingResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    interrupted(folder, monkeypatch)
+    kept = dict(checkpoint.load_arrays(folder / checkpoint.FILE))
+    broken = {
+        name: np.full_like(array, np.nan) if "action_net.bias" in name else array
+        for name, array in kept.items()
+    }
+    checkpoint.save_arrays(folder / checkpoint.FILE, broken)
+    with pytest.raises(PolicyError, match=r"not finite any longer at step 128.*last checkpoint"):
+        jax_run(folder, resume=True)
+    record = RunRecord.read(folder)
+    assert record is not None
+    assert (record.status, record.steps_done) == ("running", 64)
+    assert not (folder / "model.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agents": "jaxx"}, r"agents='jaxx': must be 'sb3' or 'jax'\. Did you mean 'jax'"),
+        ({"algorithm": "A2C"}, "algorithm='jax:A2C': must be one of jax:PPO, jax:TD3, jax:SAC"),
+        ({"hyperparameters": {"n_step": 8}}, "n_step: jax:PPO has no .*Did you mean 'n_steps'"),
+        ({"hyperparameters": {"use_sde": True}}, "use_sde: jax:PPO has no .*Known: batch_size"),
+        (
+            {"hyperparameters": {"policy_kwargs": {"activation_fn": "torch.nn:ELU"}}},
+            r"policy_kwargs.activation_fn: .*Known: .*policy_kwargs.net_arch",
+        ),
+        (
+            {"hyperparameters": {"policy_kwargs": {"net_arch": "wide"}}},
+            r"policy_kwargs.net_arch='wide': Input should be a valid tuple",
+        ),
+        ({"hyperparameters": {"n_steps": "many"}}, "n_steps='many'.*valid integer"),
+        ({"num_envs": 2}, "num_envs=2: must be 1"),
+        ({"device": "abacus"}, "device='abacus': must be one of cpu"),
+        ({"agents": "sb3", "device": "cpu"}, r"device='cpu': is for agents in JAX.*--agents jax"),
+    ],
+)
+def test_invalid_arguments_raise_typed_errors_and_create_no_folder(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    settings = {"hyperparameters": {}, **change}
+    with pytest.raises(SMEError, match=message):
+        jax_run(tmp_path / "run", **settings)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_team_is_refused_by_name(tmp_path: Path) -> None:
+    team = SMESpec(action_dim=2, team={"agents": [{"action_dim": 1}, {"action_dim": 1}]})
+    for algorithm in (None, "jax:PPO"):
+        with pytest.raises(SMEError, match=r"team=.*tasks in JAX have no team"):
+            train(team, agents="jax", algorithm=algorithm, folder=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_jax_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("sme_registry.jax")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "jax", None)
+    with pytest.raises(MissingDependencyError, match=r"JAX is not installed.*\[jax\]"):
+        jax_run(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_record_is_strict_json_and_the_model_a_zip(run: TrainingResult) -> None:
+    assert json.loads((run.folder / "run.json").read_text())["algorithm"] == "jax:PPO"
+    with zipfile.ZipFile(run.model_path) as archive:
+        assert "policy.pth" in archive.namelist()
