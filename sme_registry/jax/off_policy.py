@@ -122,6 +122,12 @@ class OffPolicyProgram(Program):
         """Make the update that follows the last step."""
         self._loop(self.steps, self.steps + 1, acts=False)
 
+    def save(self) -> dict[str, Array]:
+        """All state, as named arrays; of the buffer, the rows that are written."""
+        arrays = super().save()
+        name = f".{self.buffer}"
+        return arrays | {name: arrays[name][: self.steps]}
+
     def _loop(self, begin: int, end: int, acts: bool) -> Log:
         log: Log
         self.state, log = _steps(

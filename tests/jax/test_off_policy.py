@@ -109,6 +109,7 @@ def test_a_restored_program_goes_on_with_the_same_bits(new: Any) -> None:
     program = new()
     program.advance(STARTS + 5)
     saved = program.save()
+    assert len(saved[".buffer"]) == program.steps
     copies = {name: array.copy() for name, array in saved.items()}
     log = program.advance(BUDGET)
     assert_equal(saved, copies)
