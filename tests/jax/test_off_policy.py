@@ -55,6 +55,17 @@ def test_the_update_after_the_last_step_waits(new: Any) -> None:
     assert_equal(program.save(), finished)
 
 
+def test_a_finished_program_can_go_on(new: Any) -> None:
+    whole, continued = new(), new()
+    whole.advance(BUDGET)
+    continued.advance(STARTS + 5)
+    continued.finish()
+    continued.advance(BUDGET)
+    assert_equal(continued.save(), whole.save())
+    continued.finish()  # at the end, the row after the last one is the first
+    assert np.array_equal(continued.save()[".buffer"], whole.save()[".buffer"])
+
+
 def test_no_update_before_the_learning_starts(new: Any) -> None:
     program = new()
     initial = program.weights(0)
