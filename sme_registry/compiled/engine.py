@@ -34,7 +34,9 @@ from sme_registry.task.draw import Array
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"
 _SMALL = 8192  # numbers of a packed task that each lane may hold a copy of: 64 KiB
-_ROWS = 4096  # states per block of the oracle: 2 MiB a layer at the default width
+_ROWS = (
+    1024  # states per block of the oracle: a layer of 512 KiB, at the default width, stays in cache
+)
 
 Observation: TypeAlias = npt.NDArray[np.float32]
 Mask: TypeAlias = npt.NDArray[np.bool_]

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import boolean, float32, float64, int64, njit, types, void
 
-from sme_registry.compiled.normal_cdf import normal_cdf
+from sme_registry.compiled.normal_cdf import cell_of, in_cell, normal_cdf
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
     LANE_STATE,
@@ -215,8 +215,11 @@ def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-unt
 
 
 @njit(error_model="numpy")
-def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
-    """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed."""
+def _block_layer(W, b, x, y, cells, count):  # type: ignore[no-untyped-def]
+    """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed.
+
+    `cells` `[count]` is room for those of Φ's table.
+    """
     # Two indices everywhere: a row taken as an array of its own costs two atomic operations.
     inputs, outputs = W.shape
     for o in range(outputs):
@@ -246,14 +249,16 @@ def _block_layer(W, b, x, y, count):  # type: ignore[no-untyped-def]
                 y[o, lane] = y[o, lane] + w * x[i0, lane]
             i += 1
         for lane in range(count):
-            y[o, lane] = normal_cdf(y[o, lane])
+            cells[lane], y[o, lane] = cell_of(y[o, lane])
+        for lane in range(count):
+            y[o, lane] = in_cell(cells[lane], y[o, lane])
 
 
 # The parts of `step_many`, in its order. Inlined, so that the compiler sees that the arrays of a
 # block overlap no other array.
 @njit(inline="always", error_model="numpy")
-def _block_policy(p, s, first, count, x, y, optimal, owner, owned):  # type: ignore[no-untyped-def]
-    """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers.
+def _block_policy(p, s, first, count, x, y, cells, optimal, owner, owned):  # type: ignore[no-untyped-def]
+    """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers, `cells` for one row.
 
     Writes `optimal` `[A, lanes]`, the agent of each action channel (`owner` `[A]`), and how many
     channels each agent owns (`owned` `[n]`).
@@ -274,7 +279,7 @@ def _block_policy(p, s, first, count, x, y, optimal, owner, owned):  # type: ign
             at += 2
             b = at + inputs * outputs
             W = p[at:b].reshape(inputs, outputs)
-            _block_layer(W, p[b : b + outputs], x, y, count)
+            _block_layer(W, p[b : b + outputs], x, y, cells, count)
             at = b + outputs
             x, y = y, x
         for o in range(outputs):
@@ -450,12 +455,12 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
     x, y = np.empty((widest, lanes)), np.empty((widest, lanes))
     best, acted = np.empty((A, lanes)), np.empty((A, lanes))
     distance, team_distance = np.empty((agents, lanes)), np.empty(lanes)
-    column = np.empty(lanes)
+    column, cells = np.empty(lanes), np.empty(lanes, np.int32)
     owner, owned = np.empty(A, np.int64), np.empty(agents)
     finite = True
     for first in range(0, t.size, lanes):
         count = min(lanes, t.size - first)
-        _block_policy(p, s, first, count, x, y, best, owner, owned)
+        _block_policy(p, s, first, count, x, y, cells, best, owner, owned)
         _block_distance(action, first, count, best, owner, distance, acted, optimal)
         _block_transition(W, b, s, first, count, acted, column, moved, observation)
         finite &= _block_rewards(p, first, count, distance, owned, team_distance, values, ends)
@@ -472,7 +477,9 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
 @njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)
 def add_and_normal_cdf(x, b):  # type: ignore[no-untyped-def]
     """x ← Φ(x + b) in place, `[B, out]` and `[out]`: the step after a matrix product."""
+    cells = np.empty(b.size, np.int32)
     for i in range(x.shape[0]):
-        row = x[i]
-        for o in range(row.size):
-            row[o] = normal_cdf(row[o] + b[o])
+        for o in range(b.size):
+            cells[o], x[i, o] = cell_of(x[i, o] + b[o])
+        for o in range(b.size):
+            x[i, o] = in_cell(cells[o], x[i, o])
