@@ -258,10 +258,11 @@ def _block_layer(W, b, x, y, cells, count):  # type: ignore[no-untyped-def]
 # block overlap no other array.
 @njit(inline="always", error_model="numpy")
 def _block_policy(p, s, first, count, x, y, cells, optimal, owner, owned):  # type: ignore[no-untyped-def]
-    """π* of a block of lanes, agent by agent; `x` and `y` are room for two layers, `cells` for one row.
+    """π* of a block of lanes, agent by agent.
 
-    Writes `optimal` `[A, lanes]`, the agent of each action channel (`owner` `[A]`), and how many
-    channels each agent owns (`owned` `[n]`).
+    `x` and `y` are room for two layers, `cells` for a row of one. Writes `optimal` `[A, lanes]`,
+    the agent of each action channel (`owner` `[A]`), and how many channels each agent owns
+    (`owned` `[n]`).
     """
     at = _HEADER + int(p[1]) * int(p[0]) + int(p[0])  # behind the header, W and b
     channel = 0

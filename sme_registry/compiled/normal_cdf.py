@@ -5,9 +5,9 @@ On cells of width 1/16 over [−8.5, 8.5], Φ(c + d) = Σ_n Φ⁽ⁿ⁾(c) dⁿ 
 under 3e-15; beyond ±8.5 Φ is within 1e-17 of 0 or 1. `erfc` has branches that keep it from being
 pipelined.
 
-For many numbers call `cell_of` in one loop and `in_cell` in a second one, which takes a third of the
-time of `normal_cdf` in a single loop: compilers vectorise the first loop over numbers, and `in_cell`
-reads the coefficients of one number as two vectors, where they would gather those of several.
+For many numbers call `cell_of` in one loop and `in_cell` in a second one, a third of the time of
+`normal_cdf` in a single loop: compilers vectorise the first loop over numbers, and `in_cell` reads
+the coefficients of one number as two vectors, where they would gather those of several.
 """
 
 from __future__ import annotations
