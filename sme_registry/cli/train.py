@@ -125,7 +125,7 @@ def train(
     transitions per step as there are agents, and TensorBoard's axis counts those transitions.
 
     --agents jax trains our PPO, TD3 or SAC, the same algorithms in JAX, on a task without a team:
-    PPO in a twentieth of the time, TD3 and SAC faster on a GPU. The folder, by default
+    PPO in a twentieth of the time, TD3 in two fifths, SAC in a third. The folder, by default
     runs/TASK-jax-ALGORITHM-seedN, contains the same files, model.zip is a model of
     Stable-Baselines3 with the trained weights, and a run that is resumed is the uninterrupted one,
     bit for bit. The first run of a shape and of hyperparameters compiles for some seconds.

@@ -19,6 +19,7 @@ Every module below imports JAX, which nothing outside this folder does. Importin
     off_policy  what TD3 and SAC share: when they act and update
     replay      their buffer
     critics     their twin critics and targets
+    ranges      of hyperparameters, as types
     program     what all programs have: lanes, evaluation, saving, lanes that failed
     run         a program from its start to its end, evaluated where a study's cell is
 """

@@ -19,8 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sme_registry.errors import OptionError
-from sme_registry.io import integer_in
 from sme_registry.jax import replay
 from sme_registry.jax.env import EnvState, reset, step, to_unit
 from sme_registry.jax.networks import Weights
@@ -101,6 +99,10 @@ class OffPolicyProgram(Program):
           index: its number among the `gradient_steps` of this step, from 0; the same in all lanes.
         """
 
+    def __init__(self, settings: Any, *arguments: Any, **options: Any) -> None:
+        self.rollout = settings.train_freq
+        super().__init__(settings, *arguments, **options)
+
     def initial_state(self, weights: Weights, keys: jax.Array) -> OffPolicyState:
         """New lanes: random episodes, an empty buffer."""
         capacity = min(self.settings.buffer_size, self._whole(self.budget))
@@ -137,40 +139,7 @@ class OffPolicyProgram(Program):
 
     def _whole(self, steps: int) -> int:
         """At least these steps, in whole multiples of `train_freq`."""
-        every: int = self.settings.train_freq
-        return -(-steps // every) * every
-
-
-_LEAST = {
-    "buffer_size": 1,
-    "learning_starts": 0,
-    "batch_size": 1,
-    "train_freq": 1,
-    "gradient_steps": -1,  # as many as `train_freq`
-    "policy_delay": 1,
-    "target_update_interval": 1,
-}
-
-
-def check_settings(settings: Any) -> None:
-    """Check the hyperparameters that TD3 and SAC share, or that are counts.
-
-    Raises:
-      OptionError: one is out of range.
-    """
-    for name, least in _LEAST.items():
-        if hasattr(settings, name):
-            integer_in(f"hyperparameters.{name}", getattr(settings, name), least)
-    for name in ("tau", "gamma"):
-        if not 0.0 <= getattr(settings, name) <= 1.0:
-            raise OptionError(
-                f"hyperparameters.{name}={getattr(settings, name)!r}: must be in [0, 1]."
-            )
-    if not settings.net_arch or min(settings.net_arch) < 1:
-        raise OptionError(
-            f"hyperparameters.policy_kwargs.net_arch={list(settings.net_arch)}: must be the widths "
-            "of at least one hidden layer, each at least 1."
-        )
+        return -(-steps // self.rollout) * self.rollout
 
 
 def in_range(action: jax.Array, symmetric: bool) -> jax.Array:

@@ -18,12 +18,11 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from pydantic import Field
 
 from sme_registry.errors import OptionError
 from sme_registry.jax import oracle
@@ -39,17 +38,12 @@ from sme_registry.jax.networks import (
     perceptron,
 )
 from sme_registry.jax.program import Program, StepLog
+from sme_registry.jax.ranges import Count, Positive, Share, Weight, Widths
 from sme_registry.jax.task import TaskParams
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
 _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
 _NO_KEY: Any = None  # `step_env` draws nothing
-
-
-Count = Annotated[int, Field(ge=1, strict=True)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Weight = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,7 @@ class PPO:
     ent_coef: Weight = 0.0
     vf_coef: Weight = 0.5
     max_grad_norm: Positive = 0.5
-    net_arch: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    net_arch: Widths = (64, 64)
 
     def __post_init__(self) -> None:
         if self.batch_size < 2 or self.n_steps % self.batch_size:

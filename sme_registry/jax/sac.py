@@ -33,7 +33,16 @@ from sme_registry.jax.networks import (
     initial_perceptron,
     linear,
 )
-from sme_registry.jax.off_policy import OffPolicyProgram, check_settings, in_range
+from sme_registry.jax.off_policy import OffPolicyProgram, in_range
+from sme_registry.jax.ranges import (
+    Count,
+    CountFromZero,
+    Positive,
+    Share,
+    Updates,
+    Weight,
+    Widths,
+)
 from sme_registry.jax.replay import Transitions
 
 _LEAST_LOG_STD, _GREATEST_LOG_STD = -20.0, 2.0
@@ -46,33 +55,34 @@ class SAC:
 
     `ent_coef` is "auto", "auto_" and the initial value, or a constant. `net_arch` is the widths of
     the hidden layers of actor and critics (`policy_kwargs.net_arch`). Without generalised
-    state-dependent exploration and action noise, as is SB3's default.
+    state-dependent exploration and action noise, as is SB3's default. `run.settings_of` checks
+    types and ranges.
 
     Raises:
-      OptionError: a value is out of range.
+      OptionError: `ent_coef` or `target_entropy` is another text, or α is negative.
     """
 
-    learning_rate: float = 3e-4
-    buffer_size: int = 1_000_000
-    learning_starts: int = 100
-    batch_size: int = 256
-    tau: float = 0.005
-    gamma: float = 0.99
-    train_freq: int = 1
-    gradient_steps: int = 1
-    ent_coef: str | float = "auto"
-    target_update_interval: int = 1
-    target_entropy: str | float = "auto"
-    net_arch: tuple[int, ...] = (256, 256)
+    learning_rate: Positive = 3e-4
+    buffer_size: Count = 1_000_000
+    learning_starts: CountFromZero = 100
+    batch_size: Count = 256
+    tau: Share = 0.005
+    gamma: Share = 0.99
+    train_freq: Count = 1
+    gradient_steps: Updates = 1
+    ent_coef: str | Weight = "auto"
+    target_update_interval: Count = 1
+    target_entropy: str | Weight = "auto"
+    net_arch: Widths = (256, 256)
 
     def __post_init__(self) -> None:
-        check_settings(self)
         for name in ("ent_coef", "target_entropy"):
             _check_automatic(name, getattr(self, name))
-        if self.learns_entropy and not self.initial_entropy_coefficient > 0.0:
+        begins = self.initial_entropy_coefficient
+        if begins < 0.0 or (begins == 0.0 and self.learns_entropy):
             raise OptionError(
-                f"hyperparameters.ent_coef={self.ent_coef!r}: must begin above 0, since its "
-                "logarithm is learned."
+                f"hyperparameters.ent_coef={self.ent_coef!r}: must be at least 0, and begin above "
+                "0 where its logarithm is learned."
             )
 
     @property

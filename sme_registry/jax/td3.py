@@ -25,7 +25,16 @@ from sme_registry.jax.networks import (
     adam,
     initial_perceptron,
 )
-from sme_registry.jax.off_policy import OffPolicyProgram, check_settings, in_range
+from sme_registry.jax.off_policy import OffPolicyProgram, in_range
+from sme_registry.jax.ranges import (
+    Count,
+    CountFromZero,
+    NotNegative,
+    Positive,
+    Share,
+    Updates,
+    Widths,
+)
 from sme_registry.jax.replay import Transitions
 
 
@@ -34,27 +43,21 @@ class TD3:
     """Hyperparameters, with the names and defaults of `stable_baselines3.TD3`.
 
     Without action noise, as is SB3's default. `net_arch` is the widths of the hidden layers of
-    actor and critics (`policy_kwargs.net_arch`).
-
-    Raises:
-      OptionError: a value is out of range.
+    actor and critics (`policy_kwargs.net_arch`). `run.settings_of` checks types and ranges.
     """
 
-    learning_rate: float = 1e-3
-    buffer_size: int = 1_000_000
-    learning_starts: int = 100
-    batch_size: int = 256
-    tau: float = 0.005
-    gamma: float = 0.99
-    train_freq: int = 1
-    gradient_steps: int = 1
-    policy_delay: int = 2
-    target_policy_noise: float = 0.2
-    target_noise_clip: float = 0.5
-    net_arch: tuple[int, ...] = (400, 300)
-
-    def __post_init__(self) -> None:
-        check_settings(self)
+    learning_rate: Positive = 1e-3
+    buffer_size: Count = 1_000_000
+    learning_starts: CountFromZero = 100
+    batch_size: Count = 256
+    tau: Share = 0.005
+    gamma: Share = 0.99
+    train_freq: Count = 1
+    gradient_steps: Updates = 1
+    policy_delay: Count = 2
+    target_policy_noise: NotNegative = 0.2
+    target_noise_clip: NotNegative = 0.5
+    net_arch: Widths = (400, 300)
 
 
 class Learner(NamedTuple):

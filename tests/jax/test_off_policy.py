@@ -13,10 +13,12 @@ import pytest
 from sme_registry.errors import OptionError
 from sme_registry.jax import replay
 from sme_registry.jax.off_policy import OffPolicyProgram
+from sme_registry.jax.run import settings_of
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.spec import SMESpec
+from sme_registry.training.hyperparameters import nested_hyperparameters
 
 STARTS, BUDGET = 6, 30
 TINY: dict[str, Any] = {"learning_starts": STARTS, "batch_size": 8, "net_arch": (8,)}
@@ -153,22 +155,25 @@ def test_padding_changes_no_step() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "values"),
+    ("uses", "name", "value"),
     [
-        (TD3, {"batch_size": 0}),
-        (TD3, {"learning_starts": -1}),
-        (TD3, {"policy_delay": 0}),
-        (TD3, {"gradient_steps": -2}),
-        (TD3, {"net_arch": ()}),
-        (SAC, {"tau": 1.5}),
-        (SAC, {"ent_coef": "automatic"}),
-        (SAC, {"ent_coef": "auto_0"}),
-        (SAC, {"target_entropy": "auto_1"}),
+        ("jax:TD3", "batch_size", 0),
+        ("jax:TD3", "learning_starts", -1),
+        ("jax:TD3", "policy_delay", 1.5),
+        ("jax:TD3", "gradient_steps", -2),
+        ("jax:TD3", "train_freq", [1, "episode"]),
+        ("jax:TD3", "target_noise_clip", -0.1),
+        ("jax:SAC", "tau", 1.5),
+        ("jax:SAC", "ent_coef", "automatic"),
+        ("jax:SAC", "ent_coef", "auto_0"),
+        ("jax:SAC", "ent_coef", -1),
+        ("jax:SAC", "target_entropy", "auto_1"),
+        ("jax:SAC", "policy_kwargs.net_arch", []),
     ],
 )
-def test_hyperparameters_out_of_range_are_refused_by_name(kind: Any, values: Any) -> None:
-    with pytest.raises(OptionError, match=next(iter(values))):
-        kind(**values)
+def test_hyperparameters_out_of_range_are_refused_by_name(uses: str, name: str, value: Any) -> None:
+    with pytest.raises(OptionError, match=rf"^hyperparameters\.{name}="):
+        settings_of(uses, nested_hyperparameters({name: value}))
 
 
 CRITIC = "critic.qf0.0.weight"
