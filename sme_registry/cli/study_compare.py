@@ -64,7 +64,8 @@ def compare(
         columns = {escape(name): "number" for name in each.frame.columns} | {"class": "name"}
         rows = (tuple(map(escape, row)) for row in each.frame.itertuples(index=False))
         out().print(Table(f"[bold]{escape(each.title)}[/]", columns, rows))
-    for sentence in difference_caveats(differences):
+    caveats = comparison.implementation_caveats(folder, first, second)
+    for sentence in (*difference_caveats(differences), *caveats):
         out().print(escape(sentence), soft_wrap=True)
     if files:
         out().print(f"{escape(str(out_folder))}  {len(files)} files", soft_wrap=True)

@@ -16,7 +16,7 @@ from sme_registry.spec import SMESpec, StudyAlgorithm, StudyFile, StudyPlan, Sui
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.runner import run_study
-from sme_registry.studies.engine.scaling import scaled, selected
+from sme_registry.studies.engine.scaling import scaled, selected, with_agents
 from tests.studies.cells import raising, small_file
 
 ABLATIONS = catalogue.find(StudyFile, "paper-ablations")
@@ -316,6 +316,14 @@ class TestCommands:
             (("new", "x.json", "-t", "Default", "-a", "nomod:foo"), "No module named 'nomod'"),
             (("new", "x.json", "-t", "Default", "-a", "reference:liner"), "Did you mean 'linear'"),
             (("new", "x.json", "-t", "Default", "-a", "offline:bcc"), "Did you mean 'bc'"),
+            (("new", "x.json", "-t", "Default", "-a", "jax:A2C"), "one of jax:PPO, jax:TD3"),
+            (("new", "x.json", "-t", "Team2", "-a", "jax:PPO"), "cannot learn a task for 2 agents"),
+            (
+                ("new", "x.json", "-t", "Plane1", "-a", "jax:PPO", "--set", "jax-PPO.n_stepz=6"),
+                "Did you mean 'n_steps'",
+            ),
+            (("plan", "smoke", "--agents", "torch"), "agents='torch': must be 'sb3' or 'jax'"),
+            (("run", "smoke", "-f", "s", "--agents", "jax", "--device", "abacus"), "'abacus'"),
         ],
     )
     def test_bad_input_is_one_line_and_writes_nothing(
@@ -323,6 +331,57 @@ class TestCommands:
     ) -> None:
         assert words in refused(*arguments)
         assert list(tmp_path.iterdir()) == []
+
+
+class TestAgents:
+    """The same plan with agents in JAX is another plan, whose results are other results."""
+
+    def test_only_what_learns_online_changes_and_names_stay(self) -> None:
+        bc = {"name": "BC", "uses": "offline:bc", "hyperparameters": {"nu": 0.5}}
+        file = small_file(algorithms=["constant", bc, {"name": "slow", "uses": "ppo"}])
+        changed = with_agents(file, "jax")
+        assert [(one.name, one.uses) for one in changed.plan.algorithms] == [
+            ("constant", "reference:constant"),
+            ("BC", "offline:bc"),
+            ("slow", "jax:PPO"),
+        ]
+        assert changed.versioned_name == "small-jax-v1"
+        assert changed.digest == changed.plan.digest != file.digest
+        same = [
+            ours.cell.digest == theirs.cell.digest
+            for ours, theirs in zip(changed.plan.cells, file.plan.cells, strict=True)
+        ]
+        assert same == [True, True, False] * 2
+        assert with_agents(changed, "jax") == changed
+        assert with_agents(file, "sb3") == file
+        assert with_agents(ABLATIONS, "sb3") == ABLATIONS
+        back = with_agents(with_agents(ABLATIONS, "jax"), "sb3")
+        assert back.plan == ABLATIONS.plan
+
+    @pytest.mark.parametrize("uses", ["A2C", "sb3_contrib:TQC", "jax:DQN", "independent:PPO"])
+    def test_an_algorithm_that_jax_does_not_have_is_refused_by_name(self, uses: str) -> None:
+        team = {
+            "state_dim": 2,
+            "action_dim": 2,
+            "team": {"agents": [{"action_dim": 1}, {"action_dim": 1}]},
+        }
+        classes = [{"name": "t", "setting": team, "seeds": [1]}] if "independent" in uses else None
+        fields = {} if classes is None else {"classes": classes}
+        file = small_file(algorithms=[{"name": "other", "uses": uses}], **fields)
+        with pytest.raises(UnknownNameError, match=f"algorithm 'other': uses='{uses}'.*jax:PPO"):
+            with_agents(file, "jax")
+
+    def test_both_implementations_are_two_algorithms_of_one_plan(self) -> None:
+        good("new", "both.json", "-t", "Default", "-a", "PPO", "-a", "jax:PPO", "-a", "TD3")
+        algorithms = StudyFile.read("both.json").plan.algorithms
+        assert [(one.name, one.uses) for one in algorithms] == [
+            ("PPO", "PPO"),
+            ("jax-PPO", "jax:PPO"),
+            ("TD3", "TD3"),
+        ]
+        good("new", "jax.json", "-t", "Default", "-a", "PPO", "--agents", "jax", "-n", "PPO=7")
+        (algorithm,) = StudyFile.read("jax.json").plan.algorithms
+        assert (algorithm.name, algorithm.uses, algorithm.steps) == ("PPO", "jax:PPO", 7)
 
 
 def test_a_plan_of_what_is_not_installed_is_planned_with_a_note(tmp_path: Path) -> None:

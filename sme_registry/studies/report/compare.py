@@ -14,13 +14,14 @@ import pandas as pd
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import refuse_unwritable, to_json, write_atomically
+from sme_registry.spec.study import JAX
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import TextTable, difference_table
 from sme_registry.studies.report.frames import StudyFrames, load, plan_file, runs
 from sme_registry.studies.report.tables import METRICS, Metric, differences
 
-__all__ = ["compare", "comparison_tables", "write_comparison"]
+__all__ = ["compare", "comparison_tables", "implementation_caveats", "write_comparison"]
 
 DEFAULT_METRICS = ("wd_regret", "ood_regret")
 
@@ -69,6 +70,18 @@ def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
     return [
         difference_table(table[table.metric == key], _metric(key), levels=True)
         for key in dict.fromkeys(table.metric)
+    ]
+
+
+def implementation_caveats(folder: str | os.PathLike[str], first: str, second: str) -> list[str]:
+    """A sentence if one of two algorithms runs in JAX and the other does not."""
+    uses = {each.name: each.uses for each in plan_file(Ledger(folder)).plan.algorithms}
+    in_jax = [name for name in (first, second) if uses[name].startswith(JAX)]
+    if len(in_jax) != 1:
+        return []
+    return [
+        f"{in_jax[0]} runs in JAX and {(second if in_jax == [first] else first)} does not: their "
+        "difference is also one between implementations."
     ]
 
 

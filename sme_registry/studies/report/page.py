@@ -15,6 +15,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from sme_registry.spec.study import JAX
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL
 from sme_registry.studies.report.exports import TextTable
@@ -79,6 +80,7 @@ def page(
             if key in required or by_section[key]
         },
         findings=findings,
+        in_jax=_in_jax(analysis),
         axes=AXES,
         several=SEVERAL,
         figures=by_section,
@@ -93,6 +95,13 @@ def page(
 def _requested(analysis: Analysis) -> int:
     """How many runs have finished or are missing; `--only` may have left out others."""
     return len(analysis.runs) + len(analysis.missing)
+
+
+def _in_jax(analysis: Analysis) -> list[str]:
+    """The algorithms that run in JAX, if others beside them learn without it."""
+    of_plan = {algorithm.name: algorithm.uses for algorithm in analysis.file.plan.algorithms}
+    in_jax = [name for name in analysis.learners if of_plan[name].startswith(JAX)]
+    return in_jax if len(in_jax) < len(analysis.learners) else []
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
@@ -110,6 +119,11 @@ def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
         settings = ", ".join(f"{k} = {v}" for k, v in sorted(algorithm.hyperparameters.items()))
         text = f"{steps:,} steps, {algorithm.action_range} actions"
         yield algorithm.name, algorithm.uses, f"{text}, {settings or 'default hyperparameters'}"
+    programs = (result.program for result in analysis.cells.values())
+    kinds = Counter((each.device, each.lanes) for each in programs if each is not None)
+    for (device, lanes), count in kinds.most_common():
+        text = f"on {device}, in programs of {plural(lanes, 'lane')}"
+        yield f"{plural(count, 'run')} in JAX", "", text
     versions = Counter(
         ", ".join(f"{name} {version}" for name, version in sorted(result.versions.items()))
         for result in analysis.cells.values()

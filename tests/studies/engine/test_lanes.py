@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,10 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.program_state import read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.report.analysis import analyse
+from sme_registry.studies.report.compare import implementation_caveats
+from sme_registry.studies.report.findings import findings
+from sme_registry.studies.report.page import page
 
 pytest.importorskip("jax")
 pytest.importorskip("stable_baselines3")
@@ -155,6 +159,19 @@ def test_curve_and_regret_mean_what_they_mean_in_any_cell(whole: Path) -> None:
         assert result.timing.total > 0
     assert len({result.curve.episode_return for result in agents(whole)}) == 4
     assert len({result.online_regret for result in agents(whole)}) == 4
+
+
+def test_a_report_says_which_algorithms_run_in_jax(whole: Path) -> None:
+    (sentence,) = implementation_caveats(whole, "linear", "agent")
+    assert sentence.startswith("agent runs in JAX and linear does not")
+    analysis = analyse(plan_file(), Ledger(whole).results())
+    text = page(analysis, findings(analysis), [], [], [])
+    assert "4 runs in JAX" in text
+    assert "on cpu, in programs of 4 lanes" in text
+    assert "between implementations" not in text  # no other learner
+    beside = replace(analysis, learners=("agent", "linear"))
+    text = page(beside, findings(analysis), [], [], [])
+    assert "agent runs in JAX, the other algorithms" in text
 
 
 def test_a_kept_model_is_one_of_stable_baselines3_and_scores_the_same(whole: Path) -> None:
