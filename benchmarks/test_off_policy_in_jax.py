@@ -17,7 +17,7 @@ jax = pytest.importorskip("jax")
 
 SPEC = SMESpec()
 STEPS = 20  # of a round
-BUFFER = 2_000
+BUFFER = 2_000  # transitions
 
 TARGET = {"TD3": 1.3, "SAC": 1.5}
 BATCH = 256
