@@ -50,6 +50,16 @@ def find_device(name: str | None = None) -> Any:
         ) from None
 
 
+def memory_of(device: Any) -> int | None:
+    """Bytes of memory that programs on a device may use in all; None if unknown."""
+    statistics = device.memory_stats() or {}
+    if "bytes_limit" in statistics:
+        return int(statistics["bytes_limit"])
+    if device.platform == "cpu" and hasattr(os, "sysconf"):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
 def _cache_folder() -> Path:
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "sme-registry" / "jax"

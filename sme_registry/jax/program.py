@@ -12,6 +12,7 @@ A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and 
 from __future__ import annotations
 
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -21,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.jax import oracle
-from sme_registry.jax.device import find_device
+from sme_registry.jax.device import find_device, memory_of
 from sme_registry.jax.env import EnvState, observe, start, step_env, to_unit
 from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.padding import Padding, Widths
@@ -129,6 +130,7 @@ class Program(ABC):
         Raises:
           SpecError: a task is not one that JAX has; see `task_params`.
           OptionError: there is no such device.
+          ResourceLimitError: its memory is too small; says how many lanes fit.
         """
         self.settings, self.specs, self.budget = settings, tuple(specs), steps
         self.symmetric = action_range == "symmetric"
@@ -144,6 +146,7 @@ class Program(ABC):
         weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
         stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
+        self._refuse_without_room(jax.eval_shape(self.initial_state, stacked, keys))
         self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
         self.steps = 0
 
@@ -246,6 +249,19 @@ class Program(ABC):
         ]
         self.state = jax.tree_util.tree_unflatten(structure, restored)
         self.steps = int(arrays["steps"])
+
+    def _refuse_without_room(self, state: Any) -> None:
+        """Raise ResourceLimitError if such a state would not fit in the device's memory."""
+        leaves = jax.tree.leaves(state)
+        needed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
+        room = memory_of(self.device)
+        if room is not None and needed > room:
+            fit = self.lanes * room // needed
+            raise ResourceLimitError(
+                f"lanes={self.lanes:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
+                f"{self.device.platform} has {room / 2**30:,.1f} GiB: must be at most {fit:,}. "
+                "Choose fewer lanes, fewer steps or a smaller buffer_size."
+            )
 
     def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
         own, rng = _widths(spec), np.random.default_rng(seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ pytest.importorskip("jax")
 import jax.numpy as jnp
 
 from sme_registry import SMESpec
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.jax.networks import HostWeights, Weights, initial_linear, linear
 from sme_registry.jax.program import Program, StepLog
@@ -135,3 +136,20 @@ def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
     actor = broken.state.weights["actor.weight"].at[2, 0, 0].set(jnp.nan)
     broken.state = broken.state._replace(weights={**broken.state.weights, "actor.weight": actor})
     assert broken.failed().tolist() == [False, False, True, False]
+
+
+def test_the_policy_of_a_lane_has_no_padding() -> None:
+    program = Linear((), SEPARABLE, (0, 1, 2), steps=1)
+    observations = np.linspace(0.0, 1.0, 8, dtype=np.float32).reshape(2, 4)
+    actions = program.policy(2)(observations)  # 2 state channels of 3, 3 action channels
+    weights = program.weights(2)
+    expected = observations @ weights["actor.weight"].T + weights["actor.bias"]
+    np.testing.assert_allclose(actions, expected, atol=1 / 64 + 1e-6)
+    assert actions.shape == (2, 3)
+
+
+def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits() -> None:
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    steps = memory // 8 // 3  # of 8 bytes: a third of it, and lanes take only some bytes more
+    with pytest.raises(ResourceLimitError, match=r"lanes=4: .* must be at most 2\. Choose fewer"):
+        Linear((), BASE_LANES, (0, 1), steps=steps, lanes=4)
