@@ -631,10 +631,31 @@ class TestTrain:
         )
         assert again["regions"] == printed["evaluation"]["regions"]
 
+    def test_agents_in_jax_have_a_folder_of_their_own(self, tmp_path: Path) -> None:
+        pytest.importorskip("stable_baselines3")
+        pytest.importorskip("jax")
+        narrow = ("--set", "n_steps=32", "--set", "batch_size=32", "--set", "n_epochs=1")
+        command = ("train", "Plane1", "-a", "ppo", "--agents", "jax", "-n", "40", *narrow, *QUICK)
+        result = good(*command, "--json")
+        printed = json.loads(result.stdout)
+        assert printed["folder"] == "runs/Plane1-jax-PPO-seed0"
+        assert printed["run"]["algorithm"] == "jax:PPO"
+        assert "training PPO: 64 of 64 steps" in result.stderr
+        assert (tmp_path / printed["folder"] / "model.zip").exists()
+        assert "finished run of jax:PPO" in refused(*command)
+        in_jax = ("train", "Plane1", "--agents", "jax")
+        assert "must be one of jax:PPO" in refused(*in_jax, "-a", "A2C")
+        assert "Did you mean 'gamma'" in refused(*in_jax, "--set", "gama=0.9")
+        assert "num_envs=2" in refused(*in_jax, "--num-envs", "2")
+        assert "device='abacus'" in refused(*in_jax, "--device", "abacus")
+        assert "no team" in refused("train", "Team2", "--agents", "jax")
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
             (("-a", "TD33"), "Did you mean 'TD3'"),
+            (("--agents", "jx"), "agents='jx'"),
+            (("--device", "cpu"), "is for agents in JAX"),
             (("--seed", "-1"), "seed=-1"),
             (("--num-envs", "0"), "num_envs=0"),
             (("--action-range", "unti"), "action_range='unti'"),

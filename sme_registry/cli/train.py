@@ -44,15 +44,15 @@ def train(
         ),
     ] = None,
     agents: Annotated[
-        str,
-        typer.Option(
-            help="sb3, algorithms of Stable-Baselines3; or jax: PPO, TD3 and SAC with their "
-            "environment in one program."
-        ),
-    ] = "sb3",
-    device: Annotated[
         str | None,
-        typer.Option(help="With --agents jax: cpu, gpu or tpu. Default JAX's."),
+        typer.Option(
+            metavar="sb3|jax",
+            help="Implementation of PPO, TD3 and SAC: of Stable-Baselines3 (default), or in JAX, "
+            "with the environment in one program.",
+        ),
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="Of agents in JAX: cpu, gpu or tpu. Default JAX's.")
     ] = None,
     steps: Annotated[
         int, typer.Option("--steps", "-n", help="Environment steps; for a team, of the team.")
@@ -124,11 +124,11 @@ def train(
     as regret/agent_0. A step is one step of the whole team, so a shared policy sees as many
     transitions per step as there are agents, and TensorBoard's axis counts those transitions.
 
-    --agents jax trains our PPO, TD3 or SAC, the same algorithms in JAX, on a task without a team:
-    PPO in a twentieth of the time, TD3 in two fifths, SAC in a third. The folder, by default
-    runs/TASK-jax-ALGORITHM-seedN, contains the same files, model.zip is a model of
-    Stable-Baselines3 with the trained weights, and a run that is resumed is the uninterrupted one,
-    bit for bit. The first run of a shape and of hyperparameters compiles for some seconds.
+    --agents jax trains the same algorithms in JAX, in one environment without a team: PPO in a
+    twentieth of the time on a CPU, TD3 in two fifths, SAC in a third. The folder, by default
+    runs/TASK-jax-ALGORITHM-seedN, contains the same files; model.zip is a model of
+    Stable-Baselines3 with the trained weights. Tasks of a new shape, or other hyperparameters, are
+    compiled first, which takes some seconds.
 
     --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
     runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
@@ -136,7 +136,7 @@ def train(
 
     --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
     hyperparameters and step count. The result differs from an uninterrupted run: random streams get
-    new seeds, and unfinished episodes start again. (With --agents jax it does not differ.)
+    new seeds, and unfinished episodes start again. With --agents jax no bit differs.
 
     Examples:
 
@@ -166,6 +166,7 @@ def train(
             suite,
             algorithm=algorithm,
             agents=agents,
+            device=device,
             steps=steps,
             seeds=seeds,
             folder=out_folder,
@@ -203,6 +204,7 @@ def train(
             console=err(),
             resume=resume,
             force=force,
+            agents=cast(Any, agents),
             device=device,
         )
     except KeyboardInterrupt:

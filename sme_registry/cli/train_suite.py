@@ -18,7 +18,7 @@ RUNS = 10
 """Runs on each class by default: those that a leaderboard requires for a rank."""
 
 _EVALUATIONS = 10  # of a run, for the learning curves of `sme study report`
-_NOT_WITH_SUITE = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force", "device")
+_NOT_WITH_SUITE = ("task", "seed", "num_envs", "checkpoint_every", "resume", "force")
 
 
 def train_suite(
@@ -26,7 +26,8 @@ def train_suite(
     suite: str,
     *,
     algorithm: str | None,
-    agents: str,
+    agents: str | None,
+    device: str | None,
     steps: int,
     seeds: int | None,
     folder: Path | None,
@@ -43,7 +44,8 @@ def train_suite(
       context: of the command, to refuse its options for a single task.
       suite: name or path of the suite.
       algorithm: as in `sme train`; None for the default of the suite's first task.
-      agents: "sb3" or "jax".
+      agents: as in `sme train`.
+      device: of agents in JAX.
       steps: of each run.
       seeds: runs on each class; None for `RUNS`, rounded up so that all instances of a class have
         equally many.
@@ -92,7 +94,7 @@ def train_suite(
         "options",
     )
     study = StudyFile(name=file.name, digest=plan.digest, plan=plan)
-    status = run_study(study, folder, jobs=jobs, keep_models=True, console=err())
+    status = run_study(study, folder, jobs=jobs, keep_models=True, device=device, console=err())
     print_status(status, json)
     if status.failed:
         raise typer.Exit(1)

@@ -60,19 +60,20 @@ AGENTS = ("sb3", "jax")
 """Whose implementation of an algorithm is trained: Stable-Baselines3's, or ours in JAX."""
 
 
-def full_name(uses: str, agents: str = "sb3") -> str:
+def full_name(uses: str, agents: str | None = None) -> str:
     """The exact name of an algorithm in any case, also of `jax:…`; others' names unchanged.
 
     Args:
       uses: the name.
-      agents: "jax" for the algorithm of this name in JAX.
+      agents: whose implementation, one of `AGENTS`; None for the one that the name says.
 
     Raises:
-      OptionError: `agents` is neither "sb3" nor "jax".
+      OptionError: `agents` is none of them.
     """
-    in_jax = choice("agents", agents, AGENTS) == "jax"
-    if uses.casefold().startswith(JAX):
-        uses, in_jax = uses[len(JAX) :], True
+    in_jax = uses.casefold().startswith(JAX)
+    uses = uses[len(JAX) :] if in_jax else uses
+    if agents is not None:
+        in_jax = choice("agents", agents, AGENTS) == "jax"
     name = next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
     return f"{JAX}{name}" if in_jax else name
 

@@ -95,7 +95,7 @@ def train(
     console: Console | None = None,
     resume: bool = False,
     force: bool = False,
-    agents: Literal["sb3", "jax"] = "sb3",
+    agents: Literal["sb3", "jax"] | None = None,
     device: str | None = None,
 ) -> TrainingResult:
     """Train one algorithm of Stable-Baselines3's kind: with it on the CPU, or in JAX.
@@ -133,8 +133,9 @@ def train(
       console: where to show it; None for standard error.
       resume: continue an unfinished run in the folder, if there is one; `steps` may be larger.
       force: remove the run in the folder and start again.
-      agents: "jax" trains our implementation of "PPO", "TD3" or "SAC" in JAX: one environment in
-        one program with its agent, for a task without a team.
+      agents: "jax" for our implementation of "PPO", "TD3" or "SAC" in JAX, with its environment in
+        one program, for a task without a team; "sb3" for Stable-Baselines3's; None for the one that
+        `algorithm` names.
       device: of agents in JAX, "cpu", "gpu" or "tpu"; None for JAX's default.
 
     Returns:
@@ -220,7 +221,7 @@ def _plan(
 def _with_algorithm(
     plan: RunRecord,
     uses: str | None,
-    agents: str,
+    agents: str | None,
     num_envs: int | None,
     hyperparameters: Mapping[str, Any],
     device: str | None,

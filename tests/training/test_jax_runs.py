@@ -215,7 +215,10 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
         ({"hyperparameters": {"n_steps": "many"}}, "n_steps='many'.*valid integer"),
         ({"num_envs": 2}, "num_envs=2: must be 1"),
         ({"device": "abacus"}, "device='abacus': must be one of cpu"),
-        ({"agents": "sb3", "device": "cpu"}, r"device='cpu': is for agents in JAX.*--agents jax"),
+        (
+            {"agents": "sb3", "algorithm": "jax:PPO", "device": "cpu"},
+            r"device='cpu': is for agents in JAX.*--agents jax",
+        ),
     ],
 )
 def test_invalid_arguments_raise_typed_errors_and_create_no_folder(
