@@ -68,23 +68,28 @@ def test_a_wrapped_environment_runs_in_a_compiled_scan() -> None:
 
 def test_steps_are_those_of_the_functions_with_rescaled_actions() -> None:
     key, action = jax.random.key(1), jnp.array([0.5, -1.0, 3.0, 0.0], jnp.float32)
-    params = task_params("SME/Default-v1")
-    for range_ in ("symmetric", "unit"):
-        env = Environment(action_range=range_)
-        observation, state = env.reset(key)
-        assert (observation == functions.reset(key, params)[0]).all()
-        unit = functions.to_unit(action, range_ == "symmetric")
-        expected = jax.jit(functions.step)(key, state, unit, params)
-        after, _, reward, terminated, truncated, info = env.step(key, state, action, params)
-        assert (after == expected[0]).all()
-        assert reward == expected[2].astype(jnp.float32)
-        assert not terminated
-        assert not truncated
-        assert abs(info["regret"] - expected[4]["regret"]) < 1e-15
-        same = env.step_env(key, state, action)
-        assert len(same) == 5
-        assert (same[0] == info["final_observation"]).all()
-        assert not env.is_truncated(same[1])
+    env, params = Environment(), task_params("SME/Default-v1")
+    observation, state = env.reset(key)
+    after, _, reward, terminated, truncated, info = env.step(key, state, action, params)
+    unit = functions.to_unit(action, symmetric=True)
+    expected = jax.jit(functions.step)(key, state, unit, params)
+    assert (after == expected[0]).all()
+    assert (observation[:8] == state.s.astype(jnp.float32)).all()
+    assert reward == expected[2].astype(jnp.float32)
+    assert not terminated
+    assert not truncated
+    assert abs(info["regret"] - expected[4]["regret"]) < 1e-15
+
+
+def test_a_step_without_a_new_episode_keeps_the_last_state() -> None:
+    env = Environment("SME/Default-v1", horizon=1, D=0.9)
+    key, action = jax.random.key(0), jnp.zeros(4)
+    after, state, reward, terminated, info = jax.jit(env.step_env)(key, env.reset(key)[1], action)
+    assert env.is_truncated(state)
+    assert terminated
+    assert reward.dtype == jnp.float32
+    assert info["discount"] == 0.0
+    assert after[-2] == 1.0
 
 
 def test_names_and_spaces_are_those_of_the_task() -> None:
@@ -99,6 +104,7 @@ def test_names_and_spaces_are_those_of_the_task() -> None:
     assert sample.shape == (2,)
     assert actions.contains(sample)
     assert not actions.contains(sample + 2)
+    assert Environment(action_range="unit").action_space().low == 0.0
 
 
 def test_unknown_ranges_and_teams_are_refused() -> None:
