@@ -1,6 +1,6 @@
 """Evaluation within and out of distribution: a policy and a task to a report."""
 
-from sme_registry.evaluation.evaluate import evaluate, resolve_protocol
+from sme_registry.evaluation.evaluate import evaluate, evaluate_many, resolve_protocol
 from sme_registry.evaluation.policies import (
     OfflinePolicy,
     Perceptron,
@@ -29,6 +29,7 @@ __all__ = [
     "TeamPolicy",
     "as_policy",
     "evaluate",
+    "evaluate_many",
     "interface_of",
     "load_sb3",
     "reference_policy",

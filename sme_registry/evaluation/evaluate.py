@@ -2,32 +2,41 @@
 
 Source: METHOD, section 3. Memory holds one batch and the states of WD to which the references are
 fitted, regardless of the protocol's number of states.
+
+The similarity depends neither on k, r_min and D, nor on the horizon except through the t/T that the
+policy observes. So tasks that differ in these fields only share states, optimal actions and
+references, most of the cost of an evaluation: `evaluate_many` computes them once.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sme_registry.compiled import Engine, engine
-from sme_registry.errors import SpecError
+from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
+from sme_registry.evaluation.accumulators import Errors
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.regions import Observations, Uniform, observations, region_name
+from sme_registry.evaluation.regions import Observations, Uniform, observations
 from sme_registry.evaluation.report import (
     AgentReport,
-    ChannelReport,
     EvaluationReport,
     RegionReport,
 )
 from sme_registry.io import versions
-from sme_registry.spec import EvaluationProtocol, ProtocolFile, ProtocolLike, SpecLike, catalogue
+from sme_registry.spec import (
+    EvaluationProtocol,
+    ProtocolFile,
+    ProtocolLike,
+    SMESpec,
+    SpecLike,
+    catalogue,
+)
 from sme_registry.task import Task, load_spec, materialize
 from sme_registry.task.draw import Array
 
@@ -75,31 +84,51 @@ def evaluate(
     spec = load_spec(spec_or_id)
     protocol = resolve_protocol(protocol)
     prepared = as_policy(policy, spec, action_range=action_range, name=name, algorithm=algorithm)
-    task = materialize(spec)
-    oracle = engine(task)
-    channels = {_WHOLE: slice(0, spec.action_dim)}
-    if spec.team is not None:
-        channels |= zip(task.names, task.owned, strict=True)
+    [report] = evaluate_many([(prepared, spec)], protocol, progress=progress)
+    if isinstance(report, PolicyError):
+        raise report
+    return report
 
-    measured = list(_errors_by_region(prepared, task, oracle, protocol, channels, progress))
-    reports = {scope: _report(measured, protocol, scope) for scope in channels}
-    whole = reports.pop(_WHOLE)
-    return EvaluationReport(
-        policy=prepared.name,
-        action_range=prepared.action_range,
-        spec=spec,
-        spec_digest=spec.digest,
-        task=spec.name,
-        protocol=protocol,
-        protocol_digest=protocol.digest,
-        regions=whole.regions,
-        references=whole.references,
-        agents=reports,
-        versions=versions(
-            ["numpy", "scipy", "gymnasium", *(["numba"] if oracle.backend == "numba" else [])],
-            if_imported=_POLICY_LIBRARIES,
-        ),
-    )
+
+def evaluate_many(
+    policies: Sequence[tuple[Any, SpecLike]],
+    protocol: ProtocolLike = "paper-v1",
+    *,
+    progress: Progress | None = None,
+) -> list[EvaluationReport | PolicyError]:
+    """Evaluate many policies, each on its task, faster than one by one.
+
+    Tasks that differ only in k, r_min, D and the horizon are evaluated in one pass.
+
+    Args:
+      policies: each policy with its task, both as in `evaluate`; `as_policy` prepares a policy that
+        needs a name or an action range.
+      protocol: as in `evaluate`.
+      progress: called after each batch with the number of states done, and of all states; states
+        that several policies share count once.
+
+    Returns:
+      For each policy the report that `evaluate` would return, bit for bit; or, where its actions
+      are invalid, the error that `evaluate` would raise.
+
+    Raises:
+      As `evaluate`, except for invalid actions.
+    """
+    protocol = resolve_protocol(protocol)
+    subjects: list[_Subject] = []
+    groups: dict[str, list[int]] = {}
+    for index, (policy, task) in enumerate(policies):
+        spec = load_spec(task)
+        subjects.append((as_policy(policy, spec), spec))
+        groups.setdefault(_same_draw(spec), []).append(index)
+
+    reports: dict[int, EvaluationReport | PolicyError] = {}
+    states = protocol.states_per_region * len(protocol.edges)
+    for number, group in enumerate(groups.values()):
+        done = _offset(progress, number * states, len(groups) * states)
+        together = _evaluate_together([subjects[index] for index in group], protocol, done)
+        reports |= zip(group, together, strict=True)
+    return [reports[index] for index in range(len(subjects))]
 
 
 def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
@@ -121,149 +150,166 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     return catalogue.find(ProtocolFile, path).protocol
 
 
-_POLICY = ""  # the key of the evaluated policy among the references' names
+_Subject = tuple[Policy | TeamPolicy, SMESpec]
 _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
 _WHOLE = ""  # the key of all action channels among the agents' names
 
 
-class _Accumulator:
-    """Mean and spread of |a − a*| over states, and its sum for each action channel, in float64."""
-
-    def __init__(self, action_dim: int) -> None:
-        self._states = 0
-        self._mean = 0.0
-        # Σ (‖a − a*‖₁/A − mean)², which is exactly 0 for the optimum, unlike Σ x² − n m².
-        self._squares = 0.0
-        self._sums = np.zeros(action_dim)
-        self._clipped = 0
-
-    def add(self, errors: Array, sums: Array, clipped: int) -> None:
-        """Add a batch of |a − a*| `[B, A]` and the number of its entries that were clipped.
-
-        `sums` `[A]` over states are computed over all channels of a task at once, so that an
-        agent's channels have the same bits in its own report and in its team's.
-        """
-        deviations = errors.mean(axis=1)
-        count, mean = len(deviations), float(deviations.mean())
-        deviations -= mean
-        states = self._states + count
-        shift = mean - self._mean
-        self._squares += float(deviations @ deviations) + shift**2 * self._states * count / states
-        self._mean += shift * count / states
-        self._states = states
-        self._sums += sums
-        self._clipped += clipped
-
-    def report(
-        self,
-        region: int,
-        edges: tuple[float, float],
-        constant_half: _Accumulator,
-        wd: _Accumulator,
-    ) -> RegionReport:
-        """The report of this region; `constant_half` is of the policy ½, `wd` of this one in WD."""
-        similarity, wd_similarity = 1.0 - self._mean, 1.0 - wd._mean
-        channels = zip(self._sums, constant_half._sums, strict=True)
-        return RegionReport(
-            name=region_name(region),
-            epsilon_low=edges[0],
-            epsilon_high=edges[1],
-            states=self._states,
-            similarity=similarity,
-            similarity_sd=math.sqrt(self._squares / (self._states - 1)),
-            mae=self._mean,
-            normalised_regret=self._mean / constant_half._mean,
-            similarity_decay=(wd_similarity - similarity) / wd_similarity,
-            similarity_loss=100.0 * (wd_similarity - similarity),
-            clipped_share=self._clipped / (self._states * len(self._sums)),
-            channels=tuple(
-                ChannelReport(
-                    mae=float(total) / self._states, normalised_regret=float(total / half)
-                )
-                for total, half in channels
-            ),
-        )
-
-
-class _Errors(dict[str, _Accumulator]):
-    """A policy's errors in one region: over all action channels, and over each agent's."""
-
-    def __init__(self, channels: dict[str, slice]) -> None:
-        super().__init__(
-            {scope: _Accumulator(owned.stop - owned.start) for scope, owned in channels.items()}
-        )
-        self._channels = channels
-
-    def add(self, a: Array, optimal: Array, clipped: npt.NDArray[np.bool_] | None = None) -> None:
-        """Add a batch: `a` `[B, A]` or `[A]`, `optimal` and `clipped` `[B, A]`."""
-        errors = np.abs(a - optimal)
-        sums = errors.sum(axis=0)
-        for scope, owned in self._channels.items():
-            count = 0 if clipped is None else int(np.count_nonzero(clipped[:, owned]))
-            self[scope].add(errors[:, owned], sums[owned], count)
-
-
 class _Batch(NamedTuple):
-    """States and their optimal actions: `[B, S + 2]` float32, `[B, S]`, `[B, A]`."""
+    """States and their optimal actions: `[B, S]`, `[B, A]`.
 
-    observations: Observations
+    `observations` `[B, S + 2]` float32 are those of each horizon.
+    """
+
+    observations: dict[int, Observations]
     s: Array
     optimal: Array
 
 
-def _errors_by_region(
-    policy: Policy | TeamPolicy,
+# The key of a policy is its index, that of a reference its name.
+_ErrorsByKey = dict[int | str, Errors]
+
+
+def _same_draw(spec: SMESpec) -> str:
+    """The same for specs whose states, optimal actions and references are the same."""
+    return spec.derive(k=1, r_min=0.0, D=0.0, horizon=1).digest
+
+
+def _offset(progress: Progress | None, before: int, total: int) -> Progress:
+    """`progress` of a part, which `before` states precede."""
+    return lambda done, _: None if progress is None else progress(before + done, total)
+
+
+def _evaluate_together(
+    subjects: Sequence[_Subject], protocol: EvaluationProtocol, progress: Progress
+) -> list[EvaluationReport | PolicyError]:
+    """The reports of policies on tasks of the same draw, or why there is none."""
+    specs = [spec for _, spec in subjects]
+    task = materialize(specs[0])
+    oracle = engine(task)
+    channels = {_WHOLE: slice(0, task.spec.action_dim)}
+    if task.spec.team is not None:
+        channels |= zip(task.names, task.owned, strict=True)
+
+    failed: dict[int, PolicyError] = {}
+    measured = list(_measure(subjects, task, oracle, protocol, channels, progress, failed))
+
+    def regions(key: int | str, scope: str) -> tuple[RegionReport, ...]:
+        return _region_reports(measured, protocol, key, scope)
+
+    reports: list[EvaluationReport | PolicyError] = []
+    others: dict[str, dict[str, tuple[RegionReport, ...]]] = {}
+    if len(failed) < len(subjects):
+        others = {
+            scope: {key: regions(key, scope) for key in references.NAMES} for scope in channels
+        }
+    for index, (policy, spec) in enumerate(subjects):
+        if index in failed:
+            reports.append(failed[index])
+            continue
+        by_agent = {
+            scope: AgentReport(regions=regions(index, scope), references=others[scope])
+            for scope in channels
+        }
+        whole = by_agent.pop(_WHOLE)
+        reports.append(
+            EvaluationReport(
+                policy=policy.name,
+                action_range=policy.action_range,
+                spec=spec,
+                spec_digest=spec.digest,
+                task=spec.name,
+                protocol=protocol,
+                protocol_digest=protocol.digest,
+                regions=whole.regions,
+                references=whole.references,
+                agents=by_agent,
+                versions=versions(
+                    [
+                        "numpy",
+                        "scipy",
+                        "gymnasium",
+                        *(["numba"] if oracle.backend == "numba" else []),
+                    ],
+                    if_imported=_POLICY_LIBRARIES,
+                ),
+            )
+        )
+    return reports
+
+
+def _measure(
+    subjects: Sequence[_Subject],
     task: Task,
     oracle: Engine,
     protocol: EvaluationProtocol,
     channels: dict[str, slice],
-    progress: Progress | None,
-) -> Iterator[dict[str, _Errors]]:
-    """The errors of the policy and of each reference, by name, region after region."""
+    progress: Progress,
+    failed: dict[int, PolicyError],
+) -> Iterator[_ErrorsByKey]:
+    """The errors of the policies and of each reference, region after region.
+
+    Writes the policies that fail to `failed`, and ends once all have.
+    """
+    horizons = {spec.horizon: spec for _, spec in subjects}
     fitted: references.References | None = None
     total, done = protocol.states_per_region * len(protocol.edges), 0
     for region in range(len(protocol.edges)):
-        batches = _batches(task, oracle, protocol, region)
+        batches = _batches(horizons, oracle, protocol, region)
         if fitted is None:
             fitted, batches = _fit_references(batches, task)
-        errors = {name: _Errors(channels) for name in (_POLICY, *references.NAMES)}
+        errors: _ErrorsByKey = {
+            key: Errors(channels) for key in (*range(len(subjects)), *references.NAMES)
+        }
         random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
         for batch in batches:
-            unclipped = policy(batch.observations)
-            a = np.clip(unclipped, 0.0, 1.0)
-            errors[_POLICY].add(a, batch.optimal, a != unclipped)
+            for index, unclipped in _actions(subjects, batch, failed):
+                a = np.clip(unclipped, 0.0, 1.0)
+                errors[index].add(a, batch.optimal, a != unclipped)
+            if len(failed) == len(subjects):
+                return
             others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
             for name, a in others.items():
                 errors[name].add(a, batch.optimal)
             done += len(batch.s)
-            if progress is not None:
-                progress(done, total)
+            progress(done, total)
         yield errors
 
 
-def _report(
-    measured: list[dict[str, _Errors]], protocol: EvaluationProtocol, scope: str
-) -> AgentReport:
-    """The regions of the policy and of each reference, over the channels of a scope."""
-    by_name = {
-        name: tuple(
-            errors[name][scope].report(
-                region, edges, errors["constant_half"][scope], measured[0][name][scope]
-            )
-            for region, (edges, errors) in enumerate(zip(protocol.edges, measured, strict=True))
+def _actions(
+    subjects: Sequence[_Subject], batch: _Batch, failed: dict[int, PolicyError]
+) -> Iterator[tuple[int, Array]]:
+    """The actions of each policy that has not failed, not clipped; writes those that now fail."""
+    for index, (policy, spec) in enumerate(subjects):
+        if index not in failed:
+            try:
+                # A copy, since a policy may write into its observations.
+                yield index, policy(batch.observations[spec.horizon].copy())
+            except PolicyError as error:
+                failed[index] = error
+
+
+def _region_reports(
+    measured: list[_ErrorsByKey], protocol: EvaluationProtocol, key: int | str, scope: str
+) -> tuple[RegionReport, ...]:
+    """The regions of a policy or a reference, over the channels of a scope."""
+    return tuple(
+        errors[key][scope].report(
+            region, edges, errors["constant_half"][scope], measured[0][key][scope]
         )
-        for name in measured[0]
-    }
-    return AgentReport(regions=by_name.pop(_POLICY), references=by_name)
+        for region, (edges, errors) in enumerate(zip(protocol.edges, measured, strict=True))
+    )
 
 
 def _batches(
-    task: Task, oracle: Engine, protocol: EvaluationProtocol, region: int
+    horizons: dict[int, SMESpec], oracle: Engine, protocol: EvaluationProtocol, region: int
 ) -> Iterator[_Batch]:
-    for batch in observations(protocol, region, task.spec):
-        # A copy, so that a policy that writes into its observations does not change the states.
-        s = batch[:, : task.spec.state_dim].astype(np.float64)
-        yield _Batch(batch, s, oracle.optimal_action(s))
+    """The states of a region, with the observations that tasks of each horizon make of them."""
+    of_each = [observations(protocol, region, spec) for spec in horizons.values()]
+    S = next(iter(horizons.values())).state_dim
+    for parts in zip(*of_each, strict=True):
+        s = parts[0][:, :S].astype(np.float64)
+        yield _Batch(dict(zip(horizons, parts, strict=True)), s, oracle.optimal_action(s))
 
 
 def _fit_references(
