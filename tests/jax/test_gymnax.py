@@ -70,6 +70,7 @@ def test_steps_are_those_of_the_functions_with_rescaled_actions() -> None:
     key, action = jax.random.key(1), jnp.array([0.5, -1.0, 3.0, 0.0], jnp.float32)
     env, params = Environment(), task_params("SME/Default-v1")
     observation, state = env.reset(key)
+    assert not env.is_truncated(state)
     after, _, reward, terminated, truncated, info = env.step(key, state, action, params)
     unit = functions.to_unit(action, symmetric=True)
     expected = jax.jit(functions.step)(key, state, unit, params)
