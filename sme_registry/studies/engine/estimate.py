@@ -6,6 +6,7 @@ of the optimal policy:
 
     start + P · step + E · T · batch step + N · (state + layer · (L − 1))
 
+In JAX it is a lane of a program of ten on a CPU, and a batch step takes more for each layer, too.
 Once cells have finished, the sum after `start` is multiplied by the median ratio of their measured
 to their estimated seconds, over cells of the same algorithm and setting, or else of the same
 algorithm.
@@ -21,6 +22,7 @@ from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
 from sme_registry.studies.engine.algorithms import REFERENCE, independent_name
+from sme_registry.studies.engine.jobs import uses_jax
 from sme_registry.studies.engine.result import CellResult
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
@@ -42,6 +44,9 @@ _BATCH_STEP = (0.00006, 0.0005)  # one step of all episodes of an evaluation, wh
 _STATE = (1.5e-6, 3e-6)
 _LAYER = (1e-6, 3e-6)  # of π*, which is evaluated in every state
 _START = (1.5, 4.0)  # a process and its imports
+_START_IN_JAX = (0.4, 2.0)  # a tenth of them, and of compiling
+_BATCH_STEP_IN_JAX = (5e-7, 2e-6)
+_BATCH_LAYER_IN_JAX = (3.6e-6, 1.2e-5)
 
 
 class Span(NamedTuple):
@@ -63,7 +68,7 @@ class Estimator:
         """Learn from a finished cell, and from its wall time in seconds if that was measured."""
         expected = _work(result.cell).low
         if expected > 0 and result.timing.total > 0:
-            took = max(result.timing.total, (seconds or 0.0) - _START[0])
+            took = max(result.timing.total, (seconds or 0.0) - _start(result.cell).low)
             ratio = took / expected
             self._ratios[result.cell.uses].append(ratio)
             self._ratios[result.cell.uses, _setting(result.cell)].append(ratio)
@@ -76,10 +81,11 @@ class Estimator:
         """Estimate the cell on one core."""
         work = _work(cell)
         ratios = self._ratios.get((cell.uses, _setting(cell))) or self._ratios.get(cell.uses)
+        start = _start(cell)
         if ratios:
-            seconds = _START[0] + work.low * statistics.median(ratios)
+            seconds = start.low + work.low * statistics.median(ratios)
             return Span(seconds, seconds)
-        return Span(_START[0] + work.low, _START[1] + work.high)
+        return Span(start.low + work.low, start.high + work.high)
 
 
 def makespan(seconds: Sequence[float], workers: int) -> float:
@@ -99,10 +105,18 @@ def _work(cell: Cell) -> Span:
 
     def bound(i: int) -> float:
         training = transitions * step[i]
-        curve = cell.evaluations * cell.spec.horizon * _BATCH_STEP[i]
-        return training + curve + states * (_STATE[i] + _LAYER[i] * (cell.spec.complexity - 1))
+        inner = cell.spec.complexity - 1
+        batch_step = _BATCH_STEP[i]
+        if uses_jax(cell):
+            batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * inner
+        curve = cell.evaluations * cell.spec.horizon * batch_step
+        return training + curve + states * (_STATE[i] + _LAYER[i] * inner)
 
     return Span(bound(0), bound(1))
+
+
+def _start(cell: Cell) -> Span:
+    return Span(*(_START_IN_JAX if uses_jax(cell) else _START))
 
 
 def _agents(spec: SMESpec) -> int:

@@ -33,6 +33,7 @@ from sme_registry.studies.engine.status import StudyStatus, label, plan_status
 from sme_registry.terminal import Progress, duration
 from sme_registry.training.record import versions_for
 
+_SHARE_FOR_A_PACE = 0.02  # of a job, before its pace is measured
 EXECUTORS = ("processes", "in-process", "ray")
 
 
@@ -185,6 +186,8 @@ class _StudyRun:
         }
         self._running: dict[str, _Running] = {}
         self._shares: dict[str, float] = {}  # of a running cell's steps, done
+        self._first_reports: dict[str, tuple[float, float]] = {}  # time and share, of each job
+        self._paces: dict[str, float] = {}  # measured by estimated seconds, of each algorithm
         self._unwritten: list[Outcome] = []
         self._progress = Progress(
             f"study {file.versioned_name}",
@@ -271,10 +274,17 @@ class _StudyRun:
         seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
         for key in (*self._running, *self._waiting):
             cell = self._planned[key].cell
-            span = self._estimator.seconds(cell)
-            rest = (span.low + span.high) / 2 * (1 - self._shares.get(key, 0.0))
+            rest = self._seconds(cell) * (1 - self._shares.get(key, 0.0))
             seconds[self._one_at_a_time(cell)].append(rest)
         return max(sum(seconds[True]), makespan(seconds[False], self._executor.workers))
+
+    def _seconds(self, cell: Cell) -> float:
+        """A whole cell's seconds; before one of its algorithm has finished, by the pace of those
+        that run.
+        """
+        low, high = self._estimator.seconds(cell)
+        pace = 1.0 if self._estimator.knows(cell) else self._paces.get(cell.uses, 1.0)
+        return pace * (low + high) / 2
 
     def _one_at_a_time(self, cell: Cell) -> bool:
         """Whether a cell's program has the device to itself."""
@@ -381,7 +391,12 @@ class _StudyRun:
         return f"{first}, and {len(others)} more" if others else first
 
     def _report(self, job: Job, done: int, total: int) -> None:
-        share = done / total if total else 1.0
+        share, now = done / total if total else 1.0, time.monotonic()
+        first = job.cells[0]
+        then, before = self._first_reports.setdefault(first.digest, (now, share))
+        if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
+            measured = (now - then) / (share - before) / len(job.cells)
+            self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
         self._shares |= {cell.digest: share for cell in job.cells}
         note = f"{done:,} of {total:,} steps" if done < total else "evaluating"
         self._progress.update_part(self._name(job), share, note)
