@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -198,21 +198,6 @@ class Program(ABC):
         )
         return Evaluation(*(np.asarray(each) for each in sums))
 
-    def policy(self, lane: int) -> Callable[[Array], Array]:
-        """A lane's present deterministic policy.
-
-        It maps observations `[B, S + 2]` float32 to actions `[B, A]` in the action range, or beyond
-        it, without padding.
-        """
-        weights = jax.device_put(self.weights(lane), self.device)
-
-        def act(observations: Array) -> Array:
-            settings = self.settings
-            actions = _actions(type(self).act, settings, self.symmetric, weights, observations)
-            return np.asarray(actions)
-
-        return act
-
     def weights(self, lane: int) -> dict[str, Array]:
         """A lane's weights without padding, by SB3's names, as NumPy arrays."""
         padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
@@ -289,6 +274,20 @@ class Program(ABC):
         longer = np.zeros(present.shape, present.dtype)
         longer[: len(saved)] = saved
         return longer
+
+
+def policy(
+    kind: type[Program], settings: Any, weights: Mapping[str, Any], symmetric: bool
+) -> Callable[[Array], Array]:
+    """The deterministic policy of a lane's weights, without padding.
+
+    It maps observations `[B, S + 2]` float32 to actions `[B, A]` in the action range, or beyond it.
+    """
+
+    def act(observations: Array) -> Array:
+        return np.asarray(_actions(kind.act, settings, symmetric, dict(weights), observations))
+
+    return act
 
 
 def _widths(spec: SMESpec) -> Widths:

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
-from sme_registry.jax.program import Array, Evaluation, Program, StepLog
+from sme_registry.jax.program import Array, Evaluation, Program, StepLog, policy
 from sme_registry.jax.task import Shape
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import JAX
@@ -107,9 +107,7 @@ def new_program(
       OptionError: see `settings_of`; or there is no such device.
       SpecError: a task is not one that JAX has, such as a team's.
     """
-    name = full_name(uses)
-    program: type[Program] = getattr(_module(name), f"{name.removeprefix(JAX)}Program")
-    return program(
+    return _program(uses)(
         settings_of(uses, hyperparameters or {}),
         specs,
         seeds,
@@ -119,6 +117,18 @@ def new_program(
         shape=shape,
         device=device,
     )
+
+
+def policy_of(
+    uses: str,
+    weights: Mapping[str, Array],
+    *,
+    hyperparameters: Mapping[str, Any] | None = None,
+    action_range: str = "symmetric",
+) -> Callable[[Array], Array]:
+    """The deterministic policy of weights; see `program.policy`, and `new_program` for errors."""
+    settings = settings_of(uses, hyperparameters or {})
+    return policy(_program(uses), settings, weights, action_range == "symmetric")
 
 
 def run(
@@ -191,6 +201,12 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
     own = [np.concatenate(lane) for lane in zip(*groups, strict=True)]
     lanes = own + own[:1] * (program.lanes - len(own))
     return np.stack([np.pad(states, [(0, 0), (0, S - states.shape[1])]) for states in lanes])
+
+
+def _program(uses: str) -> type[Program]:
+    name = full_name(uses)
+    program: type[Program] = getattr(_module(name), f"{name.removeprefix(JAX)}Program")
+    return program
 
 
 def _module(uses: str) -> Any:

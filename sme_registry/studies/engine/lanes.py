@@ -9,21 +9,26 @@ the same bits.
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import evaluate
+from sme_registry.evaluation import EvaluationReport, as_policy, evaluate_many
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.jobs import CPU, Lanes
+from sme_registry.studies.engine.jobs import CPU, Lanes, child_environment
 from sme_registry.studies.engine.program_state import Arrays, read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
+from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -73,7 +78,7 @@ class _Run:
         from sme_registry.jax.task import Shape
 
         cell = self._cell = cells[0]
-        self._state, self._progress = lanes.state, progress
+        self._state, self._processes, self._progress = lanes.state, lanes.processes, progress
         self._own = {cell.digest: cell for cell in cells}
         self._keys = _keys_of_lanes(list(self._own), lanes.state)
         # Of a lane whose cell ended elsewhere, only the place remains.
@@ -125,33 +130,48 @@ class _Run:
         self._note_failures()
 
     def results(self, keep_models: bool) -> Iterator[Ended]:
-        """Evaluate the trained policies within and out of distribution."""
+        """Evaluate the trained policies within and out of distribution.
+
+        Those with tasks of the same draw are evaluated together, which is faster.
+        """
+        draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes with tasks of one draw
         for lane, key in enumerate(self._keys):
-            if key not in self._own:
-                continue
-            cell, step = self._own[key], int(self._records["failed_at"][lane])
-            if step >= 0:
-                yield cell, _not_finite(step), None
-                continue
-            start = self._clock()
-            report = evaluate(
-                self._program.policy(lane),
-                cell.spec,
-                cell.protocol,
-                action_range=cell.action_range,
-                name=cell.uses,
-            )
-            result = CellResult(
-                key=key,
-                cell=cell,
-                curve=self._curve(lane),
-                report=report,
-                online_regret=self._online_regret(lane),
-                program=self._made,
-                timing=self._timing(self._clock() - start),
-                versions=self._versions,
-            )
-            yield cell, result, self._model(lane) if keep_models else None
+            if key in self._own:
+                cell, step = self._cells[lane], int(self._records["failed_at"][lane])
+                if step >= 0:
+                    yield cell, _not_finite(step), None
+                else:
+                    draws[cell.spec.seed, cell.protocol.digest].append(lane)
+        groups = [
+            [_Trained(self._cells[lane], self._program.weights(lane)) for lane in group]
+            for group in draws.values()
+        ]
+        evaluated = _evaluate(groups, self._processes)
+        for group, (reports, seconds) in zip(draws.values(), evaluated, strict=True):
+            for lane, report in zip(group, reports, strict=True):
+                yield self._ended(lane, report, seconds / len(group), keep_models)
+
+    def _ended(
+        self,
+        lane: int,
+        report: EvaluationReport | PolicyError,
+        seconds: float,
+        keep_models: bool,
+    ) -> Ended:
+        cell = self._cells[lane]
+        if isinstance(report, PolicyError):
+            return cell, report, None
+        result = CellResult(
+            key=cell.digest,
+            cell=cell,
+            curve=self._curve(lane),
+            report=report,
+            online_regret=self._online_regret(lane),
+            program=self._made,
+            timing=self._timing(seconds),
+            versions=self._versions,
+        )
+        return cell, result, self._model(lane) if keep_models else None
 
     def _start_states(self, k: int) -> list[Any]:
         return [
@@ -250,6 +270,54 @@ class _Run:
             return
         self._records = {name: arrays.pop(f"records/{name}") for name in self._records}
         self._program.restore({name.removeprefix("program/"): a for name, a in arrays.items()})
+
+
+class _Trained(NamedTuple):
+    """A cell and its trained weights, by SB3's names."""
+
+    cell: Cell
+    weights: Arrays
+
+
+_Evaluated = tuple[list[EvaluationReport | PolicyError], float]
+"""The reports of some cells, or why there is none, and the CPU seconds of all of them."""
+
+
+def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluated]:
+    """Evaluate groups of cells with tasks of one draw, in order."""
+    if processes == 1:
+        yield from map(_evaluate_together, groups)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    # On CPUs: a device that runs programs has one process.
+    with (
+        child_environment({"JAX_PLATFORMS": CPU}),
+        ProcessPoolExecutor(processes, spawn, _begin_worker) as pool,
+    ):
+        yield from pool.map(_evaluate_together, groups)
+
+
+def _evaluate_together(group: list[_Trained]) -> _Evaluated:
+    from sme_registry.jax.run import policy_of
+
+    start = time.process_time()
+    policies = []
+    for cell, weights in group:
+        act = policy_of(
+            cell.uses,
+            weights,
+            hyperparameters=cell.hyperparameters,
+            action_range=cell.action_range,
+        )
+        range_, name = cell.action_range, cell.uses
+        policies.append((as_policy(act, cell.spec, action_range=range_, name=name), cell.spec))
+    reports = evaluate_many(policies, group[0].cell.protocol)
+    return reports, time.process_time() - start
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
 
 
 def _keys_of_lanes(keys: list[str], state: Path | None) -> list[str]:

@@ -9,13 +9,10 @@ driver.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
-import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
@@ -32,8 +29,8 @@ from sme_registry.studies.engine.executors import (
     failed,
     run_job,
 )
-from sme_registry.studies.engine.jobs import Job, available_cores
-from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts
+from sme_registry.studies.engine.jobs import Job, available_cores, child_environment
+from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts, end_with_parent
 
 _SECONDS_TO_END = 10.0
 # One thread for each library that would take every core: the jobs share the cores, one each.
@@ -108,7 +105,7 @@ class _JobProcess:
         unfinished = {cell.digest: cell for cell in job.cells}
         log = scratch / f"{next(iter(unfinished)).removeprefix('sha256:')}.log"
         process = spawn.Process(target=_child, args=(child_end, run, job, keep_models, log))
-        with _one_thread(), block_interrupts():
+        with child_environment(_ONE_THREAD), block_interrupts():
             process.start()
         child_end.close()  # so that the pipe ends when the process does
         return cls(job, process, pipe, log, unfinished)
@@ -148,7 +145,7 @@ class _JobProcess:
 def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> None:
     """Run one job: the main function of its process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_parent()
+    end_with_parent()
     # Studies run for days, and many machines remove old files from the temporary folder.
     log.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with contextlib.suppress(OSError):  # what libraries print is for the failure, not the terminal
@@ -158,33 +155,3 @@ def _child(pipe: Any, run: RunCell, job: Job, keep_models: bool, log: Path) -> N
     tempfile.tempdir = str(log.parent)  # which the driver removes, also after a kill
     for outcome in run_job(run, job, keep_models, lambda *steps: pipe.send(_Steps(*steps))):
         pipe.send(outcome)
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent ends, for any reason."""
-    if sys.platform == "linux":
-        set_parent_death_signal = 1  # PR_SET_PDEATHSIG
-        ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait_for_parent() -> None:
-        parent.join()  # returns at the end of a pipe that only the parent holds
-        os._exit(1)
-
-    threading.Thread(target=wait_for_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes started inside the block are limited to one thread before they import anything."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
