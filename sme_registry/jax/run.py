@@ -7,7 +7,6 @@ run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,12 +14,21 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import Array, Evaluation, Program, StepLog, policy
+from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
+from sme_registry.jax.td3 import TD3, TD3Program
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import JAX
 
-ALGORITHMS = ("PPO", "TD3", "SAC")
+ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
+    "PPO": (PPO, PPOProgram),
+    "TD3": (TD3, TD3Program),
+    "SAC": (SAC, SACProgram),
+}
+"""Hyperparameters and program of each algorithm."""
+
 POLICY = "policy_kwargs"
 _OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `policy_kwargs`
 _PIECE = 500  # steps
@@ -61,18 +69,19 @@ def settings_of(
       UnknownNameError: no such algorithm.
       OptionError: it has no such hyperparameter here, or not this value.
     """
-    kind = _class(full_name(uses))
+    name = full_name(uses)
+    kind, _ = ALGORITHMS[name.removeprefix(JAX)]
     fields = {each.name for each in dataclasses.fields(kind)}
     known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in sorted(fields)}
     values = {}
-    for name, value in _flat(hyperparameters).items():
-        if name not in known:
+    for given, value in _flat(hyperparameters).items():
+        if given not in known:
             raise OptionError(
-                f"{field}.{name}: {full_name(uses)} has no such hyperparameter."
-                f"{did_you_mean(name, [*known, *others])} Known: {', '.join(known)}. For "
+                f"{field}.{given}: {name} has no such hyperparameter."
+                f"{did_you_mean(given, [*known, *others])} Known: {', '.join(known)}. For "
                 "others, use the algorithm of Stable-Baselines3."
             )
-        values[known[name]] = value
+        values[known[given]] = value
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
@@ -81,9 +90,9 @@ def settings_of(
         if isinstance(own_error, OptionError):  # of values that do not go together
             raise own_error from None
         place = ".".join(str(part) for part in fault["loc"][:1])
-        name = next((shown for shown, own in known.items() if own == place), place)
+        shown = next((shown for shown, own in known.items() if own == place), place)
         raise OptionError(
-            f"{field}.{name}={values.get(place, values)!r:.60}: {fault['msg']}. Correct it, or "
+            f"{field}.{shown}={values.get(place, values)!r:.60}: {fault['msg']}. Correct it, or "
             "leave it out for the default."
         ) from None
 
@@ -107,7 +116,8 @@ def new_program(
       OptionError: see `settings_of`; or there is no such device.
       SpecError: a task is not one that JAX has, such as a team's.
     """
-    return _program(uses)(
+    _, program = ALGORITHMS[full_name(uses).removeprefix(JAX)]
+    return program(
         settings_of(uses, hyperparameters or {}),
         specs,
         seeds,
@@ -127,8 +137,9 @@ def policy_of(
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
     """The deterministic policy of weights; see `program.policy`, and `new_program` for errors."""
+    _, program = ALGORITHMS[full_name(uses).removeprefix(JAX)]
     settings = settings_of(uses, hyperparameters or {})
-    return policy(_program(uses), settings, weights, action_range == "symmetric")
+    return policy(program, settings, weights, action_range == "symmetric")
 
 
 def run(
@@ -201,20 +212,6 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
     own = [np.concatenate(lane) for lane in zip(*groups, strict=True)]
     lanes = own + own[:1] * (program.lanes - len(own))
     return np.stack([np.pad(states, [(0, 0), (0, S - states.shape[1])]) for states in lanes])
-
-
-def _program(uses: str) -> type[Program]:
-    name = full_name(uses)
-    program: type[Program] = getattr(_module(name), f"{name.removeprefix(JAX)}Program")
-    return program
-
-
-def _module(uses: str) -> Any:
-    return importlib.import_module(f"sme_registry.jax.{uses.removeprefix(JAX).lower()}")
-
-
-def _class(uses: str) -> Any:
-    return getattr(_module(uses), uses.removeprefix(JAX))
 
 
 def _flat(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
