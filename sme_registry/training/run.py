@@ -165,7 +165,7 @@ def train(
     record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread():
         training = _training(record)
-        # Rejects values of hyperparameters before the folder is created.
+        # Rejects values of hyperparameters, and tasks, before the folder is created.
         model = training.new_model(record)
         if record.sessions == 1:
             _claim(folder, force=force)
@@ -262,10 +262,8 @@ def _with_jax_algorithm(
     from sme_registry.jax.device import find_device
     from sme_registry.jax.run import full_name as known_name
     from sme_registry.jax.run import settings_of
-    from sme_registry.jax.task import check_supported
 
     known_name(uses, "algorithm")
-    check_supported(plan.spec)
     settings_of(uses, settings)
     if num_envs not in (None, 1):
         raise OptionError(

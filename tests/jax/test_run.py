@@ -76,11 +76,11 @@ def scripted_run(program: Scripted, due: list[int], **changes: Any) -> list[Any]
 
 def test_evaluations_precede_the_update_of_their_step_and_the_last_one_follows_all() -> None:
     program = Scripted(budget=10)
-    rows = scripted_run(program, [2, 5, 10], piece=4)
-    assert rows == [(0, 2, 1, [10, 10]), (1, 5, 4, [11, 11]), (2, 10, 10, [12, 12])]
+    rows = scripted_run(program, [2, 3, 10], piece=4)
+    assert rows == [(0, 2, 1, [10, 10]), (1, 3, 2, [11, 11]), (2, 10, 10, [12, 12])]
     one = ("evaluate", (3, 2, 2))
     assert program.events == [
-        ("steps", 2), one, ("steps", 3), one, ("steps", 4), ("steps", 1), "finish", one,
+        ("steps", 2), one, ("steps", 1), one, ("steps", 4), ("steps", 3), "finish", one,
     ]  # fmt: skip
 
 
@@ -108,8 +108,11 @@ def test_a_run_without_steps_is_only_evaluated() -> None:
     assert "finish" not in program.events
 
 
-def test_the_state_may_be_saved_after_each_piece() -> None:
-    program, saved = Scripted(budget=10), list[int]()
+def test_the_state_may_be_saved_after_each_piece_and_its_evaluations() -> None:
+    program = Scripted(budget=10)
+    saved = program.events
     scripted_run(program, [5, 10], piece=3, after_piece=lambda: saved.append(program.steps))
-    assert saved == [3, 5, 8, 10]
-    assert program.events[-2] == "finish"
+    one = ("evaluate", (3, 2, 2))
+    assert saved == [
+        ("steps", 3), 3, ("steps", 2), one, 5, ("steps", 3), 8, ("steps", 2), 10, "finish", one,
+    ]  # fmt: skip
