@@ -154,6 +154,8 @@ QUANTITIES = {
     "window": "rows of the running median",
     "sessions": "number of times a run was started",
     "num_envs": "environments in parallel",
+    "lanes": "runs in one program of JAX, with those that fill it up",
+    "shape": "S, A, L and H to which the tasks of a program are padded",
     "agents": "number of agents",
     "attempts": "number of attempts at a cell",
     "runs": "number of runs of a class",
