@@ -80,7 +80,7 @@ class _Run:
         cell = self._cell = cells[0]
         self._state, self._processes, self._progress = lanes.state, lanes.processes, progress
         self._own = {cell.digest: cell for cell in cells}
-        self._keys = _keys_of_lanes(list(self._own), lanes.state)
+        self._keys = _keys_of_lanes(list(self._own), lanes.state, lanes.count)
         # Of a lane whose cell ended elsewhere, only the place remains.
         self._cells = [self._own.get(key, cell) for key in self._keys]
         self._program: Program = new_program(
@@ -320,11 +320,11 @@ def _begin_worker() -> None:
     end_with_parent()
 
 
-def _keys_of_lanes(keys: list[str], state: Path | None) -> list[str]:
+def _keys_of_lanes(keys: list[str], state: Path | None, count: int) -> list[str]:
     """The cells of the lanes, in order: those of a saved state that includes all of `keys`."""
     saved = None if state is None else read_header(state)
-    in_state: list[str] = [] if saved is None else saved["cells"]
-    return in_state if set(keys) <= set(in_state) else keys
+    in_state: list[str] = [] if saved is None else list(saved.get("cells", []))
+    return in_state if set(keys) <= set(in_state) and len(in_state) <= count else keys
 
 
 def _not_finite(step: int) -> PolicyError:

@@ -254,6 +254,17 @@ def test_a_state_of_other_versions_is_not_used(
     assert numbers(tmp_path).items() <= numbers(whole).items()
 
 
+def test_a_state_of_more_lanes_is_not_used(tmp_path: Path) -> None:
+    file = plan_file(steps=0, evaluations=0)
+    keys = [planned.cell.digest for planned in file.plan.cells if planned.algorithm == "agent"]
+    state = Ledger(tmp_path).state_path(keys)
+    write_state(state, {"cells": keys}, {})
+    assert ran(tmp_path, file, lanes=2).count("done") == 4
+    programs = [result.program for result in Ledger(tmp_path).results().values()]
+    assert {program.lanes for program in programs if program is not None} == {2}
+    assert not state.exists()
+
+
 def test_a_cell_by_itself_is_a_program_of_one_lane(tmp_path: Path) -> None:
     cell = plan_file(steps=0, evaluations=0).plan.cells[0].cell
     result = run_cell(cell, model_path=tmp_path / "model.zip")
