@@ -73,6 +73,10 @@ COMPARED = 256
 _Array = npt.NDArray[np.float64]
 _WHERE = ("inside", "outside")
 
+# SciPy loads a table for the first generator, in code that loses an interrupt and prints it. In a
+# scorer's process, interrupts are blocked while this module is imported.
+qmc.Sobol(1)
+
 
 @dataclass(frozen=True, eq=False)
 class _Half:

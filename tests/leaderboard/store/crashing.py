@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,19 @@ CALLS = ("fsync", "link", "replace", "rename", "unlink", "fchmod")
 _CRASHED = 77
 
 
+def fork() -> int:
+    """`os.fork`. JAX, if an earlier test has loaded it, warns of its threads; no child uses it."""
+    with warnings.catch_warnings(action="ignore"):
+        return os.fork()
+
+
 def crashes_before(call: int, work: Callable[[], object]) -> bool:
     """Do some work in a copy of this process, which is gone before its n-th call that matters.
 
     Returns:
       Whether there were so many calls; False means that the work was done.
     """
-    child = os.fork()
+    child = fork()
     if child == 0:
         status = 1
         try:

@@ -23,7 +23,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
-from tests.leaderboard.store.crashing import make_read_only, small_disk
+from tests.leaderboard.store.crashing import fork, make_read_only, small_disk
 from tests.leaderboard.store.synthetic import synthetic_result
 
 
@@ -271,7 +271,7 @@ def test_a_board_on_a_read_only_disk_is_read(tmp_path, key, killed):
         store = tiny_board(disk / "board")
         fill(store, key, waiting=True)
         if killed:  # the last writes are then only in the write-ahead log
-            child = os.fork()
+            child = fork()
             if child == 0:
                 other = Store.open(disk / "board")
                 put_submission(other, key, 7)
@@ -310,7 +310,7 @@ def test_transactions_of_processes_do_not_overlap(tmp_path, key, deleted):
     tiny_board(tmp_path / "board").close()
     children = []
     for worker in range(3):
-        child = os.fork()
+        child = fork()
         if child == 0:
             status = 1
             try:
