@@ -245,8 +245,15 @@ def run_scorers(
     integer_in("workers", workers, 1, advice="Leave it out for one.")
     with Store.open(path) as store:
         scorers = _Scorers(path, store, workers, (until_empty, lease_seconds, isolation))
-        before, done = store.queue.done(), 0
+        before = store.queue.done()
         store.queue.retry()
+
+        def report() -> int:
+            done = store.queue.done() - before
+            if progress is not None:
+                progress(done, done + store.queue.waiting())
+            return done
+
         try:
             while not until_empty or scorers.are_needed():
                 if stop and stop():
@@ -255,12 +262,10 @@ def run_scorers(
                     if started is not None:
                         started(pid)
                 scorers.watch()
-                done = store.queue.done() - before
-                if progress is not None:
-                    progress(done, done + store.queue.waiting())
+                report()
         finally:
             scorers.stop()
-    return done
+        return report()  # one may have been done since the last
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,18 @@ def test_several_processes_score_everything_once(store, board):
     assert run_scorers(board, 2) == 0
 
 
+def test_a_submission_done_after_the_last_look_counts(store, board):
+    seen = []
+
+    def wait_for_the_last(done: int, total: int) -> None:
+        seen.append((done, total))
+        while done == 2 and store.queue.done() < 3:
+            time.sleep(0.01)
+
+    assert run_scorers(board, 1, progress=wait_for_the_last) == 3
+    assert seen[-1] == (3, 3)
+
+
 def test_zero_workers_are_refused(tmp_path):
     with pytest.raises(OptionError, match="workers=0"):
         run_scorers(tmp_path, 0)
