@@ -15,13 +15,14 @@ import multiprocessing
 import os
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sme_registry.io import to_json
 from sme_registry.spec import Cell, SMESpec
 from sme_registry.spec.study import JAX
+from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
     from sme_registry.jax.task import Shape
@@ -42,6 +43,10 @@ class Lanes:
       shape: to which the tasks are padded.
       device: "cpu", "gpu" or "tpu"; None for JAX's default.
       state: the file of its state, written every few minutes; None to write none.
+      made_with: what a state must have been made with for others to go on from it.
+      cells: those of the lanes of a state to go on from, in order. Each keeps its own task, also if
+        it is none of the job's: another job may go on from the state that this one writes. Empty
+        for those of the job.
       processes: that evaluate the trained policies.
     """
 
@@ -49,6 +54,8 @@ class Lanes:
     shape: Shape | None = None
     device: str | None = None
     state: Path | None = None
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+    cells: tuple[Cell, ...] = ()
     processes: int = 1
 
 
@@ -107,7 +114,9 @@ class Programs:
         self.platform, self._device = platform, device
         self._most = most_lanes or (_MOST_LANES if platform == CPU else _MOST_LANES_ELSEWHERE)
         self._shapes: dict[Hashable, dict[str, Shape]] = defaultdict(dict)
+        self._cells: dict[str, Cell] = {}
         for cell in filter(uses_jax, cells):
+            self._cells[cell.digest] = cell
             self._shapes[self.group(cell)][cell.digest] = _shape(cell.spec)
 
     @property
@@ -120,13 +129,24 @@ class Programs:
         size = len(self._shapes[self.group(cell)])
         return math.ceil(size / math.ceil(size / self._most))
 
-    def program(self, cell: Cell, state: Path | None = None) -> Lanes:
-        """The program of a cell."""
+    def program(self, cell: Cell) -> Lanes:
+        """The program of a cell, still without a state."""
         from sme_registry.jax.task import Shape
 
-        shape = Shape.covering(self._shapes[self.group(cell)].values())
+        count, shape = self.lanes(cell), Shape.covering(self._shapes[self.group(cell)].values())
+        made_with = {
+            "lanes": count,
+            "shape": list(shape),
+            "platform": self.platform,
+            "versions": versions_for(cell.uses),
+        }
         processes = available_cores() if self.one_at_a_time else 1
-        return Lanes(self.lanes(cell), shape, self._device, state, processes)
+        return Lanes(count, shape, self._device, made_with=made_with, processes=processes)
+
+    def cells(self, keys: Iterable[str]) -> tuple[Cell, ...] | None:
+        """The cells of the plan with these keys; None if one of them is not in it any longer."""
+        known = [self._cells.get(key) for key in keys]
+        return tuple(cell for cell in known if cell is not None) if None not in known else None
 
     def group(self, cell: Cell) -> Hashable:
         """What the cells of a program have in common."""

@@ -15,7 +15,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.jobs import CPU, Lanes, child_environment
-from sme_registry.studies.engine.program_state import Arrays, read_header, read_state, write_state
+from sme_registry.studies.engine.program_state import Arrays, read_state, write_state
 from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
 from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
@@ -78,11 +77,10 @@ class _Run:
         from sme_registry.jax.task import Shape
 
         cell = self._cell = cells[0]
-        self._state, self._processes, self._progress = lanes.state, lanes.processes, progress
+        self._lanes, self._progress = lanes, progress
         self._own = {cell.digest: cell for cell in cells}
-        self._keys = _keys_of_lanes(list(self._own), lanes.state, lanes.count)
-        # Of a lane whose cell ended elsewhere, only the place remains.
-        self._cells = [self._own.get(key, cell) for key in self._keys]
+        self._cells = lanes.cells or tuple(cells)
+        self._keys = [each.digest for each in self._cells]
         self._program: Program = new_program(
             cell.uses,
             [each.spec for each in self._cells],
@@ -99,7 +97,6 @@ class _Run:
             lanes=lanes.count,
             shape=lanes.shape or Shape.of(cell.spec),
         )
-        self._versions = versions_for(cell.uses)
         n = cell.evaluations
         self._due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self._clock = time.process_time if self._program.device.platform == CPU else time.monotonic
@@ -146,7 +143,7 @@ class _Run:
             [_Trained(self._cells[lane], self._program.weights(lane)) for lane in group]
             for group in draws.values()
         ]
-        evaluated = _evaluate(groups, self._processes)
+        evaluated = _evaluate(groups, self._lanes.processes)
         for group, (reports, seconds) in zip(draws.values(), evaluated, strict=True):
             for lane, report in zip(group, reports, strict=True):
                 yield self._ended(lane, report, seconds / len(group), keep_models)
@@ -169,7 +166,7 @@ class _Run:
             online_regret=self._online_regret(lane),
             program=self._made,
             timing=self._timing(seconds),
-            versions=self._versions,
+            versions=versions_for(cell.uses),
         )
         return cell, result, self._model(lane) if keep_models else None
 
@@ -253,19 +250,19 @@ class _Run:
 
     def _header(self) -> dict[str, Any]:
         """What a state must have been made with to be gone on from."""
-        program = self._made.to_dict()
-        return {"cells": self._keys, "program": program, "versions": self._versions}
+        return {"cells": self._keys, "device": self._made.device, **self._lanes.made_with}
 
     def _save(self) -> None:
-        if self._state is None:
+        if self._lanes.state is None:
             return
         arrays = {f"program/{name}": array for name, array in self._program.save().items()}
         arrays |= {f"records/{name}": array for name, array in self._records.items()}
         with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
-            write_state(self._state, self._header(), arrays)
+            write_state(self._lanes.state, self._header(), arrays)
 
     def _restore(self) -> None:
-        arrays = None if self._state is None else read_state(self._state, self._header())
+        state = self._lanes.state
+        arrays = None if state is None else read_state(state, self._header())
         if arrays is None:
             return
         self._records = {name: arrays.pop(f"records/{name}") for name in self._records}
@@ -318,13 +315,6 @@ def _evaluate_together(group: list[_Trained]) -> _Evaluated:
 def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
-
-
-def _keys_of_lanes(keys: list[str], state: Path | None, count: int) -> list[str]:
-    """The cells of the lanes, in order: those of a saved state that includes all of `keys`."""
-    saved = None if state is None else read_header(state)
-    in_state: list[str] = [] if saved is None else list(saved.get("cells", []))
-    return in_state if set(keys) <= set(in_state) and len(in_state) <= count else keys
 
 
 def _not_finite(step: int) -> PolicyError:

@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -170,26 +170,38 @@ class Ledger:
         """
         return file_lock(self.folder / LOCKS / "programs")
 
-    def state_path(self, keys: Iterable[str]) -> Path:
-        """Where the state of a new program of these cells goes."""
-        name = hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
+    def state_path(self, keys: Iterable[str], made_with: Mapping[str, Any] | None = None) -> Path:
+        """Where the state of a new program of these cells goes, made with this."""
+        identity = f"{' '.join(keys)} {to_json(made_with or {})}"
+        name = hashlib.sha256(identity.encode()).hexdigest()[:16]
         return self.folder / STATES / f"{name}.npz"
 
-    def state_of(self, key: str) -> SavedState | None:
-        """A saved state of a program that has this cell as a lane."""
-        for path in sorted((self.folder / STATES).glob("*.npz")):
-            keys = (read_header(path) or {}).get("cells", [])
-            if key in keys:
+    def state_of(self, key: str, made_with: Mapping[str, Any]) -> SavedState | None:
+        """A saved state, made with the same, of a program that has this cell as a lane."""
+        for path in self._states():
+            header = read_header(path) or {}
+            keys = header.get("cells", [])
+            if key in keys and made_with.items() <= header.items():
                 return SavedState(path, list(keys))
         return None
 
-    def remove_state(self, path: Path) -> None:
-        """Remove a state, unless a cell has yet to end, or all failed: a retry goes on from it."""
-        keys = (read_header(path) or {}).get("cells", [])
-        done = [key for key in keys if self._path(CELLS, key).exists()]
-        failed = [key for key in keys if self.failure_path(key).exists()]
-        if len(done) + len(failed) == len(keys) and (done or not keys):
-            path.unlink(missing_ok=True)
+    def remove_states(self, own: Path) -> None:
+        """Remove the states of which every cell has ended.
+
+        One stays if all of them failed, so that a retry goes on from it.
+
+        Args:
+          own: that of a job that has ended, which is also removed if it cannot be read.
+        """
+        for path in self._states():
+            keys = (read_header(path) or {}).get("cells", [])
+            done = [key for key in keys if self._path(CELLS, key).exists()]
+            failed = [key for key in keys if self.failure_path(key).exists()]
+            if len(done) + len(failed) == len(keys) and (done or (not keys and path == own)):
+                path.unlink(missing_ok=True)
+
+    def _states(self) -> list[Path]:
+        return sorted((self.folder / STATES).glob("*.npz"))
 
     def set_aside(self, key: str) -> None:
         """Rename a cell's result or failure if it is invalid. The caller must hold the lock.

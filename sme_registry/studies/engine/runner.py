@@ -12,6 +12,7 @@ import functools
 import os
 import time
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from rich.console import Console
@@ -325,23 +326,30 @@ class _StudyRun:
 
     def _claim_program(self, programs: Programs, first: str) -> Job | None:
         """Claim a cell and the others of its program: those of a saved state, or the next ones."""
+        if self._ledger.is_running(first):
+            return None
         alone = self._ledger.claim_lock()
         if alone is None:
             return None
         with alone, contextlib.ExitStack() as stack:  # releases all of them if one raises
             cells, locks = list[Cell](), list[Lock]()
-            saved = self._ledger.state_of(first)
+            program = programs.program(self._planned[first].cell)
+            saved = self._ledger.state_of(first, program.made_with)
+            in_state = programs.cells(saved.keys) if saved else None
+            if in_state is None:
+                saved, in_state = None, ()
             for key in self._candidates(programs, first, saved):
-                if len(cells) < programs.lanes(self._planned[first].cell):
+                if len(cells) < program.count:
                     lock = self._claim(key)
                     if lock is not None:
                         locks.append(stack.enter_context(lock))
                         cells.append(self._planned[key].cell)
                 if not cells:
                     return None
-            state = saved.path if saved else self._ledger.state_path(c.digest for c in cells)
+            new = self._ledger.state_path([cell.digest for cell in cells], program.made_with)
+            program = replace(program, state=saved.path if saved else new, cells=in_state)
             stack.pop_all()
-        return self._started(Job(tuple(cells), programs.program(cells[0], state)), locks)
+        return self._started(Job(tuple(cells), program), locks)
 
     def _candidates(self, programs: Programs, first: str, saved: SavedState | None) -> list[str]:
         """The waiting cells that may be lanes of the program of the first one, which leads."""
@@ -434,7 +442,7 @@ class _StudyRun:
         """Remove a job of which every cell has been written, and its state if it is of no use."""
         self._progress.end_part(self._name(job))
         if job.lanes is not None and job.lanes.state is not None:
-            self._ledger.remove_state(job.lanes.state)
+            self._ledger.remove_states(job.lanes.state)
 
     def _show(self, *, failed: bool) -> None:
         self._failed += failed

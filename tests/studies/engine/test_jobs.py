@@ -194,12 +194,15 @@ def test_a_saved_state_decides_which_cells_go_on_together(tmp_path: Path) -> Non
     of_group = cells(file, "small", "gated")
     ledger = Ledger(tmp_path)
     keys = [of_group[i].digest for i in (6, 0, 3)]
+    made_with = Programs(cells(file)).program(of_group[0]).made_with
     saved = ledger.state_path(keys)
-    write_state(saved, {"cells": keys}, {})
+    write_state(saved, {"cells": keys, **made_with}, {})
+    write_state(ledger.state_path(keys[:2]), {"cells": keys[:2], **made_with, "lanes": 2}, {})
     (tmp_path / "states" / "broken.npz").write_bytes(b"PK")
     first, second, *_ = claimed(file, tmp_path, only=["algorithm=PPO"])
     assert {cell.digest for cell in first.cells} == set(keys)
     assert first.lanes is not None
     assert first.lanes.state == saved
+    assert [cell.digest for cell in first.lanes.cells] == keys
     assert list(second.cells) == [of_group[i] for i in (1, 2, 4, 5, 7)]
     assert saved.exists()  # a retry goes on from it

@@ -240,6 +240,37 @@ def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(
     assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
 
 
+def test_lanes_of_cells_that_are_left_out_keep_their_tasks(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = saved(tmp_path, monkeypatch)
+    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+    assert ran(tmp_path, only=["algorithm=agent", "class=small"]).count("done") == 2
+    assert state.exists()  # with two lanes at the end of their training
+    assert ran(tmp_path).count("done") == 4
+    assert not state.exists()
+    assert numbers(tmp_path).items() <= numbers(whole).items()
+
+
+def test_a_program_with_other_lanes_leaves_a_state_whole(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = saved(tmp_path, monkeypatch)
+    before = state.read_bytes()
+    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+
+    def interrupt(done: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ran(tmp_path, lanes=2, on_steps=interrupt)
+    assert state.read_bytes() == before
+    assert len(list((tmp_path / "states").glob("*.npz"))) == 2
+    assert ran(tmp_path).count("done") == 4
+    assert numbers(tmp_path).items() <= numbers(whole).items()
+    assert not list((tmp_path / "states").glob("*.npz"))
+
+
 def test_a_state_of_other_versions_is_not_used(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
