@@ -86,8 +86,17 @@ def test_training_steps_of_one_agent(compare: Any, algorithm: str) -> None:
             {
                 "SB3": (sb3, STEPS, TARGET[algorithm]),
                 "four agents": (training(algorithm, lanes=4), STEPS, 0.0),
-                "50 × the buffer": (training(algorithm, budget=50 * BUFFER), STEPS, 0.0),
                 "its matrix products": (products(algorithm), STEPS, 0.0),
             },
             clock=time.process_time,
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("algorithm", TARGET)
+def test_training_steps_with_a_large_buffer(compare: Any, algorithm: str) -> None:
+    large = 50 * BUFFER
+    compare(
+        f"{algorithm} in JAX, a buffer of {large:,}", "step", training(algorithm, budget=large),
+        STEPS, {f"a buffer of {BUFFER:,}": (training(algorithm), STEPS, 1 / 1.2)},
+        clock=time.process_time,
+    )  # fmt: skip
