@@ -31,6 +31,11 @@ INDEPENDENT = "independent:"  # of one with a model for each agent of a team
 JAX = "jax:"  # of one that runs with its environment in a program of JAX
 
 
+def in_jax(uses: str) -> bool:
+    """Whether an algorithm runs in a program of JAX."""
+    return uses.startswith(JAX)
+
+
 def _check_task(uses: str, setting: Setting, field: str) -> None:
     """Raise ValueError, which Pydantic reports, if an algorithm cannot learn a task."""
     if uses.startswith(OFFLINE) and setting.team is not None:
@@ -44,7 +49,7 @@ def _check_task(uses: str, setting: Setting, field: str) -> None:
             f"{field}={uses!r}: needs a team, and this task has a single agent. Use "
             f"{uses.removeprefix(INDEPENDENT)!r}."
         )
-    if uses.startswith(JAX) and setting.team is not None:
+    if in_jax(uses) and setting.team is not None:
         raise ValueError(
             f"{field}={uses!r}: cannot learn a task for {len(setting.team.agents)} agents. Use an "
             f"algorithm of Stable-Baselines3, such as {uses.removeprefix(JAX)!r}."

@@ -24,7 +24,7 @@ from typing import Any
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, import_object, require_packages
 from sme_registry.spec import SMESpec
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import JAX, in_jax
 
 # Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
 ALGORITHMS = {
@@ -70,12 +70,12 @@ def full_name(uses: str, agents: str | None = None) -> str:
     Raises:
       OptionError: `agents` is none of them.
     """
-    in_jax = uses.casefold().startswith(JAX)
-    uses = uses[len(JAX) :] if in_jax else uses
+    ours = in_jax(uses.casefold())
+    uses = uses[len(JAX) :] if ours else uses
     if agents is not None:
-        in_jax = choice("agents", agents, AGENTS) == "jax"
+        ours = choice("agents", agents, AGENTS) == "jax"
     name = next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
-    return f"{JAX}{name}" if in_jax else name
+    return f"{JAX}{name}" if ours else name
 
 
 def short_name(uses: str) -> str:
@@ -85,7 +85,7 @@ def short_name(uses: str) -> str:
 
 def folder_name(uses: str) -> str:
     """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`."""
-    return f"{'jax-' * uses.startswith(JAX)}{short_name(uses)}"
+    return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
 
 
 def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) -> str:

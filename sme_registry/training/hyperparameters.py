@@ -15,7 +15,7 @@ from typing import Any
 
 from sme_registry.errors import OptionError, did_you_mean
 from sme_registry.io import import_object, read_json
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.training.algorithms import find_algorithm, is_sb3
 
 # Arguments of an algorithm's constructor that are not hyperparameters.
@@ -83,7 +83,7 @@ def check_hyperparameters(
       OptionError: it has no hyperparameter of a name; the message suggests a similar one.
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
-    if uses.startswith(JAX):
+    if in_jax(uses):
         from sme_registry.jax.run import settings_of
 
         settings_of(uses, hyperparameters, field, others)

@@ -12,7 +12,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.spec.document import Integer, Real, StrictModel
-from sme_registry.spec.study import INDEPENDENT, JAX
+from sme_registry.spec.study import INDEPENDENT, in_jax
 
 RECORD = "run.json"
 MODEL, MODELS = "model.zip", "model"  # a folder of one model for each independent agent
@@ -23,7 +23,7 @@ PACKAGES = ("gymnasium", "numpy", "scipy", "numba", "stable_baselines3", "torch"
 def versions_for(uses: str) -> dict[str, str]:
     """Installed versions that the numbers depend on, including the algorithm's own package."""
     package = uses.removeprefix(INDEPENDENT).partition(":")[0].partition(".")[0]
-    return versions([*PACKAGES, package, *(["jaxlib"] if uses.startswith(JAX) else [])])
+    return versions([*PACKAGES, package, *(["jaxlib"] if in_jax(uses) else [])])
 
 
 def _from_text(value: Any) -> Any:

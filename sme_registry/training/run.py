@@ -27,7 +27,7 @@ from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
 from sme_registry.io import choice, claim_folder, integer_in, is_installed
 from sme_registry.plots import files as plot_files
 from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.task import load_spec, materialize
 from sme_registry.terminal.progress import Progress
 from sme_registry.training import checkpoint
@@ -229,7 +229,7 @@ def _with_algorithm(
     """A plan with its algorithm, the hyperparameters that the user set, and its environments."""
     uses = full_name(default_algorithm(plan.spec) if uses is None else uses, agents)
     settings = nested_hyperparameters(hyperparameters)
-    if uses.startswith(JAX):
+    if in_jax(uses):
         return _with_jax_algorithm(plan, uses, num_envs, settings, device)
     if device is not None:
         raise OptionError(
@@ -278,13 +278,9 @@ def _with_jax_algorithm(
     )
 
 
-def _in_jax(record: RunRecord) -> bool:
-    return record.algorithm.startswith(JAX)
-
-
 def _training(record: RunRecord) -> Any:
     """The module with `new_model` and `learn` for a run."""
-    if _in_jax(record):
+    if in_jax(record.algorithm):
         from sme_registry.training import jax_learn
 
         return jax_learn
@@ -296,7 +292,7 @@ def _training(record: RunRecord) -> Any:
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
     """The plan with all its hyperparameters, and with the progress of a run that is resumed."""
     previous = None if force else RunRecord.read(folder)
-    if previous is None and _in_jax(plan):
+    if previous is None and in_jax(plan.algorithm):
         return plan
     if previous is None:
         lanes = plan.num_envs * (1 if plan.independent else plan.agents)

@@ -20,10 +20,10 @@ from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
-from sme_registry.spec.study import Cell
+from sme_registry.spec.study import Cell, in_jax
 from sme_registry.studies.engine.algorithms import find_algorithm, reference_name
 from sme_registry.studies.engine.checks import refuse_of_reference
-from sme_registry.studies.engine.jobs import Lanes, uses_jax
+from sme_registry.studies.engine.jobs import Lanes
 from sme_registry.studies.engine.lanes import run_lanes
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
@@ -63,7 +63,7 @@ def run_cell(
     """
     start = time.thread_time()
     progress = progress or (lambda done, total: None)
-    if uses_jax(cell):
+    if in_jax(cell.uses):
         return _run_alone(cell, progress, model_path)
     learner = offline_name(cell.uses)
     if learner is not None:

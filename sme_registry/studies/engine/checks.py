@@ -13,7 +13,7 @@ from typing import Any
 from sme_registry.errors import OptionError
 from sme_registry.offline.hyperparameters import resolve_hyperparameters
 from sme_registry.spec import Cell, StudyAlgorithm
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
 from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
 from sme_registry.training import ALGORITHMS
@@ -31,7 +31,7 @@ def find(uses: str) -> None:
     """
     if reference_name(uses) is not None or offline_name(uses) is not None:
         return
-    if uses.startswith(JAX):
+    if in_jax(uses):
         from sme_registry.jax.run import full_name
 
         full_name(uses)
@@ -59,7 +59,7 @@ def check_hyperparameters(algorithm: StudyAlgorithm) -> None:
     learner = offline_name(uses)
     if reference_name(uses) is not None:
         refuse_of_reference(uses, chosen)
-    elif uses.startswith(JAX):
+    elif in_jax(uses):
         from sme_registry.jax.run import settings_of
 
         settings_of(uses, chosen, field)
@@ -76,7 +76,7 @@ def check_task(cell: Cell) -> None:
     Raises:
       SpecError: JAX does not have one of the fields.
     """
-    if cell.uses.startswith(JAX):
+    if in_jax(cell.uses):
         from sme_registry.jax.task import check_supported
 
         check_supported(cell.spec)

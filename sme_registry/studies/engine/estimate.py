@@ -21,8 +21,8 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.algorithms import REFERENCE, independent_name
-from sme_registry.studies.engine.jobs import uses_jax
 from sme_registry.studies.engine.result import CellResult
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest
@@ -107,7 +107,7 @@ def _work(cell: Cell) -> Span:
         training = transitions * step[i]
         inner = cell.spec.complexity - 1
         batch_step = _BATCH_STEP[i]
-        if uses_jax(cell):
+        if in_jax(cell.uses):
             batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * inner
         curve = cell.evaluations * cell.spec.horizon * batch_step
         return training + curve + states * (_STATE[i] + _LAYER[i] * inner)
@@ -116,7 +116,7 @@ def _work(cell: Cell) -> Span:
 
 
 def _start(cell: Cell) -> Span:
-    return Span(*(_START_IN_JAX if uses_jax(cell) else _START))
+    return Span(*(_START_IN_JAX if in_jax(cell.uses) else _START))
 
 
 def _agents(spec: SMESpec) -> int:

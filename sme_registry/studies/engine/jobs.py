@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from sme_registry.io import to_json
 from sme_registry.spec import Cell, SMESpec
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
@@ -89,11 +89,6 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def uses_jax(cell: Cell) -> bool:
-    """Whether a cell is a lane of a program."""
-    return cell.uses.startswith(JAX)
-
-
 class Programs:
     """Which cells of a plan share a program, and how many lanes it has.
 
@@ -115,9 +110,10 @@ class Programs:
         self._most = most_lanes or (_MOST_LANES if platform == CPU else _MOST_LANES_ELSEWHERE)
         self._shapes: dict[Hashable, dict[str, Shape]] = defaultdict(dict)
         self._cells: dict[str, Cell] = {}
-        for cell in filter(uses_jax, cells):
-            self._cells[cell.digest] = cell
-            self._shapes[self.group(cell)][cell.digest] = _shape(cell.spec)
+        for cell in cells:
+            if in_jax(cell.uses):
+                self._cells[cell.digest] = cell
+                self._shapes[self.group(cell)][cell.digest] = _shape(cell.spec)
 
     @property
     def one_at_a_time(self) -> bool:

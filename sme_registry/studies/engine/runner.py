@@ -20,11 +20,12 @@ from rich.console import Console
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.io import Lock, integer_in
 from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine import checks
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
-from sme_registry.studies.engine.jobs import Job, Programs, platform_of, uses_jax
+from sme_registry.studies.engine.jobs import Job, Programs, platform_of
 from sme_registry.studies.engine.ledger import Ledger, SavedState
 from sme_registry.studies.engine.processes import Processes
 from sme_registry.studies.engine.ray_executor import OnRay
@@ -96,7 +97,7 @@ def run_study(
     programs = None
     if run is run_cell:
         _check(plan_file.plan, planned.values())
-        if any(uses_jax(cell.cell) for cell in planned.values()):
+        if any(in_jax(cell.cell.uses) for cell in planned.values()):
             every = (cell.cell for cell in plan_file.plan.cells)
             programs = Programs(every, platform_of(device), device, lanes)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
@@ -290,7 +291,7 @@ class _StudyRun:
     def _one_at_a_time(self, cell: Cell) -> bool:
         """Whether a cell's program has the device to itself."""
         programs = self._programs
-        return programs is not None and programs.one_at_a_time and uses_jax(cell)
+        return programs is not None and programs.one_at_a_time and in_jax(cell.uses)
 
     def _jobs(self) -> Iterator[Job | None]:
         """Jobs of locked cells for the executor; None while no cell is available."""
@@ -314,7 +315,7 @@ class _StudyRun:
         for key, planned in list(self._waiting.items()):
             if occupied and self._one_at_a_time(planned.cell):
                 continue
-            if self._programs is not None and uses_jax(planned.cell):
+            if self._programs is not None and in_jax(planned.cell.uses):
                 job = self._claim_program(self._programs, key)
             elif (lock := self._claim(key)) is not None:
                 job = self._started(Job((planned.cell,)), [lock])

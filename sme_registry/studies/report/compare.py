@@ -14,7 +14,7 @@ import pandas as pd
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import refuse_unwritable, to_json, write_atomically
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import TextTable, difference_table
@@ -76,11 +76,11 @@ def comparison_tables(table: pd.DataFrame) -> list[TextTable]:
 def implementation_caveats(folder: str | os.PathLike[str], first: str, second: str) -> list[str]:
     """A sentence if one of two algorithms runs in JAX and the other does not."""
     uses = {each.name: each.uses for each in plan_file(Ledger(folder)).plan.algorithms}
-    in_jax = [name for name in (first, second) if uses[name].startswith(JAX)]
-    if len(in_jax) != 1:
+    ours = [name for name in (first, second) if in_jax(uses[name])]
+    if len(ours) != 1:
         return []
     return [
-        f"{in_jax[0]} runs in JAX and {(second if in_jax == [first] else first)} does not: their "
+        f"{ours[0]} runs in JAX and {(second if ours == [first] else first)} does not: their "
         "difference is also one between implementations."
     ]
 

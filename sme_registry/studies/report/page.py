@@ -15,7 +15,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from sme_registry.spec.study import JAX
+from sme_registry.spec.study import in_jax
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL
 from sme_registry.studies.report.exports import TextTable
@@ -100,8 +100,8 @@ def _requested(analysis: Analysis) -> int:
 def _in_jax(analysis: Analysis) -> list[str]:
     """The algorithms that run in JAX, if others beside them learn without it."""
     of_plan = {algorithm.name: algorithm.uses for algorithm in analysis.file.plan.algorithms}
-    in_jax = [name for name in analysis.learners if of_plan[name].startswith(JAX)]
-    return in_jax if len(in_jax) < len(analysis.learners) else []
+    ours = [name for name in analysis.learners if in_jax(of_plan[name])]
+    return ours if len(ours) < len(analysis.learners) else []
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
