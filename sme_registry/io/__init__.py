@@ -1,4 +1,4 @@
-"""Files and arguments: strict JSON, atomic writes, folders, locks, versions, argument checks."""
+"""Files, folders, locks, strict JSON, spare memory, installed packages, argument checks."""
 
 from sme_registry.io.checks import choice, integer_in
 from sme_registry.io.files import (
@@ -14,6 +14,7 @@ from sme_registry.io.files import (
 )
 from sme_registry.io.json_files import MAX_DOCUMENT_BYTES, parse_json, read_json, to_json
 from sme_registry.io.locks import Lock, file_lock, is_locked
+from sme_registry.io.memory import available_memory
 from sme_registry.io.packages import (
     import_object,
     install_command,
@@ -28,6 +29,7 @@ __all__ = [
     "TEMPORARY",
     "Lock",
     "atomic_file",
+    "available_memory",
     "build_folder",
     "choice",
     "claim_folder",

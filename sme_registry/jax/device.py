@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import OptionError
-from sme_registry.io import require_packages
+from sme_registry.io import available_memory, require_packages
 
 CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
 
@@ -51,13 +51,13 @@ def find_device(name: str | None = None) -> Any:
 
 
 def memory_of(device: Any) -> int | None:
-    """Bytes of memory that programs on a device may use in all; None if unknown."""
+    """Bytes of memory that a new program on a device may use; None if unknown."""
+    if device.platform == "cpu":
+        return available_memory()
     statistics = device.memory_stats() or {}
-    if "bytes_limit" in statistics:
-        return int(statistics["bytes_limit"])
-    if device.platform == "cpu" and hasattr(os, "sysconf"):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return None
+    if "bytes_limit" not in statistics:
+        return None
+    return int(statistics["bytes_limit"]) - int(statistics.get("bytes_in_use", 0))
 
 
 def _cache_folder() -> Path:

@@ -219,7 +219,7 @@ class Program(ABC):
         A replay buffer may be that of a smaller budget.
 
         Raises:
-          OptionError: the state is another program's.
+          OptionError: the state is another program's, or damaged; this program is unchanged.
         """
         leaves, structure = jax.tree_util.tree_flatten_with_path(self.state)
         names = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -228,12 +228,13 @@ class Program(ABC):
                 "arrays: are the state of another program. Give those that a program of the same "
                 "algorithm, hyperparameters and lanes saved."
             )
+        steps = int(self._fitted("steps", arrays["steps"], np.asarray(self.steps)))
         restored = [
             jax.device_put(self._fitted(name, arrays[name], leaf), self.device)
             for name, (_, leaf) in zip(names, leaves, strict=True)
         ]
         self.state = jax.tree_util.tree_unflatten(structure, restored)
-        self.steps = int(arrays["steps"])
+        self.steps = steps
 
     def _refuse_without_room(self, state: Any) -> None:
         """Raise ResourceLimitError if such a state would not fit in the device's memory."""
@@ -242,10 +243,12 @@ class Program(ABC):
         room = memory_of(self.device)
         if room is not None and needed > room:
             fit = self.lanes * room // needed
+            advice = "fewer steps or a smaller buffer_size" if self.buffer else "a smaller n_steps"
             raise ResourceLimitError(
                 f"lanes={self.lanes:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
-                f"{self.device.platform} has {room / 2**30:,.1f} GiB: must be at most {fit:,}. "
-                "Choose fewer lanes, fewer steps or a smaller buffer_size."
+                f"{self.device.platform} has {room / 2**30:,.1f} GiB to spare: "
+                f"{f'at most {fit:,} fit' if fit else 'not one fits'}. Choose "
+                f"{'fewer lanes, ' if fit else ''}{advice}."
             )
 
     def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
@@ -254,7 +257,7 @@ class Program(ABC):
             self.initial_weights(rng, own.observation_dim, own.action_dim), own
         )
 
-    def _fitted(self, name: str, saved: Array, present: jax.Array) -> Array:
+    def _fitted(self, name: str, saved: Array, present: jax.Array | Array) -> Array:
         """A saved array, in the shape that it has here."""
         saved = np.asarray(saved)
         grows = self.buffer and name.startswith(f".{self.buffer}") and saved.ndim == present.ndim

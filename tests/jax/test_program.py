@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.io import available_memory
 from sme_registry.jax.networks import HostWeights, Weights, initial_linear, linear
 from sme_registry.jax.program import Program, StepLog, policy
 from sme_registry.task import materialize
@@ -22,8 +22,6 @@ from sme_registry.task import materialize
 BASE = SMESpec(state_dim=3, action_dim=2, horizon=30, seed=1)
 COUPLED = (BASE, BASE.derive(k=7, r_min=0.3), BASE.derive(state_dim=2, action_dim=3, D=0.1))
 SEPARABLE = (BASE, BASE.derive(seed=2, horizon=33), BASE.derive(state_dim=2, action_dim=3))
-
-
 BASE_LANES = (BASE, BASE)
 
 
@@ -63,8 +61,9 @@ class Linear(Program):
         raise NotImplementedError
 
 
-def program(specs: tuple[SMESpec, ...], **changes: Any) -> Linear:
-    return Linear((), specs, range(len(specs)), **{"steps": 4, "lanes": 4, **changes})
+def program(specs: tuple[SMESpec, ...], first_seed: int = 0, **changes: Any) -> Linear:
+    seeds = range(first_seed, first_seed + len(specs))
+    return Linear((), specs, seeds, **{"steps": 4, "lanes": 4, **changes})
 
 
 CASES = {"coupled": (COUPLED, "symmetric"), "separable": (SEPARABLE, "unit")}
@@ -108,7 +107,7 @@ def test_weights_depend_on_their_seed_and_not_on_the_padding() -> None:
 
 
 def test_state_is_restored_whole_also_for_more_steps() -> None:
-    one, other = program(BASE_LANES), program(BASE_LANES[::-1], steps=6)
+    one, other = program(BASE_LANES), program(BASE_LANES, first_seed=7, steps=6)
     one.steps = 3
     one.state = one.state._replace(count=jnp.int32(7), buffer=jnp.ones((4, 4)))
     other.restore(one.save())
@@ -127,7 +126,10 @@ def test_the_state_of_another_program_is_refused() -> None:
         two.restore(program(BASE_LANES, steps=6).save())
     with pytest.raises(OptionError, match="another program"):
         two.restore({"steps": np.asarray(0)})
-    assert two.steps == 0
+    for steps in (np.zeros(2, int), np.asarray(np.nan)):
+        with pytest.raises(OptionError, match=r"^arrays\['steps'\]: is .*: must be int64 of shape"):
+            two.restore({**program(BASE_LANES, first_seed=7).save(), "steps": steps})
+    np.testing.assert_equal(two.save(), program(BASE_LANES).save())
 
 
 def test_only_lanes_with_weights_that_are_not_finite_have_failed() -> None:
@@ -149,7 +151,10 @@ def test_the_policy_of_a_lane_has_no_padding() -> None:
 
 
 def test_too_many_lanes_for_the_memory_are_refused_with_the_number_that_fits() -> None:
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    steps = memory // 8 // 3  # of 8 bytes: a third of it, and lanes take only some bytes more
-    with pytest.raises(ResourceLimitError, match=r"lanes=4: .* must be at most 2\. Choose fewer"):
+    memory = available_memory()
+    assert memory is not None
+    steps = memory // 20  # of 8 bytes: 2.5 lanes would fit
+    with pytest.raises(ResourceLimitError, match=r"lanes=4: .* at most 2 fit\. Choose fewer lanes"):
         Linear((), BASE_LANES, (0, 1), steps=steps, lanes=4)
+    with pytest.raises(ResourceLimitError, match=r"lanes=1: .* not one fits\. Choose fewer steps"):
+        Linear((), BASE_LANES[:1], (0,), steps=4 * steps)
