@@ -1,5 +1,6 @@
-"""Files, folders, locks, strict JSON, spare memory, installed packages, argument checks."""
+"""Files, folders, locks, strict JSON, arrays, spare memory, packages, argument checks."""
 
+from sme_registry.io.arrays import Arrays, read_arrays, write_arrays
 from sme_registry.io.checks import choice, integer_in
 from sme_registry.io.files import (
     TEMPORARY,
@@ -27,6 +28,7 @@ from sme_registry.io.packages import (
 __all__ = [
     "MAX_DOCUMENT_BYTES",
     "TEMPORARY",
+    "Arrays",
     "Lock",
     "atomic_file",
     "available_memory",
@@ -41,6 +43,7 @@ __all__ = [
     "is_locked",
     "missing_dependency",
     "parse_json",
+    "read_arrays",
     "read_json",
     "refuse_existing",
     "refuse_unwritable",
@@ -49,5 +52,6 @@ __all__ = [
     "temporary_beside",
     "to_json",
     "versions",
+    "write_arrays",
     "write_atomically",
 ]

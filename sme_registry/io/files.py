@@ -68,7 +68,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
         with atomic_file(path) as stream:
             stream.write(data)
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte, broken text
-        raise _unwritable(path, error) from None
+        raise unwritable(path, error) from None
     return path
 
 
@@ -103,7 +103,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> Path:
         os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         os.unlink(probe)
     except (OSError, ValueError) as error:
-        raise _unwritable(path, error) from None
+        raise unwritable(path, error) from None
     return path
 
 
@@ -130,7 +130,7 @@ def claim_folder(
         folder.mkdir(parents=True, exist_ok=True)
         names = sorted(path.name for path in folder.iterdir())
     except (OSError, ValueError) as error:
-        raise _unwritable(folder, error) from None
+        raise unwritable(folder, error) from None
     others = [name for name in names if name not in files]
     if others:
         raise OptionError(
@@ -166,7 +166,7 @@ def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iter
         target.parent.mkdir(parents=True, exist_ok=True)
         building.mkdir()
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte
-        raise _unwritable(target, error) from None
+        raise unwritable(target, error) from None
     try:
         yield building
         _flush(building)
@@ -174,7 +174,7 @@ def build_folder(target: str | os.PathLike[str], *, force: bool = False) -> Iter
         _replace(building, target, replaced)
         sync_folder(target.parent)
     except OSError as error:
-        raise _unwritable(target, error) from None
+        raise unwritable(target, error) from None
     finally:
         for path in (building, replaced):
             shutil.rmtree(path, ignore_errors=True)
@@ -191,7 +191,7 @@ def sync_folder(folder: str | os.PathLike[str]) -> None:
         os.close(handle)
 
 
-def _unwritable(path: Path, error: Exception) -> OptionError:
+def unwritable(path: Path, error: Exception) -> OptionError:
     """The error for a file or folder that cannot be written."""
     reason = getattr(error, "strerror", None) or str(error)
     return OptionError(

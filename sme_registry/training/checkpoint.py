@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.policies import saved_sb3
-from sme_registry.io import atomic_file, write_atomically
+from sme_registry.io import Arrays, read_arrays, write_atomically
 
 FILE = "checkpoint.zip"
 _MEMBER = "sme_replay_buffer.npz"
@@ -65,27 +64,15 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
         raise _unloadable(path, error) from error
 
 
-def save_arrays(path: Path, arrays: dict[str, npt.NDArray[Any]]) -> None:
-    """Write a checkpoint of named arrays; raises OptionError as `save` does."""
-    try:
-        with atomic_file(path) as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-    except OSError as error:
-        raise OptionError(
-            f"{path}: cannot be written: {error.strerror}. Make room, or give another folder."
-        ) from None
-
-
-def load_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+def load_arrays(path: Path) -> Arrays:
     """The arrays of a checkpoint; runs no code of the file. Raises PolicyError as `load` does."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return dict(archive)
-    except Exception as error:
-        raise _unloadable(path, error) from error
+        return read_arrays(path)
+    except OptionError as error:
+        raise _unloadable(path, error.__cause__ or error) from None
 
 
-def _unloadable(path: Path, error: Exception) -> PolicyError:
+def _unloadable(path: Path, error: BaseException) -> PolicyError:
     return PolicyError(
         f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
         "(in Python, force=True), or in another folder."

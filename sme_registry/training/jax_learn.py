@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import configure
 
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.policies import saved_sb3
-from sme_registry.io import is_installed, write_atomically
+from sme_registry.io import is_installed, write_arrays, write_atomically
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.sb3 import EpisodeRegret
@@ -72,9 +72,7 @@ def learn(
 
         def save() -> None:
             log.save_checkpoint(
-                lambda path: checkpoint.save_arrays(
-                    path, {**program.save(), _EPISODE: present.sums}
-                )
+                lambda path: write_arrays(path, {**program.save(), _EPISODE: present.sums})
             )
 
         def on_log(steps: StepLog) -> None:

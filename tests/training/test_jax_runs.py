@@ -26,8 +26,9 @@ from sme_registry.errors import (
 from sme_registry.evaluation import load_sb3
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.export import export_onnx
+from sme_registry.io import write_arrays
 from sme_registry.jax.run import new_program
-from sme_registry.training import RunRecord, TrainingResult, checkpoint, train
+from sme_registry.training import RunRecord, TrainingResult, checkpoint, jax_learn, train
 from sme_registry.training.episodes import read_episodes
 from sme_registry.training.sb3_models import sb3_model
 from tests.training.runs import PROTOCOL, TINY
@@ -125,13 +126,13 @@ def test_the_model_predicts_the_same_actions(name: str, action_range: Any, tmp_p
 def interrupted(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> None:
     """A run that Ctrl-C ends while it writes its first checkpoint."""
     with monkeypatch.context() as patch:
-        save = checkpoint.save_arrays
+        save = jax_learn.write_arrays
 
         def save_and_interrupt(*arguments: Any) -> None:
             save(*arguments)
             signal.raise_signal(signal.SIGINT)  # delivered when the record is written, too
 
-        patch.setattr(checkpoint, "save_arrays", save_and_interrupt)
+        patch.setattr(jax_learn, "write_arrays", save_and_interrupt)
         with pytest.raises(KeyboardInterrupt):
             jax_run(folder, **changes)
 
@@ -188,7 +189,7 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
         name: np.full_like(array, np.nan) if "action_net.bias" in name else array
         for name, array in kept.items()
     }
-    checkpoint.save_arrays(folder / checkpoint.FILE, broken)
+    write_arrays(folder / checkpoint.FILE, broken)
     with pytest.raises(PolicyError, match=r"not finite any longer at step 128.*last checkpoint"):
         jax_run(folder, resume=True)
     record = RunRecord.read(folder)

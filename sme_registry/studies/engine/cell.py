@@ -93,7 +93,11 @@ def run_cell(
 
 def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> CellResult:
     """Run a cell that uses JAX as the only lane of a program."""
-    ((_, ended, model),) = run_lanes((cell,), Lanes(1), progress, model_path is not None)
+
+    def report(done: int, total: int, note: str = "", /) -> None:
+        progress(done, total)
+
+    ((_, ended, model),) = run_lanes((cell,), Lanes(1), report, model_path is not None)
     if isinstance(ended, PolicyError):
         raise ended
     if model_path is not None and model is not None:

@@ -20,13 +20,13 @@ from typing import Any, NamedTuple, Protocol
 
 from sme_registry.spec import Cell
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.engine.jobs import Job
+from sme_registry.studies.engine.jobs import Job, Report
 from sme_registry.studies.engine.lanes import run_lanes
 from sme_registry.studies.engine.result import CellFailure, CellResult
 from sme_registry.training.record import versions_for
 
 RunCell = Callable[[Cell, Callable[[int, int], None] | None, Path | None], CellResult]
-ReportProgress = Callable[[Job, int, int], None]
+ReportProgress = Callable[..., None]  # called with a job and the arguments of `Report`
 Jobs = Iterator[Job | None]
 
 POLL_SECONDS = 0.2
@@ -54,23 +54,21 @@ class Executor(Protocol):
         Args:
           jobs: asked for the next job whenever a worker is free; None means that no job is
             available now, and it is asked again soon.
-          progress: called with a running job, the steps done and the steps in all.
+          progress: called with a running job and what it reports; see `Report`.
 
         Yields:
           Outcomes, in the order in which cells end.
         """
 
 
-def run_job(
-    run: RunCell, job: Job, keep_models: bool, progress: Callable[[int, int], None]
-) -> Iterator[Outcome]:
+def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     """Run a job; an exception becomes the failure of its cells, so that the process goes on.
 
     Args:
       run: runs a cell that is no lane of a program.
       job: to run.
       keep_models: whether outcomes carry the trained models.
-      progress: called with the steps done and the steps in all.
+      progress: see `Report`.
 
     Yields:
       Outcomes, one for each cell.
@@ -85,9 +83,7 @@ def run_job(
             yield failed(cell, f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
-def _outcomes(
-    run: RunCell, job: Job, keep_models: bool, progress: Callable[[int, int], None]
-) -> Iterator[Outcome]:
+def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.lanes is not None:
         for cell, ended, model in run_lanes(job.cells, job.lanes, progress, keep_models):
             if isinstance(ended, CellResult):
@@ -117,16 +113,16 @@ def failed(cell: Cell, error: str, details: str) -> Outcome:
     return Outcome(failure)
 
 
-def _throttled(report: Callable[[int, int], None]) -> Callable[[int, int], None]:
-    """Pass on a report if the last one is some time ago, and at the end."""
+def _throttled(report: Report) -> Report:
+    """Pass on a report if the last one is some time ago, at the end, and with a note."""
     last = 0.0
 
-    def throttled(done: int, total: int) -> None:
+    def throttled(done: int, total: int, note: str = "", /) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total:
+        if now - last >= _SECONDS_BETWEEN_REPORTS or done >= total or note:
             last = now
-            report(done, total)
+            report(done, total, note)
 
     return throttled
 

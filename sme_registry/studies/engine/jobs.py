@@ -17,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sme_registry.io import to_json
 from sme_registry.spec import Cell, SMESpec
@@ -65,6 +65,13 @@ class Job:
 
     cells: tuple[Cell, ...]
     lanes: Lanes | None = None
+
+
+class Report(Protocol):
+    """What a job calls while it runs."""
+
+    def __call__(self, done: int, total: int, note: str = "", /) -> None:
+        """Report the steps done, the steps in all, and a note to print, if any."""
 
 
 @contextlib.contextmanager

@@ -9,11 +9,12 @@ the same bits.
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,9 +24,10 @@ from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import EvaluationReport, as_policy, evaluate_many
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
+from sme_registry.io import Arrays, to_json
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.jobs import CPU, Lanes, child_environment
-from sme_registry.studies.engine.program_state import Arrays, read_state, write_state
+from sme_registry.studies.engine.jobs import CPU, Lanes, Report, child_environment
+from sme_registry.studies.engine.program_state import read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
 from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
@@ -38,12 +40,13 @@ Ended = tuple[Cell, CellResult | PolicyError, bytes | None]
 
 SECONDS_BETWEEN_STATES = 180.0
 _TRAINING, _EVALUATION = 0, 1  # what a program's time is for
+_PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
 
 
 def run_lanes(
     cells: Sequence[Cell],
     lanes: Lanes,
-    progress: Callable[[int, int], None],
+    progress: Report,
     keep_models: bool = False,
 ) -> Iterator[Ended]:
     """Train cells as lanes of one program, and evaluate them as `run_cell` does.
@@ -51,7 +54,7 @@ def run_lanes(
     Args:
       cells: of one group; see `jobs.Programs`.
       lanes: the program.
-      progress: called with the steps done and the steps in all.
+      progress: see `Report`.
       keep_models: whether to give each model as a .zip of Stable-Baselines3.
 
     Yields:
@@ -70,9 +73,7 @@ def run_lanes(
 class _Run:
     """A program, the cells of its lanes, and the records of what they did."""
 
-    def __init__(
-        self, cells: Sequence[Cell], lanes: Lanes, progress: Callable[[int, int], None]
-    ) -> None:
+    def __init__(self, cells: Sequence[Cell], lanes: Lanes, progress: Report) -> None:
         from sme_registry.jax.run import new_program
         from sme_registry.jax.task import Shape
 
@@ -255,18 +256,35 @@ class _Run:
     def _save(self) -> None:
         if self._lanes.state is None:
             return
-        arrays = {f"program/{name}": array for name, array in self._program.save().items()}
-        arrays |= {f"records/{name}": array for name, array in self._records.items()}
+        arrays = {_PROGRAM + name: array for name, array in self._program.save().items()}
+        arrays |= {_RECORDS + name: array for name, array in self._records.items()}
         with contextlib.suppress(OptionError):  # a full disk costs only what a kill would lose
             write_state(self._lanes.state, self._header(), arrays)
 
     def _restore(self) -> None:
+        """Go on from the state, if there is one that was made in the same way."""
         state = self._lanes.state
-        arrays = None if state is None else read_state(state, self._header())
-        if arrays is None:
+        if state is None or read_header(state) != json.loads(to_json(self._header())):
             return
-        self._records = {name: arrays.pop(f"records/{name}") for name in self._records}
-        self._program.restore({name.removeprefix("program/"): a for name, a in arrays.items()})
+        arrays = read_state(state)
+        records = _named(arrays, _RECORDS)
+        try:
+            if _forms(records) != _forms(self._records):
+                raise OptionError("its records of the lanes are missing or others.")
+            self._program.restore(_named(arrays, _PROGRAM))
+        except OptionError as error:
+            self._progress(0, self._cell.steps, f"starts again, without {state}: {error}")
+        else:
+            self._records = records
+
+
+def _named(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays with this prefix, without it."""
+    return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
+
+
+def _forms(arrays: Arrays) -> Any:
+    return {name: (array.dtype, array.shape) for name, array in arrays.items()}
 
 
 class _Trained(NamedTuple):

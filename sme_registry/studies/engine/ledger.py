@@ -179,25 +179,21 @@ class Ledger:
     def state_of(self, key: str, made_with: Mapping[str, Any]) -> SavedState | None:
         """A saved state, made with the same, of a program that has this cell as a lane."""
         for path in self._states():
-            header = read_header(path) or {}
+            header = read_header(path)
             keys = header.get("cells", [])
             if key in keys and made_with.items() <= header.items():
                 return SavedState(path, list(keys))
         return None
 
     def remove_states(self, own: Path) -> None:
-        """Remove the states of which every cell has ended.
-
-        One stays if all of them failed, so that a retry goes on from it.
+        """Remove the states of which every cell has a result: a retry goes on from the others.
 
         Args:
           own: that of a job that has ended, which is also removed if it cannot be read.
         """
         for path in self._states():
-            keys = (read_header(path) or {}).get("cells", [])
-            done = [key for key in keys if self._path(CELLS, key).exists()]
-            failed = [key for key in keys if self.failure_path(key).exists()]
-            if len(done) + len(failed) == len(keys) and (done or (not keys and path == own)):
+            keys = read_header(path).get("cells", [])
+            if all(self._path(CELLS, key).exists() for key in keys) and (keys or path == own):
                 path.unlink(missing_ok=True)
 
     def _states(self) -> list[Path]:

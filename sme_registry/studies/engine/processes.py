@@ -82,10 +82,11 @@ class Processes(ConcurrentExecutor):
 
 
 class _Steps(NamedTuple):
-    """How far a process is."""
+    """What a process reports; see `Report`."""
 
     done: int
     total: int
+    note: str
 
 
 @dataclass(frozen=True)

@@ -101,9 +101,9 @@ class OnRay(ConcurrentExecutor):
         for reference in ready:
             yield from self._outcomes(reference, self._running.pop(reference))
         by_key = {job.cells[0].digest: job for job in self._running.values()}
-        for key, (done, total) in self._ray.get(self._steps.take.remote()).items():
+        for key, reported in self._ray.get(self._steps.take.remote()).items():
             if key in by_key:
-                progress(by_key[key], done, total)
+                progress(by_key[key], *reported)
 
     def _connect(self) -> None:
         """Connect, unless this process is connected already."""
@@ -144,12 +144,12 @@ class _StepCounts:
     """A Ray actor to which workers report the steps they have done."""
 
     def __init__(self) -> None:
-        self._steps: dict[str, tuple[int, int]] = {}
+        self._steps: dict[str, tuple[int, int, str]] = {}
 
-    def put(self, key: str, done: int, total: int) -> None:
-        self._steps[key] = (done, total)
+    def put(self, key: str, done: int, total: int, note: str) -> None:
+        self._steps[key] = (done, total, note)
 
-    def take(self) -> dict[str, tuple[int, int]]:
+    def take(self) -> dict[str, tuple[int, int, str]]:
         steps, self._steps = self._steps, {}
         return steps
 

@@ -399,7 +399,10 @@ class _StudyRun:
         first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
         return f"{first}, and {len(others)} more" if others else first
 
-    def _report(self, job: Job, done: int, total: int) -> None:
+    def _report(self, job: Job, done: int, total: int, note: str = "") -> None:
+        if note:
+            self._progress.message(f"{self._name(job)}: {note}")
+            return
         share, now = done / total if total else 1.0, time.monotonic()
         first = job.cells[0]
         then, before = self._first_reports.setdefault(first.digest, (now, share))

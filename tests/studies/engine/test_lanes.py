@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,8 +84,8 @@ class Watched(InProcess):
     on_steps: Any = None
 
     def map(self, jobs: Iterator[Job | None], progress: Any) -> Any:
-        def report(job: Job, done: int, total: int) -> None:
-            progress(job, done, total)
+        def report(job: Job, done: int, total: int, *note: str) -> None:
+            progress(job, done, total, *note)
             if job.lanes is not None:
                 self.on_steps(done)
 
@@ -100,7 +101,7 @@ def ran(study: str | Path, file: StudyFile | None = None, **options: Any) -> Any
         file or plan_file(),
         study,
         executor=options.pop("executor", Watched(keep_models=keep, on_steps=on_steps)),
-        console=Console(file=io.StringIO()),
+        console=options.pop("console", Console(file=io.StringIO())),
         keep_models=keep,
         **options,
     )
@@ -205,84 +206,137 @@ def test_after_kill_9_a_program_goes_on_from_its_state_with_the_same_bits(
     assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
 
 
-def saved(study: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The state that a run leaves that is interrupted after its first rollout."""
-    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+def change_state(
+    path: Path, change: Callable[[dict[str, Any]], Any], **header: Any
+) -> dict[str, Any]:
+    """Write a state again, with changed arrays and fields of its header; returns the header."""
+    before, arrays = read_header(path), read_state(path)
+    assert arrays
+    change(arrays)
+    write_state(path, before | header, arrays)
+    return before
 
-    def interrupt(done: int) -> None:
-        raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="Run the same command to continue"):
-        ran(study, on_steps=interrupt)
+def interrupt(done: int) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study that was interrupted after its first rollout, and left a state."""
+    study = tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+        with pytest.raises(KeyboardInterrupt, match="Run the same command to continue"):
+            ran(study, on_steps=interrupt)
+    return study
+
+
+@pytest.fixture
+def study(interrupted: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(interrupted, tmp_path / "study"))
+
+
+@pytest.fixture
+def state(study: Path) -> Path:
+    """Its state."""
     (state,) = (study / "states").glob("*.npz")
-    monkeypatch.undo()
     return state
 
 
 def test_a_lane_whose_weights_are_not_finite_fails_and_the_others_go_on(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, study: Path, state: Path
 ) -> None:
-    state = saved(tmp_path, monkeypatch)
-    header = read_header(state)
-    assert header is not None
-    arrays = read_state(state, header)
-    assert arrays is not None
-    for name in arrays:
-        if "action_net.bias" in name and "weights" in name:
-            arrays[name][1] = np.nan
-    write_state(state, header, arrays)
-    status = ran(tmp_path)
+    def break_a_lane(arrays: dict[str, Any]) -> None:
+        for name in arrays:
+            if "action_net.bias" in name and "weights" in name:
+                arrays[name][1] = np.nan
+
+    header = change_state(state, break_a_lane)
+    status = ran(study)
     assert (status.count("done"), status.count("failed")) == (3, 1)
-    (failure,) = Ledger(tmp_path).failures().values()
+    (failure,) = Ledger(study).failures().values()
     assert failure.key == header["cells"][1]
     assert failure.error.startswith("PolicyError: its weights were not finite after step 64.")
     uninterrupted = numbers(whole)
-    assert numbers(tmp_path) == {key: uninterrupted[key] for key in numbers(tmp_path)}
+    assert numbers(study) == {key: uninterrupted[key] for key in numbers(study)}
+
+
+def test_a_retry_goes_on_from_the_state_if_an_evaluation_at_the_end_failed(
+    whole: Path, study: Path, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+    evaluate_together = lanes._evaluate_together
+
+    def evaluate_one_draw(group: Any) -> Any:
+        if group[0].cell.spec.seed == 2:
+            raise OSError("no space left")
+        return evaluate_together(group)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "_evaluate_together", evaluate_one_draw)
+        status = ran(study)
+    assert (status.count("done"), status.count("failed")) == (2, 2)
+    steps: list[int] = []
+    assert ran(study, retry_failed=True, on_steps=steps.append).count("done") == 4
+    assert steps == []  # its training was complete
+    assert not state.exists()
+    assert numbers(study).items() <= numbers(whole).items()
 
 
 def test_lanes_of_cells_that_are_left_out_keep_their_tasks(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, study: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = saved(tmp_path, monkeypatch)
     monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
-    assert ran(tmp_path, only=["algorithm=agent", "class=small"]).count("done") == 2
+    assert ran(study, only=["algorithm=agent", "class=small"]).count("done") == 2
     assert state.exists()  # with two lanes at the end of their training
-    assert ran(tmp_path).count("done") == 4
+    assert ran(study).count("done") == 4
     assert not state.exists()
-    assert numbers(tmp_path).items() <= numbers(whole).items()
+    assert numbers(study).items() <= numbers(whole).items()
 
 
 def test_a_program_with_other_lanes_leaves_a_state_whole(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, study: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    state = saved(tmp_path, monkeypatch)
     before = state.read_bytes()
     monkeypatch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
-
-    def interrupt(done: int) -> None:
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        ran(tmp_path, lanes=2, on_steps=interrupt)
+        ran(study, lanes=2, on_steps=interrupt)
     assert state.read_bytes() == before
-    assert len(list((tmp_path / "states").glob("*.npz"))) == 2
-    assert ran(tmp_path).count("done") == 4
-    assert numbers(tmp_path).items() <= numbers(whole).items()
-    assert not list((tmp_path / "states").glob("*.npz"))
+    assert len(list((study / "states").glob("*.npz"))) == 2
+    assert ran(study).count("done") == 4
+    assert numbers(study).items() <= numbers(whole).items()
+    assert not list((study / "states").glob("*.npz"))
 
 
-def test_a_state_of_other_versions_is_not_used(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_state_of_other_versions_is_not_used(whole: Path, study: Path, state: Path) -> None:
+    def worsen(arrays: dict[str, Any]) -> None:
+        arrays["records/regret"] += 1000.0  # would show in the results
+
+    change_state(state, worsen, versions={"jax": "0"})
+    assert ran(study).count("done") == 4
+    assert numbers(study).items() <= numbers(whole).items()
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [("records/regret", None), ("records/rows", np.zeros(3)), ("program/.key", np.zeros(3))],
+)
+def test_a_state_with_other_arrays_counts_as_none_and_a_message_says_so(
+    name: str, array: Any, whole: Path, study: Path, state: Path
 ) -> None:
-    state = saved(tmp_path, monkeypatch)
-    header = read_header(state)
-    assert header is not None
-    arrays = read_state(state, header)
-    assert arrays is not None
-    arrays["records/regret"] += 1000.0  # would show in the results
-    write_state(state, header | {"versions": {"jax": "0"}}, arrays)
-    assert ran(tmp_path).count("done") == 4
-    assert numbers(tmp_path).items() <= numbers(whole).items()
+    def change(arrays: dict[str, Any]) -> None:
+        assert arrays.pop(name) is not None
+        arrays |= {} if array is None else {name: array}
+
+    change_state(state, change)
+    printed, steps = io.StringIO(), list[int]()
+    status = ran(study, console=Console(file=printed), on_steps=steps.append)
+    assert status.count("done") == 4
+    assert steps[0] == 0
+    assert numbers(study).items() <= numbers(whole).items()
+    assert printed.getvalue().count(f"starts again, without {state}") == 1
 
 
 def test_a_state_of_more_lanes_is_not_used(tmp_path: Path) -> None:
