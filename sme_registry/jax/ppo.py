@@ -38,7 +38,7 @@ from sme_registry.jax.networks import (
     perceptron,
 )
 from sme_registry.jax.program import Program, StepLog
-from sme_registry.jax.ranges import Count, Positive, Share, Weight, Widths
+from sme_registry.jax.ranges import Count, Flag, Positive, Share, Weight, Widths
 from sme_registry.jax.task import TaskParams
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
@@ -65,7 +65,7 @@ class PPO:
     gae_lambda: Share = 0.95
     clip_range: Positive = 0.2
     clip_range_vf: Positive | None = None
-    normalize_advantage: bool = True
+    normalize_advantage: Flag = True
     ent_coef: Weight = 0.0
     vf_coef: Weight = 0.5
     max_grad_norm: Positive = 0.5

@@ -7,19 +7,20 @@ run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
+from sme_registry.io import choice, integer_in
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import Array, Evaluation, Program, StepLog, policy
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
-from sme_registry.spec import SMESpec
+from sme_registry.spec import ACTION_RANGES, SMESpec
 from sme_registry.spec.study import JAX
 
 ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
@@ -55,7 +56,6 @@ def settings_of(
     uses: str,
     hyperparameters: Mapping[str, Any],
     field: str = "hyperparameters",
-    others: Iterable[str] = (),
 ) -> Any:
     """The hyperparameters of an algorithm, with its defaults for those that are left out.
 
@@ -63,29 +63,28 @@ def settings_of(
       uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
       hyperparameters: JSON values by the names of Stable-Baselines3; `net_arch` in `policy_kwargs`.
       field: what error messages call them.
-      others: names that the caller accepts beside them, which messages may suggest.
 
     Raises:
       UnknownNameError: no such algorithm.
       OptionError: it has no such hyperparameter here, or not this value.
     """
+    kind, _ = _algorithm(uses)
     name = full_name(uses)
-    kind, _ = ALGORITHMS[name.removeprefix(JAX)]
     fields = {each.name for each in dataclasses.fields(kind)}
     known = {f"{POLICY}.{name}" if name in _OF_POLICY else name: name for name in sorted(fields)}
     values = {}
-    for given, value in _flat(hyperparameters).items():
+    for given, value in _flat(hyperparameters, field).items():
         if given not in known:
             raise OptionError(
                 f"{field}.{given}: {name} has no such hyperparameter."
-                f"{did_you_mean(given, [*known, *others])} Known: {', '.join(known)}. For "
+                f"{did_you_mean(given, known)} Known: {', '.join(known)}. For "
                 "others, use the algorithm of Stable-Baselines3."
             )
         values[known[given]] = value
     try:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
-        fault = error.errors()[0]
+        fault = error.errors()[-1]  # of a text or a number: that of the number
         own_error = fault.get("ctx", {}).get("error")
         if isinstance(own_error, OptionError):  # of values that do not go together
             raise own_error from None
@@ -113,10 +112,20 @@ def new_program(
 
     Raises:
       UnknownNameError: no such algorithm.
-      OptionError: see `settings_of`; or there is no such device.
+      OptionError: see `settings_of`; there is no task or no such device; or there is another number
+        of seeds than of tasks, or fewer lanes; or another argument is outside its range.
       SpecError: a task is not one that JAX has, such as a team's.
+      ResourceLimitError: the device's memory is too small; says how many lanes fit.
     """
-    _, program = ALGORITHMS[full_name(uses).removeprefix(JAX)]
+    integer_in("len(specs)", len(specs), 1)
+    integer_in("len(seeds)", len(seeds), len(specs), len(specs), advice="Give a seed of each task.")
+    for i, seed in enumerate(seeds):
+        integer_in(f"seeds[{i}]", seed, 0, 2**32 - 1)
+    integer_in("steps", steps, 0)
+    if lanes is not None:
+        integer_in("lanes", lanes, len(specs), advice="Leave it out for one of each task.")
+    choice("action_range", action_range, ACTION_RANGES)
+    _, program = _algorithm(uses)
     return program(
         settings_of(uses, hyperparameters or {}),
         specs,
@@ -137,7 +146,8 @@ def policy_of(
     action_range: str = "symmetric",
 ) -> Callable[[Array], Array]:
     """The deterministic policy of weights; see `program.policy`, and `new_program` for errors."""
-    _, program = ALGORITHMS[full_name(uses).removeprefix(JAX)]
+    choice("action_range", action_range, ACTION_RANGES)
+    _, program = _algorithm(uses)
     settings = settings_of(uses, hyperparameters or {})
     return policy(program, settings, weights, action_range == "symmetric")
 
@@ -214,10 +224,22 @@ def _stacked(program: Program, groups: Sequence[Sequence[Array]]) -> Array:
     return np.stack([np.pad(states, [(0, 0), (0, S - states.shape[1])]) for states in lanes])
 
 
-def _flat(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+def _algorithm(uses: str) -> tuple[Any, type[Program]]:
+    return ALGORITHMS[full_name(uses).removeprefix(JAX)]
+
+
+def _flat(hyperparameters: Mapping[str, Any], field: str) -> dict[str, Any]:
     """Those of the policy by dotted names."""
-    flat = {name: value for name, value in hyperparameters.items() if name != POLICY}
-    of_policy = hyperparameters.get(POLICY, {})
-    if not isinstance(of_policy, Mapping):
-        return {**flat, POLICY: of_policy}  # refused as unknown
-    return {**flat, **{f"{POLICY}.{name}": value for name, value in of_policy.items()}}
+    flat: dict[str, Any] = {}
+    for name, value in hyperparameters.items():
+        if name.startswith(f"{POLICY}."):
+            # Stable-Baselines3, which keeps the model, has no such name.
+            raise OptionError(
+                f"{field}.{name}: must be in the dict {POLICY}, such as "
+                f'{{"{POLICY}": {{"net_arch": [64, 64]}}}}.'
+            )
+        if name == POLICY and isinstance(value, Mapping):
+            flat |= {f"{POLICY}.{each}": given for each, given in value.items()}
+        else:
+            flat[name] = value
+    return flat

@@ -79,10 +79,10 @@ class SAC:
         for name in ("ent_coef", "target_entropy"):
             _check_automatic(name, getattr(self, name))
         begins = self.initial_entropy_coefficient
-        if begins < 0.0 or (begins == 0.0 and self.learns_entropy):
+        if not 0.0 <= begins < math.inf or (begins == 0.0 and self.learns_entropy):
             raise OptionError(
-                f"hyperparameters.ent_coef={self.ent_coef!r}: must be at least 0, and begin above "
-                "0 where its logarithm is learned."
+                f"hyperparameters.ent_coef={self.ent_coef!r}: must be finite and at least 0, and "
+                "begin above 0 where its logarithm is learned."
             )
 
     @property

@@ -15,7 +15,7 @@ from typing import Any
 
 from sme_registry.errors import OptionError, did_you_mean
 from sme_registry.io import import_object, read_json
-from sme_registry.spec.study import in_jax
+from sme_registry.spec.study import JAX, in_jax
 from sme_registry.training.algorithms import find_algorithm, is_sb3
 
 # Arguments of an algorithm's constructor that are not hyperparameters.
@@ -84,9 +84,11 @@ def check_hyperparameters(
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
     """
     if in_jax(uses):
-        from sme_registry.jax.run import settings_of
+        from sme_registry.jax.run import full_name, settings_of
 
-        settings_of(uses, hyperparameters, field, others)
+        plain = full_name(uses).removeprefix(JAX)
+        refuse_unknown(find_algorithm(plain), plain, hyperparameters, field, others)
+        settings_of(uses, hyperparameters, field)
     elif hyperparameters:
         refuse_unknown(find_algorithm(uses), uses, hyperparameters, field, others)
 

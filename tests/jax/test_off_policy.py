@@ -166,6 +166,8 @@ def test_padding_changes_no_step() -> None:
         ("jax:SAC", "tau", 1.5),
         ("jax:SAC", "ent_coef", "automatic"),
         ("jax:SAC", "ent_coef", "auto_0"),
+        ("jax:SAC", "ent_coef", "auto_1e400"),
+        ("jax:SAC", "ent_coef", True),
         ("jax:SAC", "ent_coef", -1),
         ("jax:SAC", "target_entropy", "auto_1"),
         ("jax:SAC", "policy_kwargs.net_arch", []),

@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("jax")
 
 from sme_registry import SMESpec
+from sme_registry.errors import OptionError
 from sme_registry.jax.program import Evaluation, Program, StepLog
-from sme_registry.jax.run import run
+from sme_registry.jax.run import new_program, run
 
 SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=1))
 
@@ -116,3 +117,20 @@ def test_the_state_may_be_saved_after_each_piece_and_its_evaluations() -> None:
     assert saved == [
         ("steps", 3), 3, ("steps", 2), one, 5, ("steps", 3), 8, ("steps", 2), 10, "finish", one,
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"action_range": "foo"}, "action_range='foo': must be 'unit' or 'symmetric'"),
+        ({"specs": (), "seeds": ()}, r"len\(specs\)=0: must be an integer of at least 1"),
+        ({"seeds": (0,)}, r"len\(seeds\)=1: must be .*Give a seed of each task"),
+        ({"seeds": (0, -1)}, r"seeds\[1\]=-1: must be"),
+        ({"lanes": 1}, "lanes=1: must be an integer of at least 2"),
+        ({"steps": -1}, "steps=-1: must be"),
+    ],
+)
+def test_a_program_of_invalid_lanes_is_refused(change: dict[str, Any], message: str) -> None:
+    arguments = {"specs": SPECS, "seeds": (0, 1), "steps": 10, **change}
+    with pytest.raises(OptionError, match=message):
+        new_program("jax:PPO", **arguments)

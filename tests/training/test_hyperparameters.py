@@ -60,6 +60,18 @@ def test_unknown_names_are_rejected_with_a_similar_one(
         check_hyperparameters(uses, values)
 
 
+def test_a_hyperparameter_that_only_stable_baselines3_has_is_taken_for_no_field_of_a_task() -> None:
+    pytest.importorskip("jax")
+    others = ["action_dim", "complexity"]
+    with pytest.raises(
+        OptionError, match=r"action_noise: jax:TD3 has no .*of Stable-Base"
+    ) as error:
+        check_hyperparameters("jax:TD3", {"action_noise": 0.1}, others=others)
+    assert "action_dim" not in str(error.value)
+    with pytest.raises(OptionError, match=r"complexty: TD3 has no .*Did you mean 'complexity'"):
+        check_hyperparameters("jax:TD3", {"complexty": 2}, others=others)
+
+
 def test_known_names_are_accepted_whatever_their_values() -> None:
     check_hyperparameters("PPO", {"n_steps": "many", "policy_kwargs": {"net_arch": [8]}})
     check_hyperparameters("sb3_contrib:RecurrentPPO", {"policy_kwargs": {"lstm_hidden_size": 8}})

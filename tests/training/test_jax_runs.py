@@ -211,7 +211,7 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
         ),
         (
             {"hyperparameters": {"policy_kwargs": {"net_arch": "wide"}}},
-            r"policy_kwargs.net_arch='wide': Input should be a valid tuple",
+            r"policy_kwargs.net_arch='wide': must be a list of widths of at least 1, such as",
         ),
         ({"hyperparameters": {"n_steps": "many"}}, "n_steps='many'.*valid integer"),
         ({"num_envs": 2}, "num_envs=2: must be 1"),
