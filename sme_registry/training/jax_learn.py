@@ -8,7 +8,7 @@ Imports JAX and Stable-Baselines3; import it inside functions only.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,20 +26,28 @@ from sme_registry.training import checkpoint
 from sme_registry.training.episodes import Episode
 from sme_registry.training.learn import RunLog
 from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
-from sme_registry.training.sb3_models import sb3_model
+from sme_registry.training.sb3_models import new_sb3_model, set_weights
 
 _PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
 _EPISODE = "episode"  # of the checkpoint: the sums of the present episode
 
 
-def new_model(record: RunRecord) -> Program:
-    """The program of a run, at its start.
+class Agent(NamedTuple):
+    """A program of one lane, and the model of Stable-Baselines3 that gets its weights."""
+
+    program: Program
+    model: Any
+
+
+def new_model(record: RunRecord) -> Agent:
+    """The program of a run and its model, untrained.
 
     Raises:
       SpecError: the task is not one that JAX has, such as a team's.
       OptionError: there is no such device, or a hyperparameter has no such value.
+      ResourceLimitError: the program does not fit in the device's memory.
     """
-    return jax_run.new_program(
+    program = jax_run.new_program(
         record.algorithm,
         [record.spec],
         [record.seed],
@@ -48,10 +56,19 @@ def new_model(record: RunRecord) -> Program:
         steps=record.steps,
         device=record.device or None,
     )
+    model = new_sb3_model(
+        record.algorithm,
+        record.spec,
+        seed=record.seed,
+        action_range=record.action_range,
+        hyperparameters=record.hyperparameters,
+        steps=record.steps,
+    )
+    return Agent(program, model)
 
 
 def learn(
-    program: Program, record: RunRecord, folder: Path, progress: bool, console: Console | None
+    agent: Agent, record: RunRecord, folder: Path, progress: bool, console: Console | None
 ) -> tuple[RunRecord, list[Episode], Any]:
     """Train and write a model; see `training.learn.learn`.
 
@@ -60,6 +77,7 @@ def learn(
         the last checkpoint stays.
       OptionError: a file cannot be written.
     """
+    program, model = agent
     present = _PresentEpisode()
     path = folder / checkpoint.FILE
     if record.sessions > 1 and path.exists():
@@ -91,15 +109,7 @@ def learn(
         jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=piece)
         _check_finite(program, folder)
     board.close()
-    model = sb3_model(
-        record.algorithm,
-        program.weights(0),
-        record.spec,
-        seed=record.seed,
-        action_range=record.action_range,
-        hyperparameters=record.hyperparameters,
-        steps=program.steps,
-    )
+    set_weights(model, program.weights(0), program.steps)
     with defer_interrupts():
         write_atomically(folder / MODEL, saved_sb3(model))
         log.record().write(folder)

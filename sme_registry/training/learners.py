@@ -69,7 +69,7 @@ def new_learner(
         try:
             policy = policy_alias(algorithm)
             learner = algorithm(policy, env, seed=seed, device="cpu", **settings)
-        except (AssertionError, TypeError, ValueError) as error:
+        except (AssertionError, MemoryError, TypeError, ValueError) as error:
             raise OptionError(
                 f"{field}={uses!r}: rejects the task or the hyperparameters "
                 f"{sorted(hyperparameters)}: {error}. Change them, or create the learner in a "

@@ -1,4 +1,4 @@
-"""`sb3_model`: the weights of an agent in JAX in a model of Stable-Baselines3, which acts alike.
+"""Models of Stable-Baselines3 for agents in JAX: `new_sb3_model`, and `set_weights` to act alike.
 
 Saved, it is what `sme train` and studies keep of such an agent: evaluation, export to ONNX,
 diagnosis and leaderboards take it as any other model.
@@ -21,9 +21,8 @@ from sme_registry.spec.study import JAX
 from sme_registry.training.learners import new_learner
 
 
-def sb3_model(
+def new_sb3_model(
     uses: str,
-    weights: Mapping[str, npt.NDArray[Any]],
     spec: SMESpec,
     *,
     seed: int,
@@ -31,26 +30,47 @@ def sb3_model(
     hyperparameters: Mapping[str, Any],
     steps: int,
 ) -> Any:
-    """A model with these weights, untrained otherwise: its optimiser is new.
+    """An untrained model. Make it before the training, so that what it refuses is refused then.
+
+    Its replay buffer is no larger than the training needs, as in JAX: whoever loads the model gets
+    one of this size.
 
     Args:
       uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
-      weights: of one lane, by the names of the policy's `state_dict`; others are tensors of the
-        model itself.
       spec: the task.
       seed: of the run.
       action_range: of the policy's actions.
       hyperparameters: of the run.
+      steps: that it trains.
+
+    Raises:
+      OptionError: Stable-Baselines3 rejects a hyperparameter's value or the task.
+    """
+    settings = dict(hyperparameters)
+    if "buffer_size" in settings:
+        settings["buffer_size"] = min(settings["buffer_size"], max(1, steps))
+    return new_learner(
+        uses.removeprefix(JAX),
+        SMEVecEnv(spec, 1, action_range=action_range),
+        seed=seed,
+        steps=steps,
+        hyperparameters=settings,
+        field="algorithm",
+    )
+
+
+def set_weights(model: Any, weights: Mapping[str, npt.NDArray[Any]], steps: int) -> None:
+    """Give a model the weights of an agent in JAX; its optimiser stays new.
+
+    Args:
+      model: of `new_sb3_model`.
+      weights: of one lane, by the names of the policy's `state_dict`; others are tensors of the
+        model itself.
       steps: that were trained.
     """
-    env = SMEVecEnv(spec, 1, action_range=action_range)
-    model: Any = new_learner(
-        uses.removeprefix(JAX), env, seed=seed, steps=steps, hyperparameters=hyperparameters
-    )
     names = model.policy.state_dict().keys()
     tensors = {name: torch.from_numpy(np.array(value)) for name, value in weights.items()}
     model.policy.load_state_dict({name: tensors[name] for name in names})
     for name in tensors.keys() - names:
         getattr(model, name).data.copy_(tensors[name])
     model.num_timesteps = steps
-    return model

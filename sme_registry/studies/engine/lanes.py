@@ -66,6 +66,8 @@ def run_lanes(
       SpecError: JAX does not have one of the tasks.
     """
     run = _Run(cells, lanes, progress)
+    if keep_models:
+        _new_model(cells[0])  # what Stable-Baselines3 refuses is refused before the training
     run.train()
     yield from run.results(keep_models)
 
@@ -220,18 +222,10 @@ class _Run:
 
     def _model(self, lane: int) -> bytes:
         """A lane's model as Stable-Baselines3 saves it."""
-        from sme_registry.training.sb3_models import sb3_model
+        from sme_registry.training.sb3_models import set_weights
 
-        cell = self._cells[lane]
-        model = sb3_model(
-            cell.uses,
-            self._program.weights(lane),
-            cell.spec,
-            seed=cell.seed,
-            action_range=cell.action_range,
-            hyperparameters=cell.hyperparameters,
-            steps=self._program.steps,
-        )
+        model = _new_model(self._cells[lane])
+        set_weights(model, self._program.weights(lane), self._program.steps)
         return saved_sb3(model)
 
     def _online_regret(self, lane: int) -> float | None:
@@ -285,6 +279,20 @@ def _named(arrays: Arrays, prefix: str) -> Arrays:
 
 def _forms(arrays: Arrays) -> Any:
     return {name: (array.dtype, array.shape) for name, array in arrays.items()}
+
+
+def _new_model(cell: Cell) -> Any:
+    """The untrained model of Stable-Baselines3 of a cell."""
+    from sme_registry.training.sb3_models import new_sb3_model
+
+    return new_sb3_model(
+        cell.uses,
+        cell.spec,
+        seed=cell.seed,
+        action_range=cell.action_range,
+        hyperparameters=cell.hyperparameters,
+        steps=cell.steps,
+    )
 
 
 class _Trained(NamedTuple):
