@@ -22,14 +22,9 @@ import numpy as np
 from sme_registry.jax import replay
 from sme_registry.jax.env import EnvState, reset, step, to_unit
 from sme_registry.jax.networks import Weights
-from sme_registry.jax.program import Array, Program, StepLog
+from sme_registry.jax.program import PIECE, Array, Program, StepLog
 from sme_registry.jax.replay import Transitions
 from sme_registry.jax.task import TaskParams
-
-Log = tuple[jax.Array, ...]
-"""The fields of a `StepLog`."""
-
-_PIECE = 500  # most steps of one call of the compiled loop
 
 
 class OffPolicyState(NamedTuple):
@@ -59,9 +54,14 @@ class OffPolicyState(NamedTuple):
 
 
 class OffPolicyProgram(Program):
-    """Lanes of TD3 or SAC."""
+    """Lanes of TD3 or SAC.
+
+    Attributes:
+      draws: how often an update draws noise for each action of its batch.
+    """
 
     buffer = "buffer"
+    draws: int
     state: OffPolicyState
 
     @staticmethod
@@ -72,9 +72,16 @@ class OffPolicyProgram(Program):
     @staticmethod
     @abstractmethod
     def explore(
-        weights: Weights, observation: jax.Array, key: jax.Array, mask: jax.Array
+        weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
     ) -> jax.Array:
-        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask."""
+        """One lane's action `[A]` in [−1, 1] while it learns, 0 in channels outside the mask.
+
+        Args:
+          weights: of the lane.
+          observation: `[S + 2]`.
+          noise: `[A]` standard normal.
+          mask: `[A]` which action channels exist.
+        """
 
     @staticmethod
     @abstractmethod
@@ -82,7 +89,7 @@ class OffPolicyProgram(Program):
         settings: Any,
         learner: Any,
         batch: Transitions,
-        key: jax.Array,
+        noise: jax.Array,
         mask: jax.Array,
         count: jax.Array,
         index: jax.Array,
@@ -93,7 +100,7 @@ class OffPolicyProgram(Program):
           settings: hyperparameters.
           learner: before it.
           batch: `[B]` transitions.
-          key: for its noise.
+          noise: `[A, draws, B]` standard normal.
           mask: `[A]` which action channels exist.
           count: the number of this update, from 1; the same in all lanes.
           index: its number among the `gradient_steps` of this step, from 0; the same in all lanes.
@@ -111,13 +118,13 @@ class OffPolicyProgram(Program):
 
     def advance(self, limit: int) -> StepLog:
         """Go on to step `limit`, or to the end of its `train_freq` steps; see `Program.advance`."""
-        pieces: list[list[Array]] = []
+        pieces: list[StepLog] = []
         end = self._whole(limit)
         while self.steps < end or not pieces:
-            size = min(_PIECE, max(0, end - self.steps))
+            size = min(PIECE, max(0, end - self.steps))
             log = self._loop(self.steps, self.steps + size, acts=True)
             self.steps += size
-            pieces.append([np.asarray(each)[:size] for each in log])
+            pieces.append(StepLog(*(np.asarray(each)[:size] for each in log)))
         return StepLog(*map(np.concatenate, zip(*pieces, strict=True)))
 
     def finish(self) -> None:
@@ -130,8 +137,8 @@ class OffPolicyProgram(Program):
         name = f".{self.buffer}"
         return arrays | {name: arrays[name][: self.steps]}
 
-    def _loop(self, begin: int, end: int, acts: bool) -> Log:
-        log: Log
+    def _loop(self, begin: int, end: int, acts: bool) -> StepLog:
+        log: StepLog
         self.state, log = _steps(
             type(self), self.settings, self.state, self.params, begin, end, acts
         )
@@ -179,16 +186,16 @@ def _steps(
     begin: jax.Array,
     end: jax.Array,
     acts: jax.Array,
-) -> tuple[OffPolicyState, Log]:
+) -> tuple[OffPolicyState, StepLog]:
     """Each step from `begin` to `end`, after the update that is pending; no step if not `acts`.
 
     Returns:
-      The new state, and logs `[_PIECE, lanes]` whose first `end − begin` rows are used.
+      The new state, and a log `[PIECE, lanes]` whose first `end − begin` rows are used.
     """
     lanes = state.observation.shape[0]
     masks = jax.vmap(lambda each: each.action_mask)(params)
 
-    def body(n: jax.Array, carry: tuple[OffPolicyState, Log]) -> tuple[OffPolicyState, Log]:
+    def body(n: jax.Array, carry: tuple[OffPolicyState, StepLog]) -> Any:
         state, log = carry
         state = _updated(kind, settings, state, masks, n)
         state, row = _acted(kind, settings, state, params, masks, n, acts)
@@ -197,9 +204,10 @@ def _steps(
         )
         return state, log
 
-    real, flag = jnp.zeros((_PIECE, lanes), params.r_min.dtype), jnp.zeros((_PIECE, lanes), bool)
-    begun = state, (real, real, real, flag, flag)
-    ended: tuple[OffPolicyState, Log] = jax.lax.fori_loop(begin, end, body, begun)
+    real: Any = jnp.zeros((PIECE, lanes), params.r_min.dtype)
+    flag: Any = jnp.zeros((PIECE, lanes), bool)
+    begun = state, StepLog(real, real, real, flag, flag)
+    ended: tuple[OffPolicyState, StepLog] = jax.lax.fori_loop(begin, end, body, begun)
     return ended
 
 
@@ -218,7 +226,8 @@ def _updated(
 
     def one(index: jax.Array, learner: Any) -> Any:
         keys = _keys(state.keys, n, 2 + index)
-        drawn, noise = jax.vmap(jax.random.split, out_axes=1)(keys)
+        drawn, of_noise = jax.vmap(jax.random.split, out_axes=1)(keys)
+        noise = _normal(of_noise, (masks.shape[-1], kind.draws, settings.batch_size))
         capacity = len(state.buffer)
         rows = jax.vmap(lambda key: replay.sample_rows(key, settings.batch_size, n, capacity))
         batch = replay.read(state.buffer, rows(drawn), observation_dim)
@@ -243,16 +252,17 @@ def _acted(
     masks: jax.Array,
     n: jax.Array,
     acts: jax.Array,
-) -> tuple[OffPolicyState, Log]:
+) -> tuple[OffPolicyState, StepLog]:
     """The state after step n + 1, and its row of the log; the same state if not `acts`."""
-    starts, noise = _keys(state.keys, n, 0), _keys(state.keys, n, 1)
+    starts, of_noise = _keys(state.keys, n, 0), _keys(state.keys, n, 1)
+    width = masks.shape[-1:]
 
     def random(observation: jax.Array) -> jax.Array:
-        width = masks.shape[-1:]
         draw = functools.partial(jax.random.uniform, shape=width, dtype=jnp.float32, minval=-1.0)
-        return jnp.where(masks, jax.vmap(draw)(noise), 0.0)
+        return jnp.where(masks, jax.vmap(draw)(of_noise), 0.0)
 
     def chosen(observation: jax.Array) -> jax.Array:
+        noise = _normal(of_noise, width)
         return jax.vmap(kind.explore)(state.learner.weights, observation, noise, masks)
 
     action = jax.lax.cond(n < settings.learning_starts, random, chosen, state.observation)
@@ -261,17 +271,22 @@ def _acted(
     final = info["final_observation"]
     terminated = info["terminated"]
     written = Transitions(state.observation, action, final, reward, terminated)
-    row = reward, info["regret"], info["similarity"], terminated, info["truncated"]
+    row: Any = reward, info["regret"], info["similarity"], terminated, info["truncated"]
     after = state._replace(
         buffer=replay.write(state.buffer, n, written, acts),
         episode=_chosen(acts, episode, state.episode),
         observation=_chosen(acts, observation, state.observation),
     )
-    return after, row
+    return after, StepLog(*row)
 
 
 def _chosen(acts: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(acts, x, y), new, old)
+
+
+def _normal(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Standard normal numbers of each lane, `[lanes, *shape]` float32."""
+    return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
 def _keys(keys: jax.Array, n: jax.Array, use: int | jax.Array) -> jax.Array:

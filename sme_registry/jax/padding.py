@@ -19,7 +19,7 @@ InitialWeights = Callable[[np.random.Generator, int, int], HostWeights]
 """From random numbers, the width of an observation and that of an action, to initial weights."""
 
 
-class Widths(NamedTuple):
+class Dimensions(NamedTuple):
     """S state channels and A action channels, of a task or of the program that it is padded to."""
 
     state_dim: int
@@ -43,7 +43,7 @@ class Padding:
       full: the widths of the program.
     """
 
-    def __init__(self, initial_weights: InitialWeights, full: Widths) -> None:
+    def __init__(self, initial_weights: InitialWeights, full: Dimensions) -> None:
         self._full = full
         rng = np.random.default_rng(0)
         base, wider, longer = (
@@ -55,7 +55,7 @@ class Padding:
             for name, shape in base.items()
         }
 
-    def add(self, weights: Mapping[str, Array], own: Widths) -> HostWeights:
+    def add(self, weights: Mapping[str, Array], own: Dimensions) -> HostWeights:
         """The weights of networks of these widths, padded with 0."""
         padded = {}
         for name, weight in weights.items():
@@ -64,7 +64,7 @@ class Padding:
             padded[name][np.ix_(*(indices for indices, _ in kept))] = weight
         return padded
 
-    def remove(self, weights: Mapping[str, Array], own: Widths) -> HostWeights:
+    def remove(self, weights: Mapping[str, Array], own: Dimensions) -> HostWeights:
         """The weights without their padding."""
         return {
             name: np.array(
@@ -73,7 +73,7 @@ class Padding:
             for name, weight in weights.items()
         }
 
-    def _kept(self, name: str, shape: tuple[int, ...], own: Widths) -> list[tuple[Array, int]]:
+    def _kept(self, name: str, shape: tuple[int, ...], own: Dimensions) -> list[tuple[Array, int]]:
         """Of each axis, the indices that are no padding, and its padded extent."""
         S, full = own.state_dim, self._full
         observation = np.r_[:S, full.state_dim : full.observation_dim]

@@ -142,25 +142,7 @@ class State(NamedTuple):
     steps: Steps
 
 
-def initial_weights(
-    settings: PPO, rng: np.random.Generator, observation_dim: int, action_dim: int
-) -> HostWeights:
-    """SB3's initial weights: orthogonal; biases and log σ are 0."""
-    weights: HostWeights = {"log_std": np.zeros(action_dim, np.float32)}
-    for network, head, outputs, gain in (
-        ("policy_net", "action_net", action_dim, 0.01),
-        ("value_net", "value_net", 1, 1.0),
-    ):
-        width = observation_dim
-        for i, units in enumerate(settings.net_arch):
-            name = f"mlp_extractor.{network}.{2 * i}"
-            weights |= initial_orthogonal(rng, name, width, units, math.sqrt(2.0))
-            width = units
-        weights |= initial_orthogonal(rng, head, width, outputs, gain)
-    return weights
-
-
-def act(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
+def mean(settings: PPO, weights: Weights, observation: jax.Array) -> jax.Array:
     """μ `[..., A]` of observations `[..., O]`: the deterministic action before it is clipped."""
     return linear(weights, "action_net", _latent(settings, weights, "policy_net", observation))
 
@@ -176,7 +158,7 @@ def log_density(
 ) -> jax.Array:
     """log π `[...]` of actions `[..., A]`; only the channels of the mask `[A]` count."""
     log_std = weights["log_std"]
-    z = (action - act(settings, weights, observation)) * jnp.exp(-log_std)
+    z = (action - mean(settings, weights, observation)) * jnp.exp(-log_std)
     return jnp.sum(jnp.where(mask, -0.5 * z**2 - log_std - _LOG_ROOT_TAU, 0.0), axis=-1)
 
 
@@ -212,7 +194,7 @@ def collect(
     def one(episode: EnvState, drawn: tuple[jax.Array, EnvState]) -> tuple[EnvState, Any]:
         noise, fresh = drawn
         observation = observe(episode, params)
-        action = act(settings, weights, observation) + sigma * noise
+        action = mean(settings, weights, observation) + sigma * noise
         a = to_unit(action, symmetric)
         _, after, reward, ended, info = step_env(_NO_KEY, episode, a, params)
         judged: Any = info["similarity"], info["step_reward"], reward, info["terminated"]
@@ -363,11 +345,23 @@ class PPOProgram(Program):
         self.rollout = settings.n_steps
         super().__init__(settings, *arguments, **options)
 
+    @staticmethod
     def initial_weights(
-        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+        settings: PPO, rng: np.random.Generator, observation_dim: int, action_dim: int
     ) -> HostWeights:
-        """SB3's; see `initial_weights`."""
-        return initial_weights(self.settings, rng, observation_dim, action_dim)
+        """SB3's initial weights: orthogonal; biases and log σ are 0."""
+        weights: HostWeights = {"log_std": np.zeros(action_dim, np.float32)}
+        for network, head, outputs, gain in (
+            ("policy_net", "action_net", action_dim, 0.01),
+            ("value_net", "value_net", 1, 1.0),
+        ):
+            width = observation_dim
+            for i, units in enumerate(settings.net_arch):
+                name = f"mlp_extractor.{network}.{2 * i}"
+                weights |= initial_orthogonal(rng, name, width, units, math.sqrt(2.0))
+                width = units
+            weights |= initial_orthogonal(rng, head, width, outputs, gain)
+        return weights
 
     def initial_state(self, weights: Weights, keys: jax.Array) -> State:
         """Lanes at the start of their first episode."""
@@ -376,8 +370,8 @@ class PPOProgram(Program):
 
     @staticmethod
     def act(settings: PPO, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """μ; see `act`."""
-        return act(settings, weights, observations)
+        """μ; see `mean`."""
+        return mean(settings, weights, observations)
 
     def advance(self, limit: int) -> StepLog:
         """Whole rollouts until `limit` is reached, and the updates between them."""

@@ -27,14 +27,17 @@ from sme_registry.jax import oracle
 from sme_registry.jax.device import find_device, memory_of
 from sme_registry.jax.env import EnvState, observe, start, step_env, to_unit
 from sme_registry.jax.networks import HostWeights, Weights
-from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.task import Shape, TaskParams, task_params
 from sme_registry.jax.transition import States, next_state
 from sme_registry.spec import SMESpec
 
 Array = npt.NDArray[Any]
 
-_PIECE = 25  # steps of an episode that are judged at once
+PIECE = 500
+"""The most steps between two returns from compiled code."""
+
+_JUDGED_AT_ONCE = 25  # steps of an episode
 
 
 class StepLog(NamedTuple):
@@ -142,7 +145,8 @@ class Program(ABC):
         self.device = find_device(device)
         self.params: TaskParams = jax.device_put(task_params(specs, shape=shape), self.device)
         A, S = self.params.W.shape[-2:]
-        self._padding = Padding(self.initial_weights, Widths(S, A))
+        self._initial_weights = functools.partial(self.initial_weights, settings)
+        self._padding = Padding(self._initial_weights, Dimensions(S, A))
         weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
         stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
@@ -150,9 +154,10 @@ class Program(ABC):
         self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
         self.steps = 0
 
+    @staticmethod
     @abstractmethod
     def initial_weights(
-        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+        settings: Any, rng: np.random.Generator, observation_dim: int, action_dim: int
     ) -> HostWeights:
         """The weights of a new lane, by SB3's names."""
 
@@ -201,7 +206,7 @@ class Program(ABC):
     def weights(self, lane: int) -> dict[str, Array]:
         """A lane's weights without padding, by SB3's names, as NumPy arrays."""
         padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
-        return self._padding.remove(padded, _widths(self.specs[lane]))
+        return self._padding.remove(padded, _dimensions(self.specs[lane]))
 
     def failed(self) -> Array:
         """`[lanes]`, whether a lane's weights are not finite; such lanes go on without effect."""
@@ -252,9 +257,9 @@ class Program(ABC):
             )
 
     def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
-        own, rng = _widths(spec), np.random.default_rng(seed)
+        own, rng = _dimensions(spec), np.random.default_rng(seed)
         return self._padding.add(
-            self.initial_weights(rng, own.observation_dim, own.action_dim), own
+            self._initial_weights(rng, own.observation_dim, own.action_dim), own
         )
 
     def _fitted(self, name: str, saved: Array, present: jax.Array | Array) -> Array:
@@ -293,8 +298,8 @@ def policy(
     return act
 
 
-def _widths(spec: SMESpec) -> Widths:
-    return Widths(spec.state_dim, spec.action_dim)
+def _dimensions(spec: SMESpec) -> Dimensions:
+    return Dimensions(spec.state_dim, spec.action_dim)
 
 
 @functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))
@@ -345,11 +350,11 @@ def _episodes(
             s = _each(lambda s, a, p: next_state(p, s, a), state.s, a, params=params)
             return state._replace(s=s, t=state.t + 1), (state.s, a)
 
-        state, (s, a) = jax.lax.scan(move, now.state, length=_PIECE)
+        state, (s, a) = jax.lax.scan(move, now.state, length=_JUDGED_AT_ONCE)
         judge = jax.vmap(oracle.judge, (0, 1, 1), (1, 1))
         similarity, reward = judge(params, s, a)  # [piece, lanes, episodes]
         horizon = params.horizon[:, None]
-        counted = now.state.t + jnp.arange(_PIECE)[:, None, None] < horizon
+        counted = now.state.t + jnp.arange(_JUDGED_AT_ONCE)[:, None, None] < horizon
         here = (reward, jnp.ones_like(reward), 1.0 - reward, similarity)
         sums = jax.tree.map(
             lambda sum, x: sum + jnp.where(counted, x, 0.0).sum(axis=0), now.sums, here

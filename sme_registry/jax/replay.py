@@ -41,7 +41,7 @@ def empty(capacity: int, lanes: int, observation_dim: int, action_dim: int) -> j
 
 
 def write(
-    buffer: jax.Array, row: jax.Array, transitions: Transitions, writes: bool | jax.Array = True
+    buffer: jax.Array, row: jax.Array, transitions: Transitions, writes: jax.Array
 ) -> jax.Array:
     """Store one transition of each lane in a row, modulo the capacity; nothing if not `writes`."""
     parts = (*transitions[:3], transitions.reward[..., None], transitions.done[..., None])

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, integer_in
 from sme_registry.jax.ppo import PPO, PPOProgram
-from sme_registry.jax.program import Array, Evaluation, Program, StepLog, policy
+from sme_registry.jax.program import PIECE, Array, Evaluation, Program, StepLog, policy
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
@@ -32,7 +32,6 @@ ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
 
 POLICY = "policy_kwargs"
 _OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `policy_kwargs`
-_PIECE = 500  # steps
 
 
 def full_name(uses: str, field: str = "uses") -> str:
@@ -160,7 +159,7 @@ def run(
     on_log: Callable[[StepLog], Any],
     on_evaluation: Callable[[int, int, Evaluation], Any] | None = None,
     after_piece: Callable[[], Any] = lambda: None,
-    piece: int = _PIECE,
+    piece: int = PIECE,
 ) -> None:
     """Run a program to its end, from its start or from where it was restored.
 

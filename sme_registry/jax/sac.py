@@ -105,35 +105,107 @@ class Learner(NamedTuple):
     entropy: Adam
 
 
-def initial_weights(
-    rng: np.random.Generator, observation_dim: int, action_dim: int, settings: SAC
-) -> HostWeights:
-    """Actor, critics and their targets, by Torch's default initialisation; log α if learned."""
-    *_, last = widths = [observation_dim, *settings.net_arch]
-    actor = initial_perceptron(rng, "actor.latent_pi", widths)
-    for head in ("mu", "log_std"):
-        actor |= initial_linear(rng, f"actor.{head}", last, action_dim)
-    both = critics.initial_critics(rng, observation_dim, action_dim, settings.net_arch)
-    weights = critics.with_targets(actor | both, ("critic",))
-    if settings.learns_entropy:
-        log_alpha = math.log(settings.initial_entropy_coefficient)
-        weights[_ENTROPY] = np.array([log_alpha], np.float32)
-    return weights
+class SACProgram(OffPolicyProgram):
+    """Lanes of SAC."""
+
+    draws = 2
+
+    @staticmethod
+    def initial_weights(
+        settings: SAC, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        """Actor, critics and their targets, by Torch's default initialisation; log α if learned."""
+        *_, last = widths = [observation_dim, *settings.net_arch]
+        actor = initial_perceptron(rng, "actor.latent_pi", widths)
+        for head in ("mu", "log_std"):
+            actor |= initial_linear(rng, f"actor.{head}", last, action_dim)
+        both = critics.initial_critics(rng, observation_dim, action_dim, settings.net_arch)
+        weights = critics.with_targets(actor | both, ("critic",))
+        if settings.learns_entropy:
+            log_alpha = math.log(settings.initial_entropy_coefficient)
+            weights[_ENTROPY] = np.array([log_alpha], np.float32)
+        return weights
+
+    @staticmethod
+    def initial_learner(weights: Weights) -> Learner:
+        """Weights and new optimisers."""
+        actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
+        entropy = {name: weights[name] for name in weights if name == _ENTROPY}
+        return Learner(weights, Adam.initial(actor), Adam.initial(critic), Adam.initial(entropy))
+
+    @staticmethod
+    def act(settings: SAC, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
+        """tanh of the mean."""
+        return in_range(jnp.tanh(_gaussian(weights, observations)[0]), symmetric)
+
+    @staticmethod
+    def explore(
+        weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """An action drawn from the policy."""
+        return _sample(weights, observation, noise, mask)[0]
+
+    @staticmethod
+    def update(
+        settings: SAC,
+        learner: Learner,
+        batch: Transitions,
+        noise: jax.Array,
+        mask: jax.Array,
+        count: jax.Array,
+        index: jax.Array,
+    ) -> Learner:
+        """See `OffPolicyProgram`; noise is for actions at the observations and at the next ones."""
+        weights = learner.weights
+        now, later = noise.transpose(1, 2, 0)
+
+        (action, log_prob), pull_back = jax.vjp(
+            lambda actor: _sample(actor, batch.observation, now, mask),
+            critics.network(weights, "actor"),
+        )
+        coefficient = _coefficient(settings, weights)
+        entropy, weights = _update_entropy(settings, learner.entropy, weights, log_prob, mask)
+
+        next_action, next_log_prob = _sample(weights, batch.next_observation, later, mask)
+        next_value = critics.smallest_value(
+            weights, "critic_target", batch.next_observation, next_action
+        )
+        soft_value = next_value - coefficient * next_log_prob
+        target = batch.reward + (1.0 - batch.done) * settings.gamma * soft_value
+        critic, weights = critics.fit_critics(
+            weights, learner.critic, batch, target, settings.learning_rate, scale=0.5
+        )
+
+        def loss(action: jax.Array, log_prob: jax.Array) -> jax.Array:
+            values = critics.smallest_value(weights, "critic", batch.observation, action)
+            return jnp.mean(coefficient * log_prob - values)
+
+        # By the chain rule in two parts, the actor runs once for this loss and for the entropy's.
+        (gradients,) = pull_back(jax.grad(loss, argnums=(0, 1))(action, log_prob))
+        actor, moved = adam(
+            learner.actor, critics.network(weights, "actor"), gradients, settings.learning_rate
+        )
+        weights = weights | moved
+        weights = jax.lax.cond(
+            index % settings.target_update_interval == 0,
+            lambda weights: critics.follow(weights, "critic", settings.tau),
+            lambda weights: weights,
+            weights,
+        )
+        return Learner(weights, actor, critic, entropy)
 
 
-def initial_learner(weights: Weights) -> Learner:
-    """The learner before its first update."""
-    actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
-    entropy = {name: weights[name] for name in weights if name == _ENTROPY}
-    return Learner(weights, Adam.initial(actor), Adam.initial(critic), Adam.initial(entropy))
+def _check_automatic(name: str, value: str | float) -> None:
+    """Raise OptionError unless it is a number or automatic."""
+    forms = {"ent_coef": r"auto(_\d+(\.\d*)?(e-?\d+)?)?", "target_entropy": "auto"}
+    if isinstance(value, str) and not re.fullmatch(forms[name], value):
+        initial = ', "auto_0.1" (its initial value)' if name == "ent_coef" else ""
+        raise OptionError(
+            f'hyperparameters.{name}={value!r:.60}: must be "auto"{initial} or a number.'
+        )
 
 
-def act(weights: Weights, observation: jax.Array) -> jax.Array:
-    """Deterministic actions `[..., A]` in [−1, 1]: tanh of the mean."""
-    return jnp.tanh(_gaussian(weights, observation)[0])
-
-
-def sample(
+def _sample(
     weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Actions and their log-probabilities.
@@ -154,116 +226,6 @@ def sample(
     return jnp.where(mask, action, 0.0), jnp.sum(jnp.where(mask, density, 0.0), axis=-1)
 
 
-def update(
-    learner: Learner,
-    batch: Transitions,
-    noise: jax.Array,
-    mask: jax.Array,
-    settings: SAC,
-    moves_targets: bool | jax.Array = True,
-) -> Learner:
-    """One update of one lane.
-
-    Args:
-      learner: the state before.
-      batch: `[B]` transitions.
-      noise: `[A, 2, B]` standard normal, for actions at the observations and at the next ones.
-      mask: `[A]` which action channels exist; the others are padding.
-      settings: hyperparameters.
-      moves_targets: whether the targets follow; see `target_update_interval`.
-    """
-    weights = learner.weights
-    now, later = noise.transpose(1, 2, 0)
-
-    (action, log_prob), pull_back = jax.vjp(
-        lambda actor: sample(actor, batch.observation, now, mask),
-        critics.network(weights, "actor"),
-    )
-    coefficient = _coefficient(weights, settings)
-    entropy, weights = _update_entropy(learner.entropy, weights, log_prob, mask, settings)
-
-    next_action, next_log_prob = sample(weights, batch.next_observation, later, mask)
-    next_value = critics.smallest_value(
-        weights, "critic_target", batch.next_observation, next_action
-    )
-    soft_value = next_value - coefficient * next_log_prob
-    target = batch.reward + (1.0 - batch.done) * settings.gamma * soft_value
-    critic, weights = critics.fit_critics(
-        weights, learner.critic, batch, target, settings.learning_rate, scale=0.5
-    )
-
-    def loss(action: jax.Array, log_prob: jax.Array) -> jax.Array:
-        values = critics.smallest_value(weights, "critic", batch.observation, action)
-        return jnp.mean(coefficient * log_prob - values)
-
-    # By the chain rule in two parts, the actor runs once for this loss and for the entropy's.
-    (gradients,) = pull_back(jax.grad(loss, argnums=(0, 1))(action, log_prob))
-    actor, moved = adam(
-        learner.actor, critics.network(weights, "actor"), gradients, settings.learning_rate
-    )
-    weights = weights | moved
-    weights = jax.lax.cond(
-        moves_targets,
-        lambda weights: critics.follow(weights, "critic", settings.tau),
-        lambda weights: weights,
-        weights,
-    )
-    return Learner(weights, actor, critic, entropy)
-
-
-class SACProgram(OffPolicyProgram):
-    """Lanes of SAC."""
-
-    def initial_weights(
-        self, rng: np.random.Generator, observation_dim: int, action_dim: int
-    ) -> HostWeights:
-        """See `initial_weights`."""
-        return initial_weights(rng, observation_dim, action_dim, self.settings)
-
-    @staticmethod
-    def act(settings: SAC, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """See `act`."""
-        return in_range(act(weights, observations), symmetric)
-
-    @staticmethod
-    def initial_learner(weights: Weights) -> Learner:
-        """See `initial_learner`."""
-        return initial_learner(weights)
-
-    @staticmethod
-    def explore(
-        weights: Weights, observation: jax.Array, key: jax.Array, mask: jax.Array
-    ) -> jax.Array:
-        """An action drawn from the policy."""
-        noise = jax.random.normal(key, mask.shape, jnp.float32)
-        return sample(weights, observation, noise, mask)[0]
-
-    @staticmethod
-    def update(
-        settings: SAC,
-        learner: Learner,
-        batch: Transitions,
-        key: jax.Array,
-        mask: jax.Array,
-        count: jax.Array,
-        index: jax.Array,
-    ) -> Learner:
-        """See `update`; the targets move at every `target_update_interval`-th one of a step."""
-        noise = jax.random.normal(key, (mask.shape[0], 2, batch.reward.shape[0]), jnp.float32)
-        moves = index % settings.target_update_interval == 0
-        return update(learner, batch, noise, mask, settings, moves)
-
-
-def _check_automatic(name: str, value: str | float) -> None:
-    """Raise OptionError unless it is a number or automatic."""
-    forms = {"ent_coef": r"auto(_\d+(\.\d*)?(e-?\d+)?)?", "target_entropy": "auto"}
-    if isinstance(value, str) and not re.fullmatch(forms[name], value):
-        initial = ', "auto_0.1" (its initial value)' if name == "ent_coef" else ""
-        raise OptionError(
-            f'hyperparameters.{name}={value!r:.60}: must be "auto"{initial} or a number.'
-        )
-
-
 def _gaussian(weights: Weights, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean and log σ before the tanh, `[..., A]` each."""
     x = jax.nn.relu(critics.relu_perceptron(weights, "actor.latent_pi", observation))
@@ -271,7 +233,7 @@ def _gaussian(weights: Weights, observation: jax.Array) -> tuple[jax.Array, jax.
     return linear(weights, "actor.mu", x), jnp.clip(log_std, _LEAST_LOG_STD, _GREATEST_LOG_STD)
 
 
-def _coefficient(weights: Weights, settings: SAC) -> jax.Array:
+def _coefficient(settings: SAC, weights: Weights) -> jax.Array:
     """α, learned or constant."""
     if settings.learns_entropy:
         return jnp.exp(weights[_ENTROPY][0])
@@ -279,7 +241,7 @@ def _coefficient(weights: Weights, settings: SAC) -> jax.Array:
 
 
 def _update_entropy(
-    state: Adam, weights: Weights, log_prob: jax.Array, mask: jax.Array, settings: SAC
+    settings: SAC, state: Adam, weights: Weights, log_prob: jax.Array, mask: jax.Array
 ) -> tuple[Adam, Weights]:
     """Move log α, so that the policy's entropy approaches the target, −A where it is "auto"."""
     if not settings.learns_entropy:

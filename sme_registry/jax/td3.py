@@ -68,69 +68,86 @@ class Learner(NamedTuple):
     critic: Adam
 
 
-def initial_weights(
-    rng: np.random.Generator, observation_dim: int, action_dim: int, settings: TD3
-) -> HostWeights:
-    """Actor, critics and their targets, by Torch's default initialisation."""
-    widths = [observation_dim, *settings.net_arch, action_dim]
-    actor = initial_perceptron(rng, "actor.mu", widths)
-    both = critics.initial_critics(rng, observation_dim, action_dim, settings.net_arch)
-    return critics.with_targets(actor | both, ("actor", "critic"))
+class TD3Program(OffPolicyProgram):
+    """Lanes of TD3."""
+
+    draws = 1
+
+    @staticmethod
+    def initial_weights(
+        settings: TD3, rng: np.random.Generator, observation_dim: int, action_dim: int
+    ) -> HostWeights:
+        """Actor, critics and their targets, by Torch's default initialisation."""
+        widths = [observation_dim, *settings.net_arch, action_dim]
+        actor = initial_perceptron(rng, "actor.mu", widths)
+        both = critics.initial_critics(rng, observation_dim, action_dim, settings.net_arch)
+        return critics.with_targets(actor | both, ("actor", "critic"))
+
+    @staticmethod
+    def initial_learner(weights: Weights) -> Learner:
+        """Weights and new optimisers."""
+        actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
+        return Learner(weights, Adam.initial(actor), Adam.initial(critic))
+
+    @staticmethod
+    def act(settings: TD3, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
+        """tanh of the actor."""
+        return in_range(_action(weights, observations), symmetric)
+
+    @staticmethod
+    def explore(
+        weights: Weights, observation: jax.Array, noise: jax.Array, mask: jax.Array
+    ) -> jax.Array:
+        """The deterministic action: SB3 adds no noise by default."""
+        return _action(weights, observation)
+
+    @staticmethod
+    def update(
+        settings: TD3,
+        learner: Learner,
+        batch: Transitions,
+        noise: jax.Array,
+        mask: jax.Array,
+        count: jax.Array,
+        index: jax.Array,
+    ) -> Learner:
+        """See `OffPolicyProgram`; the noise smooths the target policy.
+
+        Padded action channels need no mask: actions there are 0 and so are the weights that read
+        them, whose gradients are 0, too.
+        """
+        weights = learner.weights
+        clip = settings.target_noise_clip
+        smoothing = jnp.clip(settings.target_policy_noise * noise[:, 0].T, -clip, clip)
+        next_action = _action(weights, batch.next_observation, "actor_target") + smoothing
+        next_value = critics.smallest_value(
+            weights, "critic_target", batch.next_observation, jnp.clip(next_action, -1.0, 1.0)
+        )
+        target = batch.reward + (1.0 - batch.done) * settings.gamma * next_value
+        critic, weights = critics.fit_critics(
+            weights, learner.critic, batch, target, settings.learning_rate, scale=1.0
+        )
+        learner = Learner(weights, learner.actor, critic)
+        after: Learner = jax.lax.cond(
+            count % settings.policy_delay == 0,
+            lambda learner: _update_policy(settings, learner, batch.observation),
+            lambda learner: learner,
+            learner,
+        )
+        return after
 
 
-def initial_learner(weights: Weights) -> Learner:
-    """The learner before its first update."""
-    actor, critic = (critics.network(weights, name) for name in ("actor", "critic"))
-    return Learner(weights, Adam.initial(actor), Adam.initial(critic))
-
-
-def act(weights: Weights, observation: jax.Array, policy: str = "actor") -> jax.Array:
+def _action(weights: Weights, observation: jax.Array, policy: str = "actor") -> jax.Array:
     """Deterministic actions `[..., A]` in [−1, 1] of the actor, or of `actor_target`."""
     return jnp.tanh(critics.relu_perceptron(weights, f"{policy}.mu", observation))
 
 
-def update(
-    learner: Learner, batch: Transitions, noise: jax.Array, moves_policy: jax.Array, settings: TD3
-) -> Learner:
-    """One update of one lane.
-
-    Padded action channels need no mask: actions there are 0 and so are the weights that read them,
-    whose gradients are 0, too.
-
-    Args:
-      learner: the state before.
-      batch: `[B]` transitions.
-      noise: `[A, B]` standard normal, for the smoothing of the target policy.
-      moves_policy: whether policy and targets are updated, too; see `policy_delay`.
-      settings: hyperparameters.
-    """
-    weights = learner.weights
-    clip = settings.target_noise_clip
-    smoothing = jnp.clip(settings.target_policy_noise * noise.T, -clip, clip)
-    next_action = act(weights, batch.next_observation, "actor_target") + smoothing
-    next_value = critics.smallest_value(
-        weights, "critic_target", batch.next_observation, jnp.clip(next_action, -1.0, 1.0)
-    )
-    target = batch.reward + (1.0 - batch.done) * settings.gamma * next_value
-    critic, weights = critics.fit_critics(
-        weights, learner.critic, batch, target, settings.learning_rate, scale=1.0
-    )
-    learner = Learner(weights, learner.actor, critic)
-    after: Learner = jax.lax.cond(
-        moves_policy,
-        lambda learner: _update_policy(learner, batch.observation, settings),
-        lambda learner: learner,
-        learner,
-    )
-    return after
-
-
-def _update_policy(learner: Learner, observation: jax.Array, settings: TD3) -> Learner:
+def _update_policy(settings: TD3, learner: Learner, observation: jax.Array) -> Learner:
     """Move the actor up the first critic's value, then all targets towards their networks."""
     weights = learner.weights
 
     def loss(actor: Weights) -> jax.Array:
-        action = act(actor, observation)
+        action = _action(actor, observation)
         return -jnp.mean(critics.value(weights, "critic.qf0", observation, action))
 
     actor = critics.network(weights, "actor")
@@ -139,44 +156,3 @@ def _update_policy(learner: Learner, observation: jax.Array, settings: TD3) -> L
     for name in ("critic", "actor"):
         weights = critics.follow(weights, name, settings.tau)
     return Learner(weights, state, learner.critic)
-
-
-class TD3Program(OffPolicyProgram):
-    """Lanes of TD3."""
-
-    def initial_weights(
-        self, rng: np.random.Generator, observation_dim: int, action_dim: int
-    ) -> HostWeights:
-        """See `initial_weights`."""
-        return initial_weights(rng, observation_dim, action_dim, self.settings)
-
-    @staticmethod
-    def act(settings: TD3, weights: Weights, observations: jax.Array, symmetric: bool) -> jax.Array:
-        """See `act`."""
-        return in_range(act(weights, observations), symmetric)
-
-    @staticmethod
-    def initial_learner(weights: Weights) -> Learner:
-        """See `initial_learner`."""
-        return initial_learner(weights)
-
-    @staticmethod
-    def explore(
-        weights: Weights, observation: jax.Array, key: jax.Array, mask: jax.Array
-    ) -> jax.Array:
-        """The deterministic action: SB3 adds no noise by default."""
-        return act(weights, observation)
-
-    @staticmethod
-    def update(
-        settings: TD3,
-        learner: Learner,
-        batch: Transitions,
-        key: jax.Array,
-        mask: jax.Array,
-        count: jax.Array,
-        index: jax.Array,
-    ) -> Learner:
-        """See `update`; the policy moves at every `policy_delay`-th one."""
-        noise = jax.random.normal(key, (mask.shape[0], batch.reward.shape[0]), jnp.float32)
-        return update(learner, batch, noise, count % settings.policy_delay == 0, settings)

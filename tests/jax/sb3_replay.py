@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +11,8 @@ import numpy as np
 import torch
 
 from sme_registry.jax.networks import Adam
-from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.off_policy import OffPolicyProgram
+from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.replay import Transitions
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
@@ -21,14 +20,14 @@ from sme_registry.training.algorithms import load_algorithm, one_thread, quiet
 NET_ARCH = (96, 64)
 BATCH = 64
 COUNTS = (1, 10)
-# One program serves both: the smaller one is padded to the widths of the larger one.
-WIDTHS = (Widths(8, 16), Widths(3, 4))
+# One program serves both: the smaller one is padded to the larger one.
+DIMENSIONS = (Dimensions(8, 16), Dimensions(3, 4))
 
 
-def model_in_mid_run(algorithm: str, widths: Widths) -> Any:
+def model_in_mid_run(algorithm: str, dimensions: Dimensions) -> Any:
     """A model after some updates; its episodes have terminated and been truncated."""
-    spec = {"state_dim": widths.state_dim, "action_dim": widths.action_dim, "seed": 5}
-    env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if widths.action_dim < 9 else 0.0}, 1)
+    spec = {"state_dim": dimensions.state_dim, "action_dim": dimensions.action_dim, "seed": 5}
+    env = SMEVecEnv({**spec, "horizon": 20, "D": 0.1 if dimensions.action_dim < 9 else 0.0}, 1)
     with quiet(), one_thread():
         model = load_algorithm(algorithm)(
             "MlpPolicy", env, seed=3, batch_size=BATCH, buffer_size=1000, device="cpu",
@@ -51,25 +50,24 @@ class Replayed(NamedTuple):
     padded: dict[int, dict[str, np.ndarray]]  # ours, with their padding
 
 
-def replay(module: ModuleType, settings: Any, update: Callable[..., Any]) -> list[Replayed]:
-    """Let SB3 and us make the same updates, of one model for each of `WIDTHS`, in mid-run.
+def replay(kind: type[OffPolicyProgram], settings: Any) -> list[Replayed]:
+    """Let SB3 and us make the same updates, of one model for each of `DIMENSIONS`, in mid-run.
 
     Args:
-      module: `td3` or `sac`.
-      settings: hyperparameters.
-      update: of all lanes: from learners, batches, noise `[lanes, A, draws, B]`, masks and the
-        number of updates that SB3 has made by then, to learners.
+      kind: of TD3 or SAC.
+      settings: its hyperparameters.
     """
-    full = WIDTHS[0]
-    models = [model_in_mid_run(type(settings).__name__, own) for own in WIDTHS]
-    padding = Padding(partial(module.initial_weights, settings=settings), full)
-    lanes = [_learner(module, model, padding, own) for model, own in _zip(models)]
-    learner = _stacked(lanes)
-    masks = jnp.stack([jnp.arange(full.action_dim) < own.action_dim for own in WIDTHS])
+    full = DIMENSIONS[0]
+    models = [model_in_mid_run(type(settings).__name__, own) for own in DIMENSIONS]
+    padding = Padding(partial(kind.initial_weights, settings), full)
+    learner = _stacked([_learner(kind, model, padding, own) for model, own in _zip(models)])
+    masks = jnp.stack([jnp.arange(full.action_dim) < own.action_dim for own in DIMENSIONS])
+    update = jax.jit(jax.vmap(partial(kind.update, settings), (0, 0, 0, 0, None, None)))
     results = [Replayed(_weights(model), {}, {}, {}) for model in models]
     for count in range(1, max(COUNTS) + 1):
-        inputs = _stacked([_one_update(model, own, full, count) for model, own in _zip(models)])
-        learner = update(learner, *inputs, masks, models[0]._n_updates)
+        drawn = [_one_update(model, own, full, count) for model, own in _zip(models)]
+        batch, noise = _stacked(drawn)
+        learner = update(learner, batch, noise[:, :, : kind.draws], masks, models[0]._n_updates, 0)
         if count in COUNTS:
             for lane, (result, own) in enumerate(_zip(results)):
                 result.theirs[count] = _weights(models[lane])
@@ -84,7 +82,9 @@ def greatest_difference(weights: dict[str, np.ndarray], others: dict[str, np.nda
     return max(float(np.abs(weight - others[name]).max()) for name, weight in weights.items())
 
 
-def _one_update(model: Any, own: Widths, full: Widths, seed: int) -> tuple[Transitions, np.ndarray]:
+def _one_update(
+    model: Any, own: Dimensions, full: Dimensions, seed: int
+) -> tuple[Transitions, np.ndarray]:
     """Let SB3 make one update; the batch and the noise that it drew, padded.
 
     NumPy's generator draws the batch and Torch's the noise. Noise of padded channels is 1.
@@ -122,7 +122,7 @@ def _weights(model: Any) -> dict[str, np.ndarray]:
     return weights
 
 
-def _learner(module: ModuleType, model: Any, padding: Padding, own: Widths) -> Any:
+def _learner(kind: type[OffPolicyProgram], model: Any, padding: Padding, own: Dimensions) -> Any:
     """The model's weights and Adam states, padded."""
     optimisers = [
         (getattr(model, each).optimizer, [f"{each}.{n}" for n, _ in network.named_parameters()])
@@ -131,10 +131,12 @@ def _learner(module: ModuleType, model: Any, padding: Padding, own: Widths) -> A
     if hasattr(model, "log_ent_coef"):
         optimisers.append((model.ent_coef_optimizer, ["log_ent_coef"]))
     adams = [_adam(*each, padding, own) for each in optimisers]
-    return module.Learner(padding.add(_weights(model), own), *adams)
+    weights = padding.add(_weights(model), own)
+    learner = kind.initial_learner({name: jnp.asarray(weight) for name, weight in weights.items()})
+    return type(learner)(weights, *adams)
 
 
-def _adam(optimiser: Any, names: list[str], padding: Padding, own: Widths) -> Adam:
+def _adam(optimiser: Any, names: list[str], padding: Padding, own: Dimensions) -> Adam:
     """The state of a Torch optimiser whose parameters have these names, in their order."""
     state = list(optimiser.state_dict()["state"].values())
     mean, square = (
@@ -148,8 +150,8 @@ def _stacked(lanes: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
 
 
-def _zip(each: list[Any]) -> list[tuple[Any, Widths]]:
-    return list(zip(each, WIDTHS, strict=True))
+def _zip(each: list[Any]) -> list[tuple[Any, Dimensions]]:
+    return list(zip(each, DIMENSIONS, strict=True))
 
 
 def _seed(seed: int) -> None:

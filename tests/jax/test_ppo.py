@@ -21,7 +21,7 @@ from sme_registry.errors import OptionError
 from sme_registry.jax import ppo
 from sme_registry.jax.env import EnvState, start
 from sme_registry.jax.networks import Adam
-from sme_registry.jax.padding import Padding, Widths
+from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.run import settings_of
 from sme_registry.jax.task import Shape, task_params
 from sme_registry.training.algorithms import silence
@@ -135,7 +135,7 @@ def largest_difference(one: Weights, other: Weights) -> float:
 
 def test_initial_weights_have_the_names_and_shapes_of_sb3(recording: Recording) -> None:
     rng = np.random.default_rng(0)
-    weights = ppo.initial_weights(SETTINGS, rng, 10, recording.spec.action_dim)
+    weights = ppo.PPOProgram.initial_weights(SETTINGS, rng, 10, recording.spec.action_dim)
     theirs = recording.learner.weights
     assert {n: w.shape for n, w in weights.items()} == {n: w.shape for n, w in theirs.items()}
     gains = {"mlp_extractor.value_net.2": 2**0.5, "action_net": 0.01, "value_net": 1.0}
@@ -169,8 +169,8 @@ def test_weights_equal_those_of_sb3_after_1_and_320_updates(recording: Recording
 
 @pytest.mark.parametrize("recording", [SPEC], ids=["ends"], indirect=True)
 def test_padding_changes_no_weight(recording: Recording) -> None:
-    own, full = Widths(8, 4), Widths(11, 6)
-    padding = Padding(functools.partial(ppo.initial_weights, SETTINGS), full)
+    own, full = Dimensions(8, 4), Dimensions(11, 6)
+    padding = Padding(functools.partial(ppo.PPOProgram.initial_weights, SETTINGS), full)
     weights, (mean, square, updates) = recording.learner
     learner = ppo.Learner(
         padding.add(weights, own), Adam(padding.add(mean, own), padding.add(square, own), updates)
@@ -195,7 +195,7 @@ def test_collected_steps_are_those_of_the_environment(
 ) -> None:
     n, rng = 32, np.random.default_rng(1)
     params = task_params(spec)
-    weights = ppo.initial_weights(SETTINGS, rng, 10, 4)
+    weights = ppo.PPOProgram.initial_weights(SETTINGS, rng, 10, 4)
     weights["log_std"] += np.float32(0.1)
     noise = rng.standard_normal((4, n), np.float32)
     starts = rng.random((n + 1, 8))
@@ -213,7 +213,7 @@ def test_collected_steps_are_those_of_the_environment(
     low, high = env.action_space.low, env.action_space.high
     for i in range(n):
         np.testing.assert_array_equal(steps.observation[i], observation)
-        mean = ppo.act(SETTINGS, weights, observation)
+        mean = ppo.mean(SETTINGS, weights, observation)
         expected = mean + np.exp(np.float32(0.1)) * noise[:, i]
         np.testing.assert_allclose(steps.action[i], expected, atol=1e-6)
         action = np.clip(steps.action[i], low, high)

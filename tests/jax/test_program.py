@@ -36,8 +36,9 @@ class Linear(Program):
 
     buffer = "buffer"
 
+    @staticmethod
     def initial_weights(
-        self, rng: np.random.Generator, observation_dim: int, action_dim: int
+        settings: Any, rng: np.random.Generator, observation_dim: int, action_dim: int
     ) -> HostWeights:
         both = observation_dim + action_dim
         return {

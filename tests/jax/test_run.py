@@ -28,7 +28,8 @@ class Scripted(Program):
         super().__init__((), SPECS, (0, 1), steps=budget, lanes=3)
         self.rollout, self.events, self.updates = rollout, list[Any](), 0
 
-    def initial_weights(self, rng: Any, observation_dim: int, action_dim: int) -> dict[str, Any]:
+    @staticmethod
+    def initial_weights(settings: Any, rng: Any, observation_dim: int, action_dim: int) -> Any:
         return {"bias": np.zeros(1, np.float32)}
 
     def initial_state(self, weights: Any, keys: Any) -> Nothing:

@@ -1,25 +1,27 @@
-"""SAC's updates equal Stable-Baselines3's, in wide actions and in padded ones."""
+"""Updates of TD3 and SAC equal Stable-Baselines3's, in wide actions and in padded ones."""
 
 from __future__ import annotations
 
-from functools import partial
+from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
-from sme_registry.jax import sac
-from sme_registry.jax.sac import SAC
+pytest.importorskip("jax")
+pytest.importorskip("stable_baselines3")
+
+from sme_registry.jax.sac import SAC, SACProgram
+from sme_registry.jax.td3 import TD3, TD3Program
 from tests.jax import sb3_replay
 from tests.jax.sb3_replay import BATCH, NET_ARCH, Replayed
 
-SETTINGS = SAC(net_arch=NET_ARCH, batch_size=BATCH)
+SETTINGS: dict[str, Any] = {"net_arch": NET_ARCH, "batch_size": BATCH}
+KINDS = [(TD3Program, TD3(**SETTINGS)), (SACProgram, SAC(**SETTINGS))]
 
 
-@pytest.fixture(scope="module")
-def lanes() -> list[Replayed]:
-    one = jax.jit(jax.vmap(partial(sac.update, settings=SETTINGS)))
-    return sb3_replay.replay(sac, SETTINGS, lambda *arguments: one(*arguments[:4]))
+@pytest.fixture(scope="module", params=KINDS, ids=["TD3", "SAC"])
+def lanes(request: pytest.FixtureRequest) -> list[Replayed]:
+    return sb3_replay.replay(*request.param)
 
 
 @pytest.mark.parametrize("lane", [0, 1], ids=["A=16", "padded"])
