@@ -33,6 +33,12 @@ app = application(
     Your own task:
 
       sme new mine.json --complexity 10 --seed 3
+
+    An agent of Stable-Baselines3, and the same in JAX, which is faster:
+
+      sme train mine.json -a PPO
+
+      sme train mine.json -a PPO --agents jax
     """,
 )
 app.command("list")(list_)
