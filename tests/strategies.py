@@ -17,6 +17,8 @@ THRESHOLDS = st.one_of(
     st.sampled_from([0.0, 0.25, 0.5, 0.95]), st.floats(0.0, 1.0, exclude_max=True)
 )
 
+ANGLES = st.one_of(st.just(0.0), st.floats(0.0, 6.28))
+
 
 @st.composite
 def teams(draw: st.DrawFn, state_dim: int, action_dim: int) -> dict[str, Any]:
@@ -49,6 +51,9 @@ def spec_fields(draw: st.DrawFn, team: bool | None = None) -> dict[str, Any]:
     }
     if draw(st.booleans()) if team is None else team:
         fields["team"] = draw(teams(state_dim, action_dim))
+    agents = fields.get("team", {}).get("agents", [])
+    if state_dim > 1 and all(len(agent["observes"]) > 1 for agent in agents):
+        fields["rotation"] = draw(ANGLES)
     return fields
 
 

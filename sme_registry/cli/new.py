@@ -30,6 +30,7 @@ _HELP = {  # where the field's description is too short or missing
     "horizon": "T, steps of an episode",
     "hidden_width": "H, width of the inner layers of the optimal policy",
     "policy_init": "'semi_orthogonal', or 'unit_variance', which also suits layers that widen",
+    "rotation": "θ, radians: how far the optimal policy is rotated away from the one of θ = 0",
     "seed": "Seed of the draw: an integer, or hexadecimal 0x… for a sealed task",
 }
 

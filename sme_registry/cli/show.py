@@ -124,7 +124,7 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
         derived = facts | ({"agents": agents} if agents else {})
         print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
         return
-    fields = spec.to_dict()
+    fields = spec.every_field()
     if spec.team is not None:
         fields["team"] = _team_summary(spec.team)
     print_pairs(spec.content_name if isinstance(document, SMESpec) else _title(document), fields)
@@ -257,7 +257,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
 
 def _changes(member: SuiteClass) -> str:
     """The fields that differ from the default: `k=10, r_min=0.5`."""
-    default, fields = SMESpec().to_dict(), member.setting.to_dict()
+    default, fields = SMESpec().every_field(), member.setting.every_field()
     if member.setting.team is not None:
         fields["team"] = _team_summary(member.setting.team)
     return ", ".join(f"{k}={v}" for k, v in fields.items() if v != default[k])

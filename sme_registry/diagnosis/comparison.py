@@ -22,7 +22,7 @@ def compare(
     )
     return Comparison(
         name=other.name,
-        spec_fields=_differing(subject.spec.to_dict(), other.spec.to_dict()),
+        spec_fields=_differing(subject.spec.every_field(), other.spec.every_field()),
         plan_fields=_differing(subject.plan, other.plan),
         differences=tuple(
             Difference(quantity=name, value=value, other=other_values[name])

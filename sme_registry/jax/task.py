@@ -31,7 +31,7 @@ from sme_registry.task.draw import GRID_BITS
 SUPPORTED_FIELDS = frozenset(
     (
         *("schema_version", "seed", "state_dim", "action_dim", "k", "r_min", "D"),
-        *("complexity", "horizon", "hidden_width", "policy_init"),
+        *("complexity", "horizon", "hidden_width", "policy_init", "rotation"),
     )
 )
 """Fields of a spec that these modules implement; any other must have its default."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence, Sized
-from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 import rfc8785
 from pydantic import (
@@ -16,7 +16,9 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     ValidationError,
+    model_serializer,
     model_validator,
 )
 
@@ -165,7 +167,27 @@ def refuse_other_digest(stated: str, document: Document, where: str, remedy: str
 
 
 class Document(StrictModel):
-    """A model with an identity: equal documents have equal digests, unequal ones do not."""
+    """A model with an identity: equal documents have equal digests, unequal ones do not.
+
+    Attributes:
+      left_out_by_default: fields younger than the first documents of this kind. While they have
+        their default they are in no JSON, so that the digests of older documents stay the same.
+    """
+
+    left_out_by_default: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_young_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = handler(self)
+        for name in self.left_out_by_default:
+            if getattr(self, name) == type(self).model_fields[name].default:
+                fields.pop(name, None)
+        return fields
+
+    def every_field(self) -> dict[str, Any]:
+        """As `to_dict`, with the fields that it leaves out; for people, and to compare."""
+        young = {name: getattr(self, name) for name in self.left_out_by_default}
+        return {**young, **self.to_dict()}
 
     def canonical_json(self) -> bytes:
         """The RFC 8785 canonical JSON of every field."""

@@ -1,14 +1,15 @@
 """`SMESpec`: the numbers from which a Synthetic Monitoring Environment is generated.
 
 Fields and their symbols in METHOD: N_s `state_dim` (S), N_a `action_dim` (A), k, r_min, D,
-C_π* `complexity` (L), T `horizon`, H `hidden_width`.
+C_π* `complexity` (L), T `horizon`, H `hidden_width`, θ `rotation` (METHOD, section 6).
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, get_args
 
 from pydantic import (
     Field,
@@ -38,6 +39,7 @@ ActionRange: TypeAlias = Literal["unit", "symmetric"]
 ACTION_RANGES: tuple[str, ...] = get_args(ActionRange)
 
 MAX_DIM = 2**20
+FULL_TURN = 2.0 * math.pi
 MAX_SEED = 2**53  # above it not every integer is a JSON number that all readers agree on
 _HEX_SEED = re.compile(r"0x[0-9a-fA-F]{1,64}")
 _AGENT_NAME = r"^[A-Za-z][A-Za-z0-9-]*_(0|[1-9][0-9]*)$"
@@ -146,6 +148,8 @@ class Setting(Document):
     Defaults are the paper's (METHOD, section 1), or ours where it has none.
     """
 
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("rotation",)
+
     schema_version: SchemaVersion = 1
     state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="S, state channels")] = 8
     action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="A, action channels")] = 4
@@ -161,6 +165,9 @@ class Setting(Document):
     ] = 64
     policy_init: Literal["semi_orthogonal", "unit_variance"] = "semi_orthogonal"
     team: TeamSpec | None = None
+    rotation: Annotated[
+        Real, Field(ge=0, lt=FULL_TURN, description="θ, radians by which π*'s input is rotated")
+    ] = 0.0
 
     @field_validator("team")
     @classmethod
@@ -195,6 +202,20 @@ class Setting(Document):
                     f"[0, state_dim={self.state_dim}). Remove channel {agent.observes[-1]}, or "
                     "increase state_dim."
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _rotation_has_a_plane(self) -> Self:
+        if not self.rotation:
+            return self
+        observers = () if self.team is None else self.team.agents
+        blind = [agent.name for agent in observers if len(agent.observes) == 1]
+        if self.state_dim == 1 or blind:
+            what = f"{blind[0]} observes one" if self.state_dim > 1 else "state_dim is 1"
+            raise ValueError(
+                f"rotation={self.rotation}: must be 0, because a rotation needs two state channels "
+                f"and {what}. Leave it out, or add a channel."
+            )
         return self
 
 

@@ -87,20 +87,36 @@ def _optimal_policy(
     inner = spec.complexity - 1
     widths = [len(observed), *[spec.hidden_width] * inner, action_dim]
     names = [f"{stream}/inner/{index}" for index in range(inner)] + [f"{stream}/output"]
-    return tuple(
-        _uniform_layer(spec, name, inputs, outputs)
+    matrices = [
+        _uniform_matrix(spec, name, inputs, outputs)
         for name, inputs, outputs in zip(names, widths[:-1], widths[1:], strict=True)
-    )
+    ]
+    if spec.rotation:
+        matrices[0] = matrices[0] @ _rotation(spec, f"{stream}/rotation", len(observed))
+    return tuple(Layer(W, -0.5 * W.sum(axis=1)) for W in matrices)
 
 
-def _uniform_layer(spec: SMESpec, name: str, inputs: int, outputs: int) -> Layer:
-    """W = √12 × semi-orthogonal, b = −½ W 1, so that Φ(W x + b) of uniform x is near uniform."""
+def _uniform_matrix(spec: SMESpec, name: str, inputs: int, outputs: int) -> Array:
+    """W = √12 × semi-orthogonal; with b = −½ W 1, Φ(W x + b) of uniform x is near uniform."""
     tall = _haar(spec.seed, name, max(inputs, outputs), min(inputs, outputs))
     semi_orthogonal = tall if outputs >= inputs else tall.T
     if spec.policy_init == "unit_variance" and outputs > inputs:
         semi_orthogonal /= np.linalg.norm(semi_orthogonal, axis=1, keepdims=True)
-    W = np.ascontiguousarray(math.sqrt(12.0) * semi_orthogonal)
-    return Layer(W, -0.5 * W.sum(axis=1))
+    return np.ascontiguousarray(math.sqrt(12.0) * semi_orthogonal)
+
+
+def _rotation(spec: SMESpec, name: str, channels: int) -> Array:
+    """R(θ) = B · diag(rot θ, …, rot θ[, 1]) · Bᵀ `[S, S]`, with B Haar orthogonal.
+
+    Source: METHOD, section 6. π*_θ(s) = π*(½ + R (s − ½)). As the first layer's b is −½ W 1, that
+    is the policy whose first layer has W R in place of W: every back-end reads it from the layers.
+    """
+    B = _haar(spec.seed, name, channels, channels)
+    u, v = B[:, 0 : channels - 1 : 2], B[:, 1:channels:2]  # the two axes of each plane
+    cos, sin = math.cos(spec.rotation), math.sin(spec.rotation)
+    fixed = B[:, 2 * (channels // 2) :]
+    turned = np.concatenate([u * cos + v * sin, v * cos - u * sin, fixed], axis=1)
+    return np.asarray(turned @ np.concatenate([u, v, fixed], axis=1).T)
 
 
 def _haar(seed: int | str, name: str, rows: int, columns: int) -> Array:

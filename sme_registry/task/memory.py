@@ -22,6 +22,8 @@ def parameter_bytes(spec: SMESpec) -> int:
 def peak_bytes(spec: SMESpec) -> int:
     """An upper estimate of the bytes needed while a task is drawn."""
     largest = max(out * inputs for inputs, out, _ in _shapes(spec))
+    if spec.rotation:
+        largest = max(largest, max(_observed(spec)) ** 2)
     return parameter_bytes(spec) + 8 * _WORKSPACE * largest
 
 
@@ -62,8 +64,7 @@ def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
     """`(inputs, outputs, how many)` of every matrix of a task, without a list of its layers."""
     H, inner = spec.hidden_width, spec.complexity - 1
     yield spec.action_dim, spec.state_dim, 1  # W and b of the transition
-    for agent in agents(spec):
-        observed = spec.state_dim if agent.observes == "all" else len(agent.observes)
+    for agent, observed in zip(agents(spec), _observed(spec), strict=True):
         if inner == 0:
             yield observed, agent.action_dim, 1
         else:
@@ -71,3 +72,10 @@ def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
             if inner > 1:
                 yield H, H, inner - 1
             yield H, agent.action_dim, 1
+
+
+def _observed(spec: SMESpec) -> list[int]:
+    """How many state channels each agent observes."""
+    return [
+        spec.state_dim if agent.observes == "all" else len(agent.observes) for agent in agents(spec)
+    ]

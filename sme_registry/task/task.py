@@ -167,7 +167,9 @@ class Task:
         """π* of states `[..., S]`, unchecked: each agent's layers over what it observes."""
         actions = []
         for channels, layers in zip(self.observed, self.policies, strict=True):
-            x = s if len(channels) == self.spec.state_dim else s[..., channels]
+            # `take`, since the rows of s[..., channels] are not contiguous, and BLAS would then sum
+            # a batch in another order than its lanes.
+            x = s if len(channels) == self.spec.state_dim else s.take(channels, axis=-1)
             for W, b in layers:
                 x = ndtr(x @ W.T + b)
             actions.append(x)

@@ -27,6 +27,10 @@ TEAM = SMESpec(
 )  # fmt: skip
 SHARED = TEAM.derive(D=0.2, r_min=0.1, team={**TEAM.to_dict()["team"], "reward": "team"})
 
+PARTIAL = SMESpec(
+    state_dim=5, action_dim=1, team={"agents": [{"action_dim": 1, "observes": [0, 1, 2, 3]}]}
+)
+
 
 @pytest.fixture(autouse=True)
 def _needs_numba(request):
@@ -150,6 +154,7 @@ def test_a_batch_is_its_singles_bit_for_bit(backend, spec, B, seed):
 @pytest.mark.parametrize("backend", BACKENDS)
 @settings(max_examples=25)
 @given(spec=specs(team=True), B=st.sampled_from([1, 2, 63, 64, 65, 130]), seed=st.integers(0, 100))
+@example(PARTIAL, 2, 1)
 @example(TEAM, 129, 0)
 @example(SHARED, 65, 0)
 def test_a_batch_of_teams_is_the_loop_of_its_lanes_bit_for_bit(backend, spec, B, seed):

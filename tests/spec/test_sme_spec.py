@@ -26,6 +26,7 @@ CHANGED = {
     "horizon": 101,
     "hidden_width": 65,
     "policy_init": "unit_variance",
+    "rotation": 0.5,
     "team": {"agents": [{"action_dim": 4}]},
     "seed": 1,
 }
@@ -55,7 +56,12 @@ def test_every_field_but_the_version_of_the_schema_is_part_of_the_digest():
     assert CHANGED.keys() == SMESpec.model_fields.keys() - {"schema_version"}
     digests = {SMESpec().digest} | {SMESpec().derive(**{f: v}).digest for f, v in CHANGED.items()}
     assert len(digests) == 1 + len(CHANGED)
-    assert set(json.loads(SMESpec().canonical_json())) == set(SMESpec.model_fields)
+    in_json = set(SMESpec.model_fields) - {"rotation"}
+    assert set(json.loads(SMESpec().canonical_json())) == in_json
+    rotated = SMESpec(rotation=0.5)
+    assert set(json.loads(rotated.canonical_json())) == set(SMESpec.model_fields)
+    assert rotated.digest.startswith("sha256:130c1352935c1883")  # as released
+    assert rotated.derive(rotation=0.0) == SMESpec() == SMESpec(rotation=-0.0)
 
 
 @given(specs())

@@ -136,6 +136,7 @@ FIELDS = [
     ("r_min", 0.5, set()),
     ("D", 0.5, set()),
     ("horizon", 17, set()),
+    ("rotation", 0.5, {"inner/0"}),
     ("complexity", 4, {"inner/2"}),
     ("complexity", 2, {"inner/1"}),
     ("hidden_width", 4, {"inner/0", "inner/1", "output"}),

@@ -20,6 +20,7 @@ AXES = {
     "complexity": ("L", "complexity L"),
     "horizon": ("T", "horizon T"),
     "hidden_width": ("H", "hidden width H"),
+    "rotation": ("θ", "rotation θ"),
     "policy_init": ("policy_init", "policy_init"),
 }
 
@@ -117,7 +118,7 @@ def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
-    setting, base = (_flat(each.setting.to_dict()) for each in (member, first))
+    setting, base = (_flat(each.setting.every_field()) for each in (member, first))
     differing = [name for name in AXES if setting[name] != base[name]]
     team = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == "team"]
     team = [name for name in team if setting.get(name) != base.get(name)]

@@ -23,8 +23,8 @@ Columns of the run, repeated in each of its regions; NaN or NA where the run has
     final_return                 mean return of the last evaluations, in % of the optimum's
     online_regret                mean of 1 − step reward over training, in [0, 1]
     uses, action_range, steps    the algorithm, its action range, its training steps
-    state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, spec_seed
-                                 fields of the task's spec; spec_seed as text
+    state_dim, action_dim, k, r_min, D, complexity, horizon, hidden_width, policy_init, rotation,
+    spec_seed                    fields of the task's spec; spec_seed as text
     spec_digest, seed            the task's digest; the seed of training
     nu, transitions, dataset_digest   the data set of an offline run: ν in [0, 1], its size
     behaviour_similarity, behaviour_similarity_sd    r̃ of the behaviour policy over the data set
@@ -72,7 +72,7 @@ _REGION = """region:str epsilon_low epsilon_high states:int64 similarity similar
     best_constant_normalised_regret random_normalised_regret constant_similarity """
 _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str action_range:str
     steps:int64 state_dim:int64 action_dim:int64 k:int64 r_min D complexity:int64 horizon:int64
-    hidden_width:int64 policy_init:str spec_seed:str spec_digest:str seed:int64 nu
+    hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 _CURVES = _PLACE + "step:int64 episode_return regret similarity length"
@@ -219,7 +219,11 @@ def _run_columns(result: CellResult) -> dict[str, Any]:
     """The columns of `_RUN`; those of offline runs only where there are any."""
     cell, report, offline = result.cell, result.report, result.offline
     columns = {
-        **cell.spec.model_dump(exclude={"schema_version", "seed", "team"}),
+        **{
+            name: value
+            for name, value in cell.spec.every_field().items()
+            if name not in ("schema_version", "seed", "team")
+        },
         **{name: getattr(report, name) for name in ("wd_regret", "ood_regret", "ood_decay")},
         **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
         "final_return": _final_return(result),

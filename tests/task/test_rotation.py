@@ -1,0 +1,102 @@
+"""The rotated optimal policy: METHOD, section 6."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.special import ndtr
+
+from sme_registry import SMESpec
+from sme_registry.task import draw, materialize
+
+EVEN = st.sampled_from([2, 8, 32])
+ANGLES = st.floats(0.0, 6.28)
+TEAM = {
+    "agents": [
+        {"action_dim": 1, "observes": [0, 3]},
+        {"action_dim": 1},
+        {"action_dim": 2, "observes": [1, 2, 4]},
+    ]
+}
+
+
+def rotation(theta: float, state_dim: int, seed: int = 0) -> np.ndarray:
+    spec = SMESpec(state_dim=state_dim, seed=seed).model_copy(update={"rotation": theta})
+    return draw._rotation(spec, "policy/0/rotation", state_dim)
+
+
+@given(EVEN, ANGLES, ANGLES, st.integers(0, 5))
+def test_with_even_dimension_pre_activations_correlate_with_the_cosine(S, theta, other, seed):
+    spec = SMESpec(state_dim=S, complexity=2, seed=seed)
+    one, two = (materialize(spec.derive(rotation=angle)).layers[0].W for angle in (theta, other))
+    # Of isotropic inputs, such as uniform states: w · R w / (|w| |R w|) of each neuron.
+    correlation = (
+        (one * two).sum(axis=1) / np.linalg.norm(one, axis=1) / np.linalg.norm(two, axis=1)
+    )
+    np.testing.assert_allclose(correlation, math.cos(theta - other), rtol=0, atol=1e-12)
+
+
+@given(st.integers(2, 9), ANGLES)
+def test_a_rotation_is_orthogonal_and_the_same_after_a_full_turn(S, theta):
+    R = rotation(theta, S)
+    np.testing.assert_allclose(R @ R.T, np.eye(S), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(rotation(theta + 2.0 * math.pi, S), R, rtol=0, atol=2e-14)
+    np.testing.assert_allclose(rotation(0.0, S), np.eye(S), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("S", [2, 5, 8])
+def test_a_rotation_is_two_by_two_in_the_planes_of_a_haar_basis(S):
+    theta, blocks = 0.7, np.eye(S)
+    for i in range(0, S - 1, 2):
+        cos, sin = math.cos(theta), math.sin(theta)
+        blocks[i : i + 2, i : i + 2] = [[cos, -sin], [sin, cos]]
+    B = draw._haar(0, "policy/0/rotation", S, S)
+    np.testing.assert_allclose(rotation(theta, S), B @ blocks @ B.T, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("complexity", [1, 4])
+def test_the_optimal_policy_reads_the_rotated_state_and_nothing_else_moves(complexity):
+    spec = SMESpec(complexity=complexity, seed=3)
+    plain, task = materialize(spec), materialize(spec.derive(rotation=0.9))
+    s = np.random.default_rng(0).uniform(-0.5, 1.5, (200, spec.state_dim))
+    R = draw._rotation(task.spec, "policy/0/rotation", spec.state_dim)
+    rotated = 0.5 + (s - 0.5) @ R.T
+    np.testing.assert_allclose(
+        task.optimal_action(s), plain.optimal_action(rotated), rtol=0, atol=1e-12
+    )
+    np.testing.assert_array_equal(task.W, plain.W)
+    np.testing.assert_array_equal(task.b, plain.b)
+    for one, two in zip(task.layers[1:], plain.layers[1:], strict=True):
+        np.testing.assert_array_equal(one.W, two.W)
+
+
+def test_agents_rotate_within_the_channels_that_they_observe():
+    spec = SMESpec(state_dim=5, action_dim=4, team=TEAM, complexity=3)
+    plain, task = materialize(spec), materialize(spec.derive(rotation=1.1))
+    s = np.random.default_rng(1).random((50, 5))
+    expected = []
+    for index, (channels, layers) in enumerate(zip(plain.observed, plain.policies, strict=True)):
+        R = draw._rotation(task.spec, f"policy/{index}/rotation", len(channels))
+        x = 0.5 + (s[:, channels] - 0.5) @ R.T
+        for W, b in layers:
+            x = ndtr(x @ W.T + b)
+        expected.append(x)
+    np.testing.assert_allclose(
+        task.optimal_action(s), np.concatenate(expected, axis=1), rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("theta", [0.1, 0.3, math.pi / 4, math.pi / 2, math.pi])
+@pytest.mark.parametrize("complexity", [1, 10])
+def test_the_angle_says_how_far_apart_two_tasks_are(theta, complexity):
+    spec = SMESpec(complexity=complexity)
+    s = np.random.default_rng(2).random((4_000, spec.state_dim))
+    optimal = materialize(spec.derive(rotation=theta)).optimal_action(s)
+    other = materialize(spec).optimal_action(s)
+    regret = np.abs(optimal - other).mean() / np.abs(optimal - 0.5).mean()
+    low, high = {0.1: (0.08, 0.13), 0.3: (0.25, 0.37), math.pi: (1.8, 2.05)}.get(
+        theta, (0.6, 0.9) if theta < 1 else (1.2, 1.4)
+    )
+    assert low <= regret <= high
