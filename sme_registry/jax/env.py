@@ -16,12 +16,15 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from sme_registry.errors import ActionError, OptionError, StateError
 from sme_registry.jax import oracle, pairs
 from sme_registry.jax.pairs import Pair
 from sme_registry.jax.task import TaskParams
 from sme_registry.jax.transition import States, next_state
 
 Info = dict[str, jax.Array]
+
+_OF_LANES = "Use jax.vmap for several environments."
 
 
 class EnvState(NamedTuple):
@@ -42,8 +45,12 @@ def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
     """Begin an episode at a uniform state, on the grid 2⁻³².
 
     Padding does not change the numbers that a key draws.
+
+    Raises:
+      OptionError: the params are of several tasks.
     """
-    bits = jax.random.bits(key, (params.W.shape[-1],), jnp.uint32)
+    _, S = _widths(params)
+    bits = jax.random.bits(key, (S,), jnp.uint32)
     bits = jnp.where(params.state_mask, bits, jnp.uint32(0))
     if isinstance(params.b, Pair):
         return start(pairs.from_fraction(bits), params)
@@ -51,7 +58,14 @@ def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
 
 
 def start(s: States, params: TaskParams) -> tuple[jax.Array, EnvState]:
-    """Begin an episode at state s `[S]`; padded channels must be 0."""
+    """Begin an episode at state s `[S]`; padded channels must be 0.
+
+    Raises:
+      StateError: s has another shape, or is not as the params have states.
+      OptionError: the params are of several tasks.
+    """
+    s = s if isinstance(s, Pair) else jnp.asarray(s, jnp.float64)
+    _check_state(s, params)
     state = EnvState(s, jnp.zeros((), jnp.int32), jnp.zeros((), params.r_min.dtype))
     return observe(state, params), state
 
@@ -70,6 +84,10 @@ def step(
     Returns:
       Observation, state, reward R, done (terminated or truncated), and info: that of `step_env`,
       and `final_observation`, that of the ended episode.
+
+    Raises:
+      ActionError, StateError: the action or the state has another shape than the task's.
+      OptionError: the params are of several tasks.
     """
     observation, after, reward, done, info = step_env(key, state, action, params)
     info["final_observation"] = observation
@@ -85,6 +103,11 @@ def step_env(
 
     `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`.
     """
+    action = jnp.asarray(action)
+    _check_state(state.s, params)
+    A, _ = _widths(params)
+    if action.shape != (A,):
+        raise ActionError(f"action of shape {action.shape}: must be of shape ({A},). {_OF_LANES}")
     similarity, step_reward = oracle.judge(params, state.s, action)
 
     total = state.accumulated_reward + step_reward
@@ -105,6 +128,27 @@ def step_env(
 
 reset_env = reset
 """gymnax's name of the same."""
+
+
+def _widths(params: TaskParams) -> tuple[int, int]:
+    """A and S of one task."""
+    if params.W.ndim != 2:
+        raise OptionError(
+            f"params: are of {len(params.W)} tasks: must be of one. Use jax.vmap over the tasks."
+        )
+    A, S = params.W.shape
+    return A, S
+
+
+def _check_state(s: States, params: TaskParams) -> None:
+    _, S = _widths(params)
+    as_pairs = isinstance(params.b, Pair)
+    if isinstance(s, Pair) != as_pairs:
+        kind = "a Pair" if as_pairs else "float64"
+        raise StateError(f"state of type {type(s).__name__}: must be {kind}, as the params' b is.")
+    shape = s.high.shape if isinstance(s, Pair) else s.shape
+    if shape != (S,):
+        raise StateError(f"state of shape {shape}: must be of shape ({S},). {_OF_LANES}")
 
 
 @custom_vmap

@@ -11,11 +11,13 @@ before 1.0 expect `done` in place of `terminated` and `truncated`: wrap this env
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sme_registry.io import choice
 from sme_registry.jax import env
@@ -129,11 +131,14 @@ class Environment:
         return observation, state, reward, info["terminated"], info["truncated"], info
 
 
+@dataclass(frozen=True)
 class Box:
     """gymnax's space of arrays, where gymnax is not installed."""
 
-    def __init__(self, low: float, high: float, shape: tuple[int, ...], dtype: Any) -> None:
-        self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: Any
 
     def sample(self, key: jax.Array) -> jax.Array:
         """A uniform array of the space."""
@@ -148,5 +153,5 @@ def _box(low: float, high: float, shape: tuple[int, ...]) -> Any:
     try:
         from gymnax.environments import spaces  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
-        return Box(low, high, shape, jnp.float32)
+        return Box(low, high, shape, np.dtype(np.float32))
     return spaces.Box(low, high, shape, jnp.float32)

@@ -147,17 +147,20 @@ def task_params(
 
     Args:
       specs: a task, or a sequence of tasks, one for each lane: specs, ids, digests or paths.
-      shape: pad to this shape; None for the smallest that covers all tasks.
+      shape: pad to this shape, a `Shape` or a tuple of its fields; None for the smallest that
+        covers all tasks.
       dtype: of the oracle and of rewards, float64 or float32.
-      states: "float64", or "pairs" of uint32 for devices without it; the bits are the same.
+      states: "float64"; or "pairs" of uint32, with the same bits, for devices without float64.
+        With `dtype=jnp.float32`, too, `env.reset` and `env.step` need no float64 at all.
+        `pairs.from_float64` and `pairs.to_float64` convert states.
 
     Returns:
       One task, or lanes of tasks stacked along a leading axis.
 
     Raises:
       SpecError: a field that only NumPy implements, such as `team`; or see `load_task`.
-      OptionError: no task, a task larger than `shape`, L = 1 beside L > 1, or another dtype or
-        kind of states.
+      OptionError: no task, a task larger than `shape`, no shape, L = 1 beside L > 1, or another
+        dtype or kind of states.
       UnknownNameError, ResourceLimitError, FingerprintMismatchError: see `load_task`.
     """
     as_pairs = choice("states", states, ("float64", "pairs")) == "pairs"
@@ -170,8 +173,7 @@ def task_params(
     for task in tasks:
         check_supported(task.spec)
     smallest = Shape.covering(Shape.of(task.spec) for task in tasks)
-    if shape is None:
-        shape = smallest
+    shape = smallest if shape is None else _checked_shape(shape)
     _check_covered(smallest, shape)
     lanes = [_padded(task, shape, dtype, as_pairs) for task in tasks]
     params = lanes[0] if single else jax.tree.map(lambda *parts: np.stack(parts), *lanes)
@@ -189,6 +191,16 @@ def check_supported(spec: SMESpec) -> None:
             )
 
 
+def _checked_shape(shape: Any) -> Shape:
+    numbers = isinstance(shape, tuple) and all(isinstance(extent, int) for extent in shape)
+    if not numbers or len(shape) != len(Shape._fields):
+        raise OptionError(
+            f"shape={short_repr(shape)}: must be a Shape of {', '.join(Shape._fields)}, such as "
+            "Shape(8, 4, 1, 0). Leave it out for the smallest that covers the tasks."
+        )
+    return Shape(*shape)
+
+
 def _check_covered(shape: Shape, covering: Shape) -> None:
     if (shape.complexity == 1) != (covering.complexity == 1):
         raise OptionError(
@@ -204,7 +216,7 @@ def _check_covered(shape: Shape, covering: Shape) -> None:
 
 def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> TaskParams:
     """A task with NumPy's arrays in place of JAX's."""
-    spec, (S, A, _, H) = task.spec, shape
+    spec, (S, A, L, H) = task.spec, shape
     W, b = _pad(task.W, (A, S)), _pad(task.b, (S,))
     *inner, output = task.policies[0]
     fields: dict[str, Any] = {
@@ -217,7 +229,7 @@ def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> T
         "W": (W * 2**GRID_BITS).astype(np.uint32) if as_pairs else W,
         "b": pairs.from_float64(b) if as_pairs else b,
         "inner": _inner_layers(inner, shape, dtype) if inner else None,
-        "output": _layer(output, (A, H or S), dtype),
+        "output": _layer(output, (A, H if L > 1 else S), dtype),
     }
     return TaskParams(**fields)
 

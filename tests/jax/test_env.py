@@ -11,6 +11,7 @@ import pytest
 
 from sme_registry import SMESpec, materialize
 from sme_registry.envs import arguments
+from sme_registry.errors import ActionError, OptionError, StateError
 from sme_registry.jax import env, pairs
 from sme_registry.jax.task import Shape, task_params
 from sme_registry.task import observe, step
@@ -58,7 +59,7 @@ def float64(s: Any) -> Any:
     [
         (SHALLOW, jnp.float64, "float64", 1e-12),
         (DEEP, jnp.float64, "float64", 1e-12),
-        (SHALLOW, jnp.float32, "pairs", 2e-5),
+        (SHALLOW, jnp.float32, "pairs", 1e-6),
     ],
 )
 def test_lanes_of_tasks_step_as_in_numpy(
@@ -139,6 +140,26 @@ def test_an_episode_begins_at_any_state() -> None:
     observation, state = env.start(jnp.full(8, 0.25), task_params(SMESpec()))
     assert observation.tolist() == [0.25] * 8 + [0.0, 0.0]
     assert (state.t, state.accumulated_reward) == (0, 0.0)
+
+
+def test_arrays_of_other_shapes_are_refused_before_a_step() -> None:
+    params = task_params(SMESpec(state_dim=3, action_dim=2))
+    lanes = task_params([SMESpec(state_dim=3, action_dim=2)] * 4)
+    key = jax.random.key(0)
+    _, state = env.start(jnp.zeros(3), params)
+    for action in (jnp.zeros(3), jnp.zeros((5, 2)), 0.5):
+        with pytest.raises(
+            ActionError, match=r"^action of shape .*: must be of shape \(2,\)\. Use"
+        ):
+            env.step(key, state, action, params)  # type: ignore[arg-type]
+    wide = state._replace(s=jnp.zeros(4))
+    with pytest.raises(StateError, match=r"^state of shape \(4,\): must be of shape \(3,\)"):
+        jax.jit(env.step)(key, wide, jnp.zeros(2), params)
+    with pytest.raises(StateError, match=r"^state of type Pair: must be float64"):
+        env.start(pairs.Pair(jnp.zeros(3, jnp.uint32), jnp.zeros(3, jnp.uint32)), params)
+    for call in (lambda: env.reset(key, lanes), lambda: env.step(key, state, jnp.zeros(2), lanes)):
+        with pytest.raises(OptionError, match=r"^params: are of 4 tasks: must be of one\. Use"):
+            call()
 
 
 @pytest.mark.parametrize("states", ["float64", "pairs"])

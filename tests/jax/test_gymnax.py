@@ -100,6 +100,7 @@ def test_names_and_spaces_are_those_of_the_task() -> None:
     assert Environment("SME/Default-v1").name == "SME/Default-v1"
     actions, observations = env.action_space(), env.observation_space()
     assert (actions.low, actions.high, actions.shape) == (-1.0, 1.0, (2,))
+    assert repr(actions) == "Box(low=-1.0, high=1.0, shape=(2,), dtype=dtype('float32'))"
     assert (observations.low, observations.high, observations.shape) == (0.0, 1.0, (10,))
     sample = actions.sample(jax.random.key(0))
     assert sample.shape == (2,)

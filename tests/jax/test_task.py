@@ -77,6 +77,13 @@ def test_a_task_larger_than_the_shape_is_refused() -> None:
         task_params(SMESpec(), shape=Shape(8, 3, 1, 0))
 
 
+def test_shapes_are_those_of_tasks() -> None:
+    assert task_params(SMESpec(state_dim=3), shape=(5, 6, 1, 9)).output.W.shape == (6, 5)
+    for shape in ((2, 2), (8, 4, 1, "wide"), 3):
+        with pytest.raises(OptionError, match=r"^shape=.*: must be a Shape of state_dim, action"):
+            task_params(SMESpec(), shape=shape)  # type: ignore[arg-type]
+
+
 def test_no_task_is_refused() -> None:
     with pytest.raises(OptionError, match=r"specs=\[\]: must have at least one"):
         task_params([])
