@@ -117,6 +117,7 @@ class Program(ABC):
         lanes: int | None = None,
         shape: Shape | None = None,
         device: str | None = None,
+        at_once: int = 1,
     ) -> None:
         """New lanes, before their first step.
 
@@ -129,6 +130,7 @@ class Program(ABC):
           lanes: fill up to this number with copies of the first lane; None for none.
           shape: to which the tasks are padded; None for their maxima.
           device: see `find_device`.
+          at_once: programs that are to share what the device has of memory.
 
         Raises:
           SpecError: a task is not one that JAX has; see `task_params`.
@@ -150,7 +152,7 @@ class Program(ABC):
         weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
         stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
-        self._refuse_without_room(jax.eval_shape(self.initial_state, stacked, keys))
+        self._refuse_without_room(jax.eval_shape(self.initial_state, stacked, keys), at_once)
         self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
         self.steps = 0
 
@@ -241,19 +243,20 @@ class Program(ABC):
         self.state = jax.tree_util.tree_unflatten(structure, restored)
         self.steps = steps
 
-    def _refuse_without_room(self, state: Any) -> None:
-        """Raise ResourceLimitError if such a state would not fit in the device's memory."""
+    def _refuse_without_room(self, state: Any, at_once: int) -> None:
+        """Raise ResourceLimitError if such a state would not fit in its share of the memory."""
         leaves = jax.tree.leaves(state)
         needed = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
         room = memory_of(self.device)
-        if room is not None and needed > room:
-            fit = self.lanes * room // needed
+        if room is not None and at_once * needed > room:
+            fit = self.lanes * room // (at_once * needed)
+            sharing = f" for {at_once} programs at once" if at_once > 1 else ""
             advice = "fewer steps or a smaller buffer_size" if self.buffer else "a smaller n_steps"
             raise ResourceLimitError(
                 f"lanes={self.lanes:,}: their state takes {needed / 2**30:,.1f} GiB, and the "
-                f"{self.device.platform} has {room / 2**30:,.1f} GiB to spare: "
+                f"{self.device.platform} has {room / 2**30:,.1f} GiB to spare{sharing}: "
                 f"{f'at most {fit:,} fit' if fit else 'not one fits'}. Choose "
-                f"{'fewer lanes, ' if fit else ''}{advice}."
+                f"{'fewer lanes, ' if fit else ''}{'fewer programs, ' if sharing else ''}{advice}."
             )
 
     def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
@@ -282,6 +285,16 @@ class Program(ABC):
         longer = np.zeros(present.shape, present.dtype)
         longer[: len(saved)] = saved
         return longer
+
+
+def check_room(new_program: Callable[[], Program]) -> None:
+    """Check that a program would fit in memory: neither makes nor compiles anything.
+
+    Raises:
+      ResourceLimitError: it would not.
+      Exception: what `new_program` raises.
+    """
+    jax.eval_shape(lambda: new_program().state)
 
 
 def policy(

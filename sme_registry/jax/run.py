@@ -106,6 +106,7 @@ def new_program(
     lanes: int | None = None,
     shape: Shape | None = None,
     device: str | None = None,
+    at_once: int = 1,
 ) -> Program:
     """A program of new lanes; see `Program` for the arguments, and `settings_of`.
 
@@ -134,6 +135,7 @@ def new_program(
         lanes=lanes,
         shape=shape,
         device=device,
+        at_once=at_once,
     )
 
 

@@ -9,24 +9,28 @@ and so its result the same bits.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import math
 import multiprocessing
 import os
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
+from sme_registry.errors import ResourceLimitError
 from sme_registry.io import to_json
 from sme_registry.spec import Cell, SMESpec
 from sme_registry.spec.study import in_jax
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
+    from sme_registry.jax.program import Program
     from sme_registry.jax.task import Shape
 
+_Returned = TypeVar("_Returned")
 CPU = "cpu"
 _MOST_LANES = 10  # on a CPU: more save little time, and the last of a study would run alone longer
 _MOST_LANES_ELSEWHERE = 256
@@ -144,7 +148,27 @@ class Programs:
             "versions": versions_for(cell.uses),
         }
         processes = available_cores() if self.one_at_a_time else 1
-        return Lanes(count, shape, self._device, made_with=made_with, processes=processes)
+        device = self._device if self.one_at_a_time else CPU
+        return Lanes(count, shape, device, made_with=made_with, processes=processes)
+
+    def without_room(self, cells: Iterable[Cell], workers: int) -> dict[str, str]:
+        """Why programs would not fit in memory beside those that run at once.
+
+        Args:
+          cells: that are to run; those that do not use JAX are left out.
+          workers: programs at once, where none has the device to itself.
+
+        Returns:
+          By the digest of a cell of each such program, a reason that says how many lanes fit.
+        """
+        groups: dict[Hashable, list[Cell]] = defaultdict(list)
+        for cell in cells:
+            if in_jax(cell.uses):
+                groups[self.group(cell)].append(cell)
+        programs = [(group[0], self.program(group[0])) for group in groups.values()]
+        number = sum(math.ceil(len(g) / self.lanes(g[0])) for g in groups.values())
+        at_once = 1 if self.one_at_a_time else min(workers, number)
+        return _beside_the_gpu(_without_room, programs, at_once) if programs else {}
 
     def cells(self, keys: Iterable[str]) -> tuple[Cell, ...] | None:
         """The cells of the plan with these keys; None if one of them is not in it any longer."""
@@ -167,6 +191,29 @@ class Programs:
         )
 
 
+def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Program:
+    """The program of cells of one group, of which `at_once` are to share the memory.
+
+    Raises:
+      OptionError, MissingDependencyError, SpecError, ResourceLimitError: see `jax.run.new_program`.
+    """
+    from sme_registry.jax.run import new_program
+
+    cell = cells[0]
+    return new_program(
+        cell.uses,
+        [each.spec for each in cells],
+        [each.seed for each in cells],
+        hyperparameters=cell.hyperparameters,
+        action_range=cell.action_range,
+        steps=cell.steps,
+        lanes=lanes.count,
+        shape=lanes.shape,
+        device=lanes.device,
+        at_once=at_once,
+    )
+
+
 def platform_of(device: str | None) -> str:
     """The platform of a device, or of JAX's default: "cpu", "gpu" or "tpu".
 
@@ -174,17 +221,36 @@ def platform_of(device: str | None) -> str:
       OptionError: there is no such device.
       MissingDependencyError: JAX is not installed.
     """
+    return _beside_the_gpu(_platform, device)
+
+
+def _beside_the_gpu(function: Callable[..., _Returned], *arguments: Any) -> _Returned:
+    """Call a function of JAX, in a process of its own if there may be a GPU.
+
+    A process that looks for a GPU takes most of its memory.
+    """
     if not importlib.metadata.entry_points(group="jax_plugins"):
-        return _platform(device)
-    # In a process of its own: to look for a GPU takes most of its memory.
+        return function(*arguments)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_platform, (device,))
+        return pool.apply(function, arguments)
 
 
 def _platform(device: str | None) -> str:
     from sme_registry.jax.device import find_device
 
     return str(find_device(device).platform)
+
+
+def _without_room(programs: Sequence[tuple[Cell, Lanes]], at_once: int) -> dict[str, str]:
+    from sme_registry.jax.program import check_room
+
+    reasons = {}
+    for cell, lanes in programs:
+        try:
+            check_room(functools.partial(new_program, [cell], lanes, at_once))
+        except ResourceLimitError as error:
+            reasons[cell.digest] = str(error)
+    return reasons
 
 
 def _shape(spec: SMESpec) -> Shape:

@@ -26,14 +26,14 @@ from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.jobs import CPU, Lanes, Report, child_environment
+from sme_registry.studies.engine.jobs import CPU, Lanes, Report, child_environment, new_program
 from sme_registry.studies.engine.program_state import read_header, read_state, write_state
 from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
 from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
 
 if TYPE_CHECKING:
-    from sme_registry.jax.program import Evaluation, Program, StepLog
+    from sme_registry.jax.program import Evaluation, StepLog
 
 Ended = tuple[Cell, CellResult | PolicyError, bytes | None]
 """A cell, its result or the reason why it has none, and its model's .zip if that is kept."""
@@ -76,7 +76,6 @@ class _Run:
     """A program, the cells of its lanes, and the records of what they did."""
 
     def __init__(self, cells: Sequence[Cell], lanes: Lanes, progress: Report) -> None:
-        from sme_registry.jax.run import new_program
         from sme_registry.jax.task import Shape
 
         cell = self._cell = cells[0]
@@ -84,17 +83,7 @@ class _Run:
         self._own = {cell.digest: cell for cell in cells}
         self._cells = lanes.cells or tuple(cells)
         self._keys = [each.digest for each in self._cells]
-        self._program: Program = new_program(
-            cell.uses,
-            [each.spec for each in self._cells],
-            [each.seed for each in self._cells],
-            hyperparameters=cell.hyperparameters,
-            action_range=cell.action_range,
-            steps=cell.steps,
-            lanes=lanes.count,
-            shape=lanes.shape,
-            device=lanes.device,
-        )
+        self._program = new_program(self._cells, lanes)
         self._made = ProgramResult(
             device=str(self._program.device.device_kind),
             lanes=lanes.count,

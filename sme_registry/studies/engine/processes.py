@@ -29,7 +29,7 @@ from sme_registry.studies.engine.executors import (
     failed,
     run_job,
 )
-from sme_registry.studies.engine.jobs import Job, available_cores, child_environment
+from sme_registry.studies.engine.jobs import CPU, Job, available_cores, child_environment
 from sme_registry.terminal.interrupts import block_interrupts, defer_interrupts, end_with_parent
 
 _SECONDS_TO_END = 10.0
@@ -106,7 +106,10 @@ class _JobProcess:
         unfinished = {cell.digest: cell for cell in job.cells}
         log = scratch / f"{next(iter(unfinished)).removeprefix('sha256:')}.log"
         process = spawn.Process(target=_child, args=(child_end, run, job, keep_models, log))
-        with child_environment(_ONE_THREAD), block_interrupts():
+        on_cpu = job.lanes is not None and job.lanes.device == CPU
+        # Or JAX would look for a GPU, and take most of its memory.
+        variables = _ONE_THREAD | ({"JAX_PLATFORMS": CPU} if on_cpu else {})
+        with child_environment(variables), block_interrupts():
             process.start()
         child_end.close()  # so that the pipe ends when the process does
         return cls(job, process, pipe, log, unfinished)

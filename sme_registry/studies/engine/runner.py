@@ -13,11 +13,11 @@ import os
 import time
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.errors import OptionError, ResourceLimitError, UnknownNameError
 from sme_registry.io import Lock, integer_in
 from sme_registry.spec import Cell, PlannedCell, StudyFile, StudyPlan
 from sme_registry.spec.study import in_jax
@@ -25,7 +25,7 @@ from sme_registry.studies.engine import checks
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.estimate import Estimator, makespan
 from sme_registry.studies.engine.executors import Executor, InProcess, Outcome, RunCell
-from sme_registry.studies.engine.jobs import Job, Programs, platform_of
+from sme_registry.studies.engine.jobs import CPU, Job, Programs, platform_of
 from sme_registry.studies.engine.ledger import Ledger, SavedState
 from sme_registry.studies.engine.processes import Processes
 from sme_registry.studies.engine.ray_executor import OnRay
@@ -84,7 +84,9 @@ def run_study(
 
     Raises:
       OptionError: the folder contains other files or cannot be written to, an argument is out of
-        range, or there is no such device. Finished cells stay.
+        range, there is no such device, or no cell uses one. Finished cells stay.
+      ResourceLimitError: the programs that run at once do not fit in memory; says how many lanes
+        of each do.
       UnknownNameError: a pattern matches nothing, or an algorithm cannot be found.
       MissingDependencyError: an algorithm, or Ray, needs a package that is not installed.
       KeyboardInterrupt: interrupted; says how to continue.
@@ -97,14 +99,16 @@ def run_study(
     programs = None
     if run is run_cell:
         _check(plan_file.plan, planned.values())
-        if any(in_jax(cell.cell.uses) for cell in planned.values()):
-            every = (cell.cell for cell in plan_file.plan.cells)
-            programs = Programs(every, platform_of(device), device, lanes)
+    if run is run_cell and any(in_jax(cell.cell.uses) for cell in planned.values()):
+        if executor == "ray" or isinstance(executor, OnRay):
+            device = _device_on_ray(device)
+        every = (cell.cell for cell in plan_file.plan.cells)
+        programs = Programs(every, platform_of(device), device, lanes)
+    else:
+        _refuse_without_jax(device=device, lanes=lanes)
     runs_on = _executor(executor, jobs, ray, run, keep_models)
     ledger = Ledger(folder)
     earlier_plan = ledger.plan_file()
-    if earlier_plan is None or earlier_plan != plan_file:
-        ledger.write_plan(plan_file)
     study = _StudyRun(
         plan_file,
         ledger,
@@ -115,6 +119,10 @@ def run_study(
         retry_failed,
         progress,
     )
+    if not isinstance(runs_on, OnRay):  # whose nodes have a memory of their own
+        study.refuse_without_room()
+    if earlier_plan is None or earlier_plan != plan_file:
+        ledger.write_plan(plan_file)
     if study.finished < len(planned):
         ledger.write_request(plan_file, only)
     study.announce(earlier_plan, keep_models)
@@ -137,6 +145,26 @@ def _check(plan: StudyPlan, planned: Collection[PlannedCell]) -> None:
             checks.check_hyperparameters(algorithm)
     for cell in planned:
         checks.check_task(cell.cell)
+
+
+def _refuse_without_jax(**options: Any) -> None:
+    """Raise OptionError if an option is given that is for agents in JAX alone."""
+    for name, value in options.items():
+        if value is not None:
+            raise OptionError(
+                f"{name}={value!r}: is for agents in JAX, and no cell to run has one. Leave it "
+                'out, or use --agents jax (in a plan, "uses": "jax:PPO").'
+            )
+
+
+def _device_on_ray(device: str | None) -> str:
+    """The device of programs on Ray: each task has one core of its node, and no GPU."""
+    if device not in (None, CPU):
+        raise OptionError(
+            f"device={device!r}: must be cpu on Ray, where a program has one core. Leave out "
+            "--device, or leave out --ray on a machine that has such a device."
+        )
+    return CPU
 
 
 def _executor(
@@ -201,6 +229,19 @@ class _StudyRun:
             enabled=progress,
         )
         ledger.warn = self._progress.message
+
+    def refuse_without_room(self) -> None:
+        """Raise ResourceLimitError if programs that run at once would not fit in memory."""
+        if self._programs is None:
+            return
+        cells = [planned.cell for planned in self._waiting.values()]
+        reasons = self._programs.without_room(cells, self._executor.workers)
+        if reasons:
+            named = ((self._planned[key], reason) for key, reason in reasons.items())
+            raise ResourceLimitError(
+                "\n".join(f"{cell.algorithm} on {cell.class_name}: {why}" for cell, why in named)
+                + "\nSee --lanes and --jobs."
+            )
 
     def announce(self, earlier_plan: StudyFile | None, keep_models: bool) -> None:
         """Print what is done, what is reused, and what will run."""

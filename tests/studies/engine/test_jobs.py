@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine.executors import Outcome, failed
 from sme_registry.studies.engine.jobs import Job, Programs
@@ -20,6 +21,8 @@ from sme_registry.studies.engine.program_state import write_state
 from sme_registry.studies.engine.runner import run_study
 
 pytest.importorskip("jax")
+
+from sme_registry.jax import program
 
 
 def plan_file(seeds: int = 3, **fields: Any) -> StudyFile:
@@ -187,6 +190,38 @@ def test_while_another_run_claims_a_program_this_one_waits(tmp_path: Path) -> No
     assert ledger.claim_lock() is None
     claiming.release()
     assert ledger.claim_lock() is not None
+
+
+@pytest.mark.parametrize(("workers", "fit"), [(1, None), (2, "at most 1 fit"), (8, "not one fits")])
+def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first_runs(
+    workers: int, fit: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = plan_file(steps=1000, algorithms=[{"name": "TD3", "uses": "jax:TD3"}])
+    executor = Refusing(workers)
+
+    def run() -> None:
+        run_study(file, tmp_path, executor=executor, lanes=3, device="cpu", progress=False)
+
+    # The state of three lanes takes 13.6 MiB; there are three programs.
+    monkeypatch.setattr(program, "memory_of", lambda device: 20 * 2**20)
+    if fit is None:
+        run()
+        assert len(executor.jobs) == 3
+        return
+    with pytest.raises(ResourceLimitError) as caught:
+        run()
+    shared, delayed, last = str(caught.value).splitlines()
+    assert shared.startswith("TD3 on small: lanes=3: their state takes 0.0 GiB")
+    assert delayed.startswith("TD3 on delayed: lanes=3: ")
+    assert f"{min(workers, 3)} programs at once: {fit}. Choose" in delayed
+    assert "--jobs" in last
+    assert not executor.jobs
+    assert not list(tmp_path.iterdir())
+
+
+def test_programs_on_ray_run_on_cpus_alone(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"device='gpu': must be cpu on Ray.*leave out --ray"):
+        run_study(plan_file(), tmp_path, executor="ray", device="gpu")
 
 
 def test_a_saved_state_decides_which_cells_go_on_together(tmp_path: Path) -> None:
