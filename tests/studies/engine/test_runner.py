@@ -116,6 +116,16 @@ def test_a_process_of_each_cell_gives_the_same_results_with_one_thread(
         assert result.report == ours
 
 
+@pytest.mark.parametrize("options", [{"device": "cpu"}, {"lanes": 3}])
+def test_options_of_agents_in_jax_are_refused_where_no_cell_has_one(
+    options: dict[str, Any], study: Path
+) -> None:
+    (name,) = options
+    with pytest.raises(OptionError, match=f"^{name}=.*no cell to run has one. Leave it out, or"):
+        run_study(small_file(), study, **options)
+    assert not list(study.glob("*"))
+
+
 def test_a_cell_that_raises_is_listed_with_its_error_and_retried_on_request(study: Path) -> None:
     file = small_file(seeds=3)
     status, output = quick(file, study, run=cells.raising)
