@@ -192,9 +192,12 @@ def test_while_another_run_claims_a_program_this_one_waits(tmp_path: Path) -> No
     assert ledger.claim_lock() is not None
 
 
-@pytest.mark.parametrize(("workers", "fit"), [(1, None), (2, "at most 1 fit"), (8, "not one fits")])
+@pytest.mark.parametrize(
+    ("workers", "MiB", "fit"),
+    [(1, 20, None), (2, 20, "at most 1 fit"), (8, 20, "at most 1 fit"), (8, 10, "not one fits")],
+)
 def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first_runs(
-    workers: int, fit: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workers: int, MiB: int, fit: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = plan_file(steps=1000, algorithms=[{"name": "TD3", "uses": "jax:TD3"}])
     executor = Refusing(workers)
@@ -203,7 +206,7 @@ def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first
         run_study(file, tmp_path, executor=executor, lanes=3, device="cpu", progress=False)
 
     # The state of three lanes takes 13.6 MiB; there are three programs.
-    monkeypatch.setattr(program, "memory_of", lambda device: 20 * 2**20)
+    monkeypatch.setattr(program, "memory_of", lambda device: MiB * 2**20)
     if fit is None:
         run()
         assert len(executor.jobs) == 3
