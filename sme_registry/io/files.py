@@ -120,15 +120,16 @@ def claim_folder(
       force: whether these may be replaced; other files are refused even then.
 
     Raises:
-      OptionError: the folder is a file, holds other files, holds `files` and `force` is false, or
-        cannot be created.
+      OptionError: the folder is a file, holds other files that are not hidden, holds `files` and
+        `force` is false, or cannot be created.
     """
     folder = Path(folder)
     if os.path.lexists(folder) and not folder.is_dir():
         raise OptionError(f"{folder}: is a file. Give a folder.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        names = sorted(path.name for path in folder.iterdir())
+        # Hidden files may be locks, or writes of ours that were cut short.
+        names = sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
     except (OSError, ValueError) as error:
         raise unwritable(folder, error) from None
     others = [name for name in names if name not in files]

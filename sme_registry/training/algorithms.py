@@ -68,13 +68,18 @@ def full_name(uses: str, agents: str | None = None) -> str:
       agents: whose implementation, one of `AGENTS`; None for the one that the name says.
 
     Raises:
-      OptionError: `agents` is none of them.
+      OptionError: `agents` is none of them, or "sb3" for a name in JAX.
     """
     ours = in_jax(uses.casefold())
-    uses = uses[len(JAX) :] if ours else uses
+    plain = uses[len(JAX) :] if ours else uses
     if agents is not None:
-        ours = choice("agents", agents, AGENTS) == "jax"
-    name = next((name for name in ALGORITHMS if name.casefold() == uses.casefold()), uses)
+        if choice("agents", agents, AGENTS) == "sb3" and ours:
+            raise OptionError(
+                f"agents='sb3': must be left out for {uses!r}, which is in JAX. Leave it out, or "
+                f"train {plain!r}."
+            )
+        ours = agents == "jax"
+    name = next((name for name in ALGORITHMS if name.casefold() == plain.casefold()), plain)
     return f"{JAX}{name}" if ours else name
 
 

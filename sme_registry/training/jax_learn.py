@@ -119,12 +119,15 @@ def learn(
 def _check_finite(program: Program, folder: Path) -> None:
     if not program.failed()[0]:
         return
+    failure = f"the weights are not finite any longer at step {program.steps:,}"
+    record = RunRecord.read(folder)  # of its last checkpoint
+    if record is not None:
+        record.updated(status="failed", failure=failure).write(folder)
     path = folder / checkpoint.FILE
     kept = f"{path} is its last checkpoint" if path.exists() else "it has no checkpoint"
     raise PolicyError(
-        f"training: the weights are not finite any longer at step {program.steps:,}. The run stays "
-        f"in {folder}; {kept}. Train into another folder with other hyperparameters, such as a "
-        "lower learning_rate."
+        f"training: {failure}. The run stays in {folder}; {kept}. Train into another folder with "
+        "other hyperparameters, such as a lower learning_rate."
     )
 
 

@@ -41,7 +41,8 @@ class RunRecord(StrictModel):
     """
 
     schema_version: Literal[1] = 1
-    status: Literal["running", "finished"]  # "running" also after a kill
+    status: Literal["running", "finished", "failed"]  # "running" also after a kill
+    failure: str = ""  # why it failed
     spec: SMESpec
     spec_digest: str
     task: str = ""  # what the task's file calls it
@@ -97,8 +98,14 @@ class RunRecord(StrictModel):
         """This plan, with the progress and the hyperparameters of the run that it continues.
 
         Raises:
-          OptionError: the run has another plan. Hyperparameters may be left out of this one.
+          OptionError: the run has another plan, or has done more steps. Hyperparameters may be left
+            out of this one.
         """
+        if self.steps < min(previous.steps, previous.steps_done):
+            raise OptionError(
+                f"steps={self.steps:,}: must be at least {previous.steps_done:,}, since the run in "
+                f"{folder} has done so many of its {previous.steps:,}. Resume it with more steps."
+            )
         fields = ("spec_digest", "algorithm", "seed", "action_range", "num_envs", "independent")
         pairs = {field: (getattr(previous, field), getattr(self, field)) for field in fields}
         for name, value in self.hyperparameters.items():

@@ -1,6 +1,7 @@
 """`train`: train one algorithm on one task, with exact regret of every episode.
 
-The folder of a run, which `resume` continues after an interruption:
+The folder of a run, which `resume` continues after an interruption, and of which one process at a
+time writes the files:
     run.json          the run and its progress
     episodes.csv      one row for each finished episode
     checkpoint.zip    model and replay buffer, for resuming
@@ -24,7 +25,15 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
-from sme_registry.io import choice, claim_folder, integer_in, is_installed
+from sme_registry.io import (
+    Lock,
+    choice,
+    claim_folder,
+    file_lock,
+    integer_in,
+    is_installed,
+    is_locked,
+)
 from sme_registry.plots import files as plot_files
 from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
 from sme_registry.spec.study import in_jax
@@ -53,6 +62,7 @@ _FILES = (
     *plot_files.FILES, REPORT, TENSORBOARD,
 )  # fmt: skip
 
+_LOCK = ".lock"  # held by the process that trains; the file stays
 MAX_STEPS = 10**10
 _CHECKPOINTS = 20
 _MIN_STEPS_BETWEEN_CHECKPOINTS = 1_000
@@ -131,7 +141,8 @@ def train(
       protocol: of the final evaluation.
       progress: whether to show progress: a bar, or lines if there is no terminal.
       console: where to show it; None for standard error.
-      resume: continue an unfinished run in the folder, if there is one; `steps` may be larger.
+      resume: continue the unfinished run in the folder; `steps` may be larger than before, and not
+        smaller than what is done.
       force: remove the run in the folder and start again.
       agents: "jax" for our implementation of "PPO", "TD3" or "SAC" in JAX, with its environment in
         one program, for a task without a team; "sb3" for Stable-Baselines3's; None for the one that
@@ -144,7 +155,7 @@ def train(
     Raises:
       UnknownNameError, SpecError: no such task, algorithm or protocol, or a field is out of range.
       OptionError: another argument is out of range; or the folder contains another run, a finished
-        run or other files, or is not writable.
+        run, no run to resume or other files, is in use by another process, or is not writable.
       PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer (JAX).
       ResourceLimitError: the task would not fit in memory.
       MissingDependencyError: Stable-Baselines3, PyTorch or JAX is not installed.
@@ -168,12 +179,15 @@ def train(
         # Rejects values of hyperparameters, and tasks, before the folder is created.
         model = training.new_model(record)
         if record.sessions == 1:
-            _claim(folder, force=force)
-        record.write(folder)
-        record, episodes, model = training.learn(model, record, folder, progress, console)
-        report, figures = _evaluate(model, record, folder, progress, console)
-    record = record.updated(status="finished")
-    record.write(folder)
+            claim_folder(folder, _FILES if force else (), force=force)
+        with _lock(folder):
+            if record.sessions == 1:
+                _remove_run(folder)
+            record.write(folder)
+            record, episodes, model = training.learn(model, record, folder, progress, console)
+            report, figures = _evaluate(model, record, folder, progress, console)
+            record = record.updated(status="finished")
+            record.write(folder)
     return TrainingResult(folder, record, tuple(episodes), report, figures)
 
 
@@ -291,17 +305,26 @@ def _training(record: RunRecord) -> Any:
 
 def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: bool) -> RunRecord:
     """The plan with all its hyperparameters, and with the progress of a run that is resumed."""
+    if is_locked(folder / _LOCK):
+        raise _in_use(folder)
     previous = None if force else RunRecord.read(folder)
+    if previous is None and resume and not force:
+        raise OptionError(
+            f"{folder}: contains no run to resume. Leave out --resume to start one (in Python, "
+            "resume=True), or give the folder of the run."
+        )
     if previous is None and in_jax(plan.algorithm):
         return plan
     if previous is None:
         lanes = plan.num_envs * (1 if plan.independent else plan.agents)
         settings = for_lanes(find_algorithm(plan.algorithm), lanes, plan.hyperparameters)
         return plan.updated(hyperparameters={**settings, **plan.hyperparameters})
-    if previous.status == "finished":
+    if previous.status != "running":
+        reason = f" ({previous.failure})" if previous.failure else ""
         raise OptionError(
-            f"{folder}: contains a finished run of {previous.algorithm}. Give another folder, or "
-            "use --force to replace it (in Python, force=True)."
+            f"{folder}: contains a {previous.status} run of {previous.algorithm}{reason}. Only "
+            "interrupted runs can be resumed, also with more steps. Give another folder, or use "
+            "--force to replace it (in Python, force=True)."
         )
     if not resume:
         raise OptionError(
@@ -312,9 +335,22 @@ def _new_or_continued(folder: Path, plan: RunRecord, *, resume: bool, force: boo
     return plan.continuing(previous, folder)
 
 
-def _claim(folder: Path, *, force: bool) -> None:
-    """Prepare the folder of a new run; with `force`, remove the run in it."""
-    claim_folder(folder, _FILES if force else (), force=force)
+def _lock(folder: Path) -> Lock:
+    """The lock of a run's folder, which the system releases also when the process is killed."""
+    lock = file_lock(folder / _LOCK)
+    if lock is None:
+        raise _in_use(folder)
+    return lock
+
+
+def _in_use(folder: Path) -> OptionError:
+    return OptionError(
+        f"{folder}: another process is training in this folder. Wait for it or stop it, or give "
+        "another folder."
+    )
+
+
+def _remove_run(folder: Path) -> None:
     for name in _FILES:
         if name in (MODELS, TENSORBOARD):
             shutil.rmtree(folder / name, ignore_errors=True)

@@ -35,6 +35,7 @@ def test_a_path_that_cannot_be_written_is_refused_before_the_work(tmp_path, plac
 def test_a_claimed_folder_is_created_with_its_parents(tmp_path):
     folder = claim_folder(tmp_path / "a" / "b", ["run.json"])
     assert folder.is_dir()
+    (folder / ".lock").write_text("")  # a hidden file does not count
     assert claim_folder(folder, ["run.json"]) == folder
 
 

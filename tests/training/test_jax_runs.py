@@ -188,8 +188,11 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
         jax_run(folder, resume=True)
     record = RunRecord.read(folder)
     assert record is not None
-    assert (record.status, record.steps_done) == ("running", 64)
+    assert (record.status, record.steps_done) == ("failed", 64)
+    assert record.failure == "the weights are not finite any longer at step 128"
     assert not (folder / "model.zip").exists()
+    with pytest.raises(OptionError, match=r"failed run of jax:PPO \(the weights are not finite"):
+        jax_run(folder, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -211,9 +214,10 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
         ({"num_envs": 2}, "num_envs=2: must be 1"),
         ({"device": "abacus"}, "device='abacus': must be one of cpu"),
         (
-            {"agents": "sb3", "algorithm": "jax:PPO", "device": "cpu"},
+            {"agents": "sb3", "algorithm": "PPO", "device": "cpu"},
             r"device='cpu': is for agents in JAX.*--agents jax",
         ),
+        ({"agents": "sb3", "algorithm": "jax:PPO"}, "agents='sb3': must be left out for 'jax:PPO'"),
     ],
 )
 def test_invalid_arguments_raise_typed_errors_and_create_no_folder(

@@ -106,15 +106,17 @@ def test_the_checkpoint_holds_the_model_its_optimisers_and_its_replay_buffer(
     assert TD3.load(path, device="cpu").num_timesteps == steps
 
 
-def test_resuming_with_fewer_steps_than_are_done_only_evaluates(
+def test_a_run_that_was_killed_after_its_last_step_is_only_evaluated(
     killed: Path, tmp_path: Path
 ) -> None:
     copy_files(killed, tmp_path / "run")
     before = RunRecord.read(killed)
     assert before is not None
-    result = short(tmp_path / "run", seed=3, steps=20, resume=True)
-    assert result.record.steps_done >= before.steps_done
+    result = short(tmp_path / "run", seed=3, steps=before.steps_done, resume=True)
+    assert result.record.steps_done == before.steps_done
     assert result.model_path.exists()
+    # On-policy algorithms finish their rollout: more steps are done than were asked for.
+    before.updated(steps=20).continuing(before.updated(steps=20), tmp_path)
 
 
 def test_resuming_twice_from_one_checkpoint_gives_the_same_run(
@@ -134,6 +136,7 @@ def test_resuming_twice_from_one_checkpoint_gives_the_same_run(
     ("change", "field"),
     [
         ({"seed": 4}, "seed"),
+        ({"steps": 20}, "steps"),
         ({"algorithm": "SAC"}, "algorithm"),
         ({"action_range": "unit"}, "action_range"),
         ({"num_envs": 2}, "num_envs"),
@@ -144,7 +147,7 @@ def test_resuming_twice_from_one_checkpoint_gives_the_same_run(
 def test_another_plan_cannot_be_resumed(killed: Path, change: dict[str, Any], field: str) -> None:
     before = (killed / "run.json").read_bytes()
     with pytest.raises(OptionError, match=f"^{field}="):
-        short(killed, **{"seed": 3, "resume": True, **change})
+        short(killed, **{"seed": 3, "steps": 100_000, "resume": True, **change})
     assert (killed / "run.json").read_bytes() == before
 
 

@@ -25,6 +25,7 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
+from sme_registry.io import file_lock
 from sme_registry.training import RunRecord, TrainingResult, train
 from sme_registry.training.episodes import Episode, read_episodes
 from tests.training.runs import PROTOCOL, TINY, copy_files, short
@@ -35,7 +36,7 @@ pytest.importorskip("stable_baselines3")
 def test_a_run_writes_all_files_into_its_folder(run: TrainingResult) -> None:
     names = {path.name for path in run.folder.iterdir()}
     assert names >= {"run.json", "episodes.csv", "checkpoint.zip", "model.zip", "evaluation.json"}
-    assert not [name for name in names if name.startswith(".")]
+    assert [name for name in names if name.startswith(".")] == [".lock"]
     assert {path.name for path in run.figures} <= names
     assert "similarity_map.png" in names
 
@@ -199,11 +200,36 @@ def test_a_finished_run_is_replaced_only_with_force(run: TrainingResult, tmp_pat
     folder = tmp_path / "run"
     copy_files(run.folder, folder)
     for resume in (False, True):
-        with pytest.raises(OptionError, match="finished run"):
+        with pytest.raises(OptionError, match=r"finished run of TD3\. Only interrupted runs can"):
             short(folder, resume=resume)
     replaced = short(folder, seed=9, steps=30, force=True)
     assert replaced.record.seed == 9
     assert len(replaced.episodes) == 1
+
+
+def test_a_folder_in_which_another_process_trains_is_refused(
+    run: TrainingResult, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    copy_files(run.folder, folder)
+    run.record.updated(status="running").write(folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    with file_lock(folder / ".lock"):  # type: ignore[union-attr]
+        for change in ({"resume": True}, {"force": True}, {}):
+            with pytest.raises(OptionError, match="another process is training in this folder"):
+                short(folder, **change)
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    assert short(folder, resume=True).record.sessions == 2
+
+
+def test_two_processes_that_begin_at_once_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sme_registry.training.run.is_locked", lambda path: False)
+    with file_lock(tmp_path / "run" / ".lock"):  # type: ignore[union-attr]
+        with pytest.raises(OptionError, match="another process is training in this folder"):
+            short(tmp_path / "run")
+        assert [path.name for path in (tmp_path / "run").iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -218,6 +244,8 @@ def test_a_folder_with_other_files_is_never_touched(force: bool, tmp_path: Path)
     ("change", "message"),
     [
         ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
+        ({"resume": True}, "contains no run to resume. Leave out --resume"),
+        ({"hyperparameters": {"buffer_size": 10**15}}, "rejects the task or .*buffer_size"),
         ({"hyperparameters": {"gama": 0.9}}, "Did you mean 'gamma'"),
         ({"hyperparameters": {"learning_rate": "fast"}}, "rejects the task or"),
         ({"steps": 0}, "steps=0"),
