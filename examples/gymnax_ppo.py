@@ -1,7 +1,7 @@
 """Train PPO of rejax, agent and environment in one compiled program, and log the exact regret.
 
     make frameworks                    # an environment with the version tried, then this example
-    python examples/rejax_ppo.py --env Default
+    python examples/gymnax_ppo.py --env Default
 
 rejax trains in environments of gymnax before 1.0; gymnax has wrappers that log episodes and that
 give its present environments, such as ours, the former interface. γ = 0.5 is enough where every
