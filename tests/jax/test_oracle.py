@@ -22,7 +22,7 @@ SHAPES = [
         (5, 8, 1, 0),
         1e-6,
     ),
-    (SMESpec(complexity=2, hidden_width=7), None, 1e-6),
+    (SMESpec(complexity=2, hidden_width=7, rotation=0.7), None, 1e-6),
     (SMESpec(complexity=4, hidden_width=7, action_dim=16), (9, 18, 6, 10), 1e-6),
     (SMESpec(complexity=50), None, 6e-5),
 ]

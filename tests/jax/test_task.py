@@ -108,13 +108,13 @@ def test_teams_are_refused_by_name() -> None:
 class FutureSpec(SMESpec):
     """A spec with a field of a later version."""
 
-    rotation: float = 0.0
+    gravity: float = 0.0
 
 
 def test_fields_of_later_versions_are_refused_unless_they_have_their_default() -> None:
     check_supported(FutureSpec())
-    with pytest.raises(SpecError, match=r"^rotation=0.3: must be absent"):
-        check_supported(FutureSpec(rotation=0.3))
+    with pytest.raises(SpecError, match=r"^gravity=0.3: must be absent"):
+        check_supported(FutureSpec(gravity=0.3))
 
 
 def test_every_field_is_supported_or_refused_on_purpose() -> None:
