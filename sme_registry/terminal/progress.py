@@ -50,6 +50,7 @@ class Progress:
     ) -> None:
         self._title, self._unit = title, unit
         self._total, self._done_before, self._done = total, done, done
+        self._rate_from: tuple[int, float] | None = None  # steps and time; None while it prepares
         self._console = console or Console(stderr=True)
         self._seconds_left, self._enabled = seconds_left, enabled
         self._note = ""
@@ -61,6 +62,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         self._start = self._last = time.monotonic()
+        self._rate_from = self._done, self._start
         if self._enabled and self._console.is_terminal:
             self._bars = Bars(
                 TextColumn("{task.description}"),
@@ -87,6 +89,21 @@ class Progress:
             self._bars.stop()
         elif self._enabled and error is None and self._done_before < self._done >= self._total:
             self._print()
+
+    def prepare(self, note: str) -> None:
+        """Show at once what precedes or slows the first steps, such as a compilation.
+
+        Until `prepared`, neither a rate nor the time left is shown: both would be wrong.
+        """
+        self._note, self._rate_from = note, None
+        if self._bars is not None:
+            self._draw()
+        else:
+            self.message(f"{self._title}: {note}")
+
+    def prepared(self) -> None:
+        """Measure the rate from here on, if it is not measured yet."""
+        self._rate_from = self._rate_from or (self._done, time.monotonic())
 
     def update(self, done: int, note: str | None = None, *, total: int | None = None) -> None:
         """Set how far the job is; cheap enough to call at every step.
@@ -163,7 +180,9 @@ class Progress:
 
     def _summary(self) -> list[str]:
         """`4 of 10 steps`, the rate, the time left, the note."""
-        rate = (self._done - self._done_before) / max(time.monotonic() - self._start, 1e-9)
+        now = time.monotonic()
+        done_before, start = self._rate_from or (self._done, now)
+        rate = (self._done - done_before) / max(now - start, 1e-9)
         parts = [f"{self._done:,} of {self._total:,} {self._unit}"]
         if rate > 0 and self._seconds_left is None:
             parts.append(_rate(rate, self._unit))

@@ -86,7 +86,9 @@ def learn(
         program.restore(arrays)
     total = -(-max(record.steps, program.steps) // program.rollout) * program.rollout
     board = _Board(folder / TENSORBOARD)
-    with RunLog(record, folder, program.steps, total, progress, console) as log:
+    begin, piece = program.steps, min(_PIECE, record.checkpoint_every)
+    with RunLog(record, folder, begin, total, progress, console) as log:
+        log.prepare("compiling …")
 
         def save() -> None:
             log.save_checkpoint(
@@ -99,13 +101,14 @@ def learn(
             for episode in finished:
                 log.add(episode.step, [episode])
             log.add(program.steps, [])
+            if program.steps - begin > max(piece, program.rollout):
+                log.prepared()  # PPO's updates are compiled in the second piece
             board.add(program.steps, finished)
 
         def after_piece() -> None:
             if log.is_checkpoint_due() or program.steps >= program.budget:
                 save()
 
-        piece = min(_PIECE, record.checkpoint_every)
         jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=piece)
         _check_finite(program, folder)
     board.close()

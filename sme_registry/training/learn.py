@@ -197,6 +197,14 @@ class RunLog:
         """All finished episodes, also those of earlier sessions."""
         return self._log.episodes
 
+    def prepare(self, note: str) -> None:
+        """Show what precedes or slows the first steps; see `Progress.prepare`."""
+        self._progress.prepare(note)
+
+    def prepared(self) -> None:
+        """Measure the displayed rate from here on, if it is not measured yet."""
+        self._progress.prepared()
+
     def add(self, steps: int, finished: Sequence[EpisodeRegret]) -> None:
         """Log the episodes that finished after so many environment steps of the whole run."""
         self._steps = steps

@@ -56,6 +56,27 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
+def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(clock: Clock) -> None:
+    text = io.StringIO()
+    with Progress("training", 100, console=Console(file=text, width=200)) as progress:
+        progress.prepare("compiling …")
+        assert text.getvalue() == "training: compiling …\n"
+        clock.now = 30.0
+        progress.update(20, "")
+        progress.prepared()
+        clock.now = 100.0
+        progress.update(90, "")
+        progress.prepared()  # once suffices
+        clock.now = 220.0
+        progress.update(95, "")
+    lines = text.getvalue().splitlines()[1:]
+    assert lines == [
+        "training: 20 of 100 steps",
+        "training: 90 of 100 steps · 1 steps/s · about 10 s left",
+        "training: 95 of 100 steps · 3 s per step · about 13 s left",
+    ]
+
+
 @pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24, 25), (24 * 30, 30)])
 def test_a_log_stays_short_however_long_the_job_takes(
     clock: Clock, hours: float, most: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import signal
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("jax")
@@ -51,8 +53,20 @@ def jax_run(folder: Path, **changes: Any) -> TrainingResult:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
-    return jax_run(tmp_path_factory.mktemp("jax"))
+def shown() -> io.StringIO:
+    """What `run` printed."""
+    return io.StringIO()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, shown: io.StringIO) -> TrainingResult:
+    console = Console(file=shown, width=100)
+    return jax_run(tmp_path_factory.mktemp("jax"), progress=True, console=console)
+
+
+def test_a_run_says_that_it_compiles(run: TrainingResult, shown: io.StringIO) -> None:
+    assert "\ntraining PPO: compiling …\n" in shown.getvalue()
+    assert "\ntraining PPO: 128 of 128 steps" in shown.getvalue()
 
 
 def test_a_run_writes_the_same_files(run: TrainingResult) -> None:
