@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
 from sme_registry.errors import OptionError
-from sme_registry.io import available_memory, require_packages
+from sme_registry.io import available_memory, refuse_unwritable, require_packages
 
 CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
 
 
 def prepare() -> None:
     """Configure JAX for exact states and for agents equal to Stable-Baselines3's.
+
+    Prints a line on standard error if compiled programs cannot be kept: JAX itself says nothing.
 
     Raises:
       MissingDependencyError: JAX is not installed.
@@ -26,7 +29,17 @@ def prepare() -> None:
     # Recent GPUs multiply float32 matrices in TF32 by default: one update of TD3 is then 2e-4 off.
     jax.config.update("jax_default_matmul_precision", "highest")
     folder = os.environ.get(CACHE_VARIABLE) or str(_cache_folder())
-    if folder != "off" and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    if folder == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    try:
+        refuse_unwritable(Path(folder) / "entry")
+    except OptionError:
+        print(  # no warning: training hides those of libraries
+            f"sme_registry: {folder} cannot be written, so each process compiles its programs of "
+            f"JAX again. Set {CACHE_VARIABLE} to a folder that you may write to, or to off.",
+            file=sys.stderr,
+        )
+    else:
         jax.config.update("jax_compilation_cache_dir", folder)
 
 

@@ -1,0 +1,33 @@
+"""The process's JAX."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("jax")
+
+import jax
+
+from sme_registry.jax.device import CACHE_VARIABLE, prepare
+
+
+def test_a_compile_cache_that_cannot_be_written_is_announced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = jax.config.jax_compilation_cache_dir
+    (tmp_path / "file").write_text("")
+    try:
+        monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+        prepare()
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{tmp_path / 'file'} cannot be written" in line
+        assert jax.config.jax_compilation_cache_dir == before
+        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "new" / "folder"))
+        prepare()
+        assert capsys.readouterr().err == ""
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "new" / "folder")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
