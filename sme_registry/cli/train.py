@@ -1,4 +1,4 @@
-"""`sme train`: train an algorithm of Stable-Baselines3."""
+"""`sme train`: train an algorithm of Stable-Baselines3, or in JAX."""
 
 from __future__ import annotations
 
@@ -101,12 +101,13 @@ def train(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Train an algorithm of Stable-Baselines3, log the exact regret of each episode, evaluate it.
+    """Train an algorithm, log the exact regret of each episode, and evaluate the trained policy.
 
-    It runs on one CPU thread, which is fastest for networks of this size. On-policy algorithms
-    finish their last rollout. The output folder, by default runs/TASK-ALGORITHM-seedN, contains
-    episodes.csv, checkpoint.zip, model.zip, run.json, evaluation.json, figures, and logs that
-    `tensorboard --logdir runs` shows.
+    The algorithm is one of Stable-Baselines3, or with --agents jax the same in JAX. The former runs
+    on one CPU thread, which is fastest for networks of this size. On-policy algorithms finish their
+    last rollout. The output folder, by default runs/TASK-ALGORITHM-seedN, contains episodes.csv,
+    checkpoint.zip, model.zip, run.json, evaluation.json, figures, and logs that `tensorboard
+    --logdir runs` shows.
 
     --set changes a field of the task (`sme show TASK`) or a hyperparameter, whose names and
     defaults are those of the algorithm's class in Stable-Baselines3. Values are JSON or text; dots
@@ -134,9 +135,10 @@ def train(
     runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
     `report` read it, and `sme-leaderboard new --runs` makes a submission of it.
 
-    --resume continues from the last checkpoint with the same networks, optimisers, replay buffer,
-    hyperparameters and step count. The result differs from an uninterrupted run: random streams get
-    new seeds, and unfinished episodes start again. With --agents jax no bit differs.
+    --resume continues an interrupted run from its last checkpoint with the same networks,
+    optimisers, replay buffer, hyperparameters and step count; --steps may be larger. A finished run
+    cannot be continued. The result differs from an uninterrupted run: random streams get new seeds,
+    and unfinished episodes start again. With --agents jax no bit differs.
 
     Examples:
 

@@ -187,7 +187,7 @@ def check_supported(spec: SMESpec) -> None:
         if name not in SUPPORTED_FIELDS and value != field.get_default(call_default_factory=True):
             raise SpecError(
                 f"{name}={short_repr(value)}: must be absent, since tasks in JAX have no {name}. "
-                "Use the environments and agents without JAX."
+                "Use the environments without JAX, and leave out --agents jax."
             )
 
 
