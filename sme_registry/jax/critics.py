@@ -73,8 +73,8 @@ def smallest_value(
 
 
 def fit_critics(
-    weights: Weights,
     state: Adam,
+    weights: Weights,
     batch: Transitions,
     target: jax.Array,
     learning_rate: float,

@@ -173,7 +173,7 @@ class SACProgram(OffPolicyProgram):
         soft_value = next_value - coefficient * next_log_prob
         target = batch.reward + (1.0 - batch.done) * settings.gamma * soft_value
         critic, weights = critics.fit_critics(
-            weights, learner.critic, batch, target, settings.learning_rate, scale=0.5
+            learner.critic, weights, batch, target, settings.learning_rate, scale=0.5
         )
 
         def loss(action: jax.Array, log_prob: jax.Array) -> jax.Array:

@@ -125,7 +125,7 @@ class TD3Program(OffPolicyProgram):
         )
         target = batch.reward + (1.0 - batch.done) * settings.gamma * next_value
         critic, weights = critics.fit_critics(
-            weights, learner.critic, batch, target, settings.learning_rate, scale=1.0
+            learner.critic, weights, batch, target, settings.learning_rate, scale=1.0
         )
         learner = Learner(weights, learner.actor, critic)
         after: Learner = jax.lax.cond(

@@ -91,6 +91,17 @@ def test_td3_moves_its_policy_at_every_second_update() -> None:
     assert changed == [critic, set(initial), critic, set(initial)]
 
 
+def test_updates_of_one_step_count_from_its_first() -> None:
+    """As many updates as steps before them; targets move at the first and every second one."""
+    rare = {"train_freq": 3, "gradient_steps": -1, "target_update_interval": 2, "tau": 1.0}
+    program = SACProgram(SAC(**TINY, **rare), SPECS, [3, 4], steps=BUDGET)
+    program.advance(STARTS + 3)
+    program.finish()
+    assert program.state.learner.critic.updates.tolist() == [3, 3]
+    weights = program.weights(0)
+    assert np.array_equal(weights[CRITIC.replace("critic", "critic_target")], weights[CRITIC])
+
+
 def test_td3_acts_at_random_until_the_learning_starts() -> None:
     kind, settings = KINDS[0]
     program = kind(settings, SPECS, [3, 4], steps=BUDGET)
