@@ -10,6 +10,9 @@ from typing import Any
 from sme_registry.errors import OptionError
 from sme_registry.io import available_memory, refuse_unwritable, require_packages
 
+_COMPILED = "/jax/core/compile/backend_compile_duration"  # an event of JAX
+_compilations = 0
+
 CACHE_VARIABLE = "SME_JAX_CACHE"  # a folder, or "off"
 
 
@@ -28,6 +31,7 @@ def prepare() -> None:
     jax.config.update("jax_enable_x64", True)
     # Recent GPUs multiply float32 matrices in TF32 by default: one update of TD3 is then 2e-4 off.
     jax.config.update("jax_default_matmul_precision", "highest")
+    jax.monitoring.register_event_duration_secs_listener(_count_compilation)
     folder = os.environ.get(CACHE_VARIABLE) or str(_cache_folder())
     if folder == "off" or "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -41,6 +45,14 @@ def prepare() -> None:
         )
     else:
         jax.config.update("jax_compilation_cache_dir", folder)
+
+
+def compilations() -> int:
+    """How often this process has compiled something, or read it from the cache on disk.
+
+    Between two times at which the number is the same, a program ran at its full speed.
+    """
+    return _compilations
 
 
 def find_device(name: str | None = None) -> Any:
@@ -71,6 +83,11 @@ def memory_of(device: Any) -> int | None:
     if "bytes_limit" not in statistics:
         return None
     return int(statistics["bytes_limit"]) - int(statistics.get("bytes_in_use", 0))
+
+
+def _count_compilation(event: str, duration_secs: float, **_: Any) -> None:
+    global _compilations
+    _compilations += event == _COMPILED
 
 
 def _cache_folder() -> Path:

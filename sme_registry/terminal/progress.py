@@ -54,7 +54,7 @@ class Progress:
         self._console = console or Console(stderr=True)
         self._seconds_left, self._enabled = seconds_left, enabled
         self._note = ""
-        self._parts: dict[str, float] = {}
+        self._parts: dict[str, str] = {}  # how far they are
         self._start = self._last = time.monotonic()
         self._share_printed = 0.0
         self._bars: Bars | None = None
@@ -122,17 +122,17 @@ class Progress:
         """Set how far the job is and how long it is, as callbacks `(done, total)` report it."""
         self.update(done, total=total)
 
-    def start_part(self, name: str) -> None:
-        """Show a part of the job that runs from now on."""
-        self._parts[name] = 0.0
+    def start_part(self, name: str, note: str = "") -> None:
+        """Show a part of the job that runs from now on, and what it does first."""
+        self._parts[name] = f"({note})" if note else "0%"
         if self._bars is not None:
             label = f"  {escape(name)}"
-            self._tasks[name] = self._bars.add_task(label, total=1.0, text="starting")
+            self._tasks[name] = self._bars.add_task(label, total=1.0, text=note or "starting")
         self._refresh()
 
     def update_part(self, name: str, share: float, note: str = "") -> None:
         """Set how far a part is, from 0 to 1."""
-        self._parts[name] = share
+        self._parts[name] = f"{share:.0%}"
         if self._bars is not None:
             self._bars.update(self._tasks[name], completed=share, text=note)
         self._refresh()
@@ -197,7 +197,7 @@ class Progress:
     def _running(self) -> list[str]:
         if not self._parts:
             return []
-        parts = [f"{name} {share:.0%}" for name, share in self._parts.items()]
+        parts = [f"{name} {state}" for name, state in self._parts.items()]
         more = f", and {len(parts) - _PARTS_NAMED} more" if len(parts) > _PARTS_NAMED else ""
         return [f"running: {', '.join(parts[:_PARTS_NAMED])}{more}"]
 

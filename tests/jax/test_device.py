@@ -10,7 +10,7 @@ pytest.importorskip("jax")
 
 import jax
 
-from sme_registry.jax.device import CACHE_VARIABLE, prepare
+from sme_registry.jax.device import CACHE_VARIABLE, compilations, prepare
 
 
 def test_a_compile_cache_that_cannot_be_written_is_announced(
@@ -31,3 +31,13 @@ def test_a_compile_cache_that_cannot_be_written_is_announced(
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "new" / "folder")
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_what_is_compiled_is_counted_and_what_runs_again_is_not() -> None:
+    add = jax.jit(lambda x: x + 0.125)
+    counts = [compilations()]
+    for x in (1.0, 2.0, 3):
+        add(x)
+        counts.append(compilations())
+    before, first, again, other_type = counts
+    assert before < first == again < other_type

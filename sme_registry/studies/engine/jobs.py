@@ -74,8 +74,15 @@ class Job:
 class Report(Protocol):
     """What a job calls while it runs."""
 
-    def __call__(self, done: int, total: int, note: str = "", /) -> None:
-        """Report the steps done, the steps in all, and a note to print, if any."""
+    def __call__(self, done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
+        """Report how far a job is.
+
+        Args:
+          done: steps done.
+          total: steps in all.
+          compilations: so far; the time of a step is measured where this stays the same.
+          note: to print, if any.
+        """
 
 
 @contextlib.contextmanager

@@ -184,11 +184,14 @@ class _Run:
         self._spend(_EVALUATION)
 
     def _after_piece(self) -> None:
+        from sme_registry.jax.device import compilations
+
         self._note_failures()
         if time.monotonic() - self._last_state >= SECONDS_BETWEEN_STATES:
             self._save()
             self._last_state = time.monotonic()
-        self._progress(min(self._program.steps, self._cell.steps), self._cell.steps)
+        steps = self._cell.steps
+        self._progress(min(self._program.steps, steps), steps, compilations())
 
     def _note_failures(self) -> None:
         failed_at = self._records["failed_at"]
@@ -256,7 +259,7 @@ class _Run:
                 raise OptionError("its records of the lanes are missing or others.")
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
-            self._progress(0, self._cell.steps, f"starts again, without {state}: {error}")
+            self._progress(0, self._cell.steps, 0, f"starts again, without {state}: {error}")
         else:
             self._records = records
 

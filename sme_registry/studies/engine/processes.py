@@ -86,6 +86,7 @@ class _Steps(NamedTuple):
 
     done: int
     total: int
+    compilations: int
     note: str
 
 

@@ -144,12 +144,12 @@ class _StepCounts:
     """A Ray actor to which workers report the steps they have done."""
 
     def __init__(self) -> None:
-        self._steps: dict[str, tuple[int, int, str]] = {}
+        self._steps: dict[str, tuple[Any, ...]] = {}
 
-    def put(self, key: str, done: int, total: int, note: str) -> None:
-        self._steps[key] = (done, total, note)
+    def put(self, key: str, *reported: Any) -> None:
+        self._steps[key] = reported
 
-    def take(self) -> dict[str, tuple[int, int, str]]:
+    def take(self) -> dict[str, tuple[Any, ...]]:
         steps, self._steps = self._steps, {}
         return steps
 

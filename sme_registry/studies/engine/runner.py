@@ -216,7 +216,8 @@ class _StudyRun:
         }
         self._running: dict[str, _Running] = {}
         self._shares: dict[str, float] = {}  # of a running cell's steps, done
-        self._first_reports: dict[str, tuple[float, float]] = {}  # time and share, of each job
+        # Of each job, the first report after it last compiled: time, share, compilations.
+        self._first_reports: dict[str, tuple[float, float, int]] = {}
         self._paces: dict[str, float] = {}  # measured by estimated seconds, of each algorithm
         self._unwritten: list[Outcome] = []
         self._progress = Progress(
@@ -315,10 +316,11 @@ class _StudyRun:
     def seconds_left(self) -> float:
         """Seconds to the end, as estimated now."""
         seconds: dict[bool, list[float]] = {True: [], False: []}  # one at a time; others
-        for key in (*self._running, *self._waiting):
-            cell = self._planned[key].cell
-            rest = self._seconds(cell) * (1 - self._shares.get(key, 0.0))
-            seconds[self._one_at_a_time(cell)].append(rest)
+        jobs = {id(running.job): running.job.cells for running in self._running.values()}
+        waiting = ((self._planned[key].cell,) for key in self._waiting)
+        for cells in (*jobs.values(), *waiting):
+            rests = (self._seconds(c) * (1 - self._shares.get(c.digest, 0.0)) for c in cells)
+            seconds[self._one_at_a_time(cells[0])].append(sum(rests))
         return max(sum(seconds[True]), makespan(seconds[False], self._executor.workers))
 
     def _seconds(self, cell: Cell) -> float:
@@ -432,7 +434,7 @@ class _StudyRun:
         for cell, lock in zip(job.cells, locks, strict=True):
             del self._waiting[cell.digest]
             self._running[cell.digest] = _Running(lock, now, job)
-        self._progress.start_part(self._name(job))
+        self._progress.start_part(self._name(job), "compiling" if job.lanes else "")
         return job
 
     def _name(self, job: Job) -> str:
@@ -440,19 +442,24 @@ class _StudyRun:
         first, *others = (label(self._planned[cell.digest]) for cell in job.cells)
         return f"{first}, and {len(others)} more" if others else first
 
-    def _report(self, job: Job, done: int, total: int, note: str = "") -> None:
+    def _report(
+        self, job: Job, done: int, total: int, compilations: int = 0, note: str = ""
+    ) -> None:
         if note:
             self._progress.message(f"{self._name(job)}: {note}")
             return
         share, now = done / total if total else 1.0, time.monotonic()
         first = job.cells[0]
-        then, before = self._first_reports.setdefault(first.digest, (now, share))
+        then, before, compiled = self._first_reports.get(first.digest, (now, share, -1))
+        if compilations != compiled:
+            then, before = now, share
+            self._first_reports[first.digest] = (now, share, compilations)
         if share - before >= _SHARE_FOR_A_PACE:  # a program may go on from far beyond its start
             measured = (now - then) / (share - before) / len(job.cells)
             self._paces[first.uses] = 2 * measured / sum(self._estimator.seconds(first))
         self._shares |= {cell.digest: share for cell in job.cells}
-        note = f"{done:,} of {total:,} steps" if done < total else "evaluating"
-        self._progress.update_part(self._name(job), share, note)
+        state = f"{done:,} of {total:,} steps" if done < total else "evaluating"
+        self._progress.update_part(self._name(job), share, state)
 
     def _handle(self, outcome: Outcome) -> None:
         entry = outcome.entry

@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.studies.engine import runner
 from sme_registry.studies.engine.executors import Outcome, failed
 from sme_registry.studies.engine.jobs import Job, Programs
 from sme_registry.studies.engine.ledger import Ledger
@@ -220,6 +222,35 @@ def test_programs_that_do_not_fit_in_memory_at_once_are_refused_before_the_first
     assert "--jobs" in last
     assert not executor.jobs
     assert not list(tmp_path.iterdir())
+
+
+def test_the_time_left_does_not_count_compiling_as_the_speed_of_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = plan_file(seeds=1)
+    seconds_left: list[float] = []
+    now = [0.0]
+    monkeypatch.setattr(runner, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    @dataclass
+    class Reporting(Refusing):
+        def map(self, jobs: Iterator[Job | None], progress: Any) -> Iterator[Outcome]:
+            first = next(jobs)
+            for now[0], done, compilations in (
+                (60.0, 100, 1),
+                (120.0, 200, 2),  # it compiled again
+                (121.0, 300, 2),
+                (122.0, 400, 2),
+            ):
+                progress(first, done, 1000, compilations)
+                seconds_left.append(progress.__self__.seconds_left())
+            assert first is not None
+            yield from (failed(cell, "refused", "") for cell in first.cells)
+
+    only = ["algorithm=PPO", "class=delayed"]
+    run_study(file, tmp_path, executor=Reporting(), device="cpu", only=only, progress=False)
+    assert seconds_left[0] == pytest.approx(seconds_left[1] * 9 / 8)  # both from a table
+    assert seconds_left[2:] == pytest.approx([7.0, 6.0])
 
 
 def test_programs_on_ray_run_on_cpus_alone(tmp_path: Path) -> None:
