@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.errors import PolicyError
 from sme_registry.evaluation.policies import saved_sb3
-from sme_registry.io import Arrays, read_arrays, write_atomically
+from sme_registry.io import write_atomically
 
 FILE = "checkpoint.zip"
 _MEMBER = "sme_replay_buffer.npz"
@@ -61,18 +61,11 @@ def load(algorithm: Any, path: Path, env: Any, **kwargs: Any) -> Any:
         _refill(model.replay_buffer, replay)
         return model
     except Exception as error:
-        raise _unloadable(path, error) from error
+        raise unloadable(path, error) from error
 
 
-def load_arrays(path: Path) -> Arrays:
-    """The arrays of a checkpoint; runs no code of the file. Raises PolicyError as `load` does."""
-    try:
-        return read_arrays(path)
-    except OptionError as error:
-        raise _unloadable(path, error.__cause__ or error) from None
-
-
-def _unloadable(path: Path, error: BaseException) -> PolicyError:
+def unloadable(path: Path, error: BaseException) -> PolicyError:
+    """The error for a checkpoint that is damaged or of another program."""
     return PolicyError(
         f"{path}: cannot be loaded: {type(error).__name__}: {error}. Start again with --force "
         "(in Python, force=True), or in another folder."

@@ -42,7 +42,7 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
                 f"hyperparameters.{name}: is not a name, or is set twice. Use one name for each "
                 "value, such as policy_kwargs.net_arch."
             )
-        block[last] = value
+        block[last] = dict(value) if isinstance(value, Mapping) else value  # the caller's stays
     return nested
 
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 
-from sme_registry.errors import PolicyError
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.policies import saved_sb3
-from sme_registry.io import is_installed, write_arrays, write_atomically
+from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.sb3 import EpisodeRegret
@@ -81,9 +81,12 @@ def learn(
     present = _PresentEpisode()
     path = folder / checkpoint.FILE
     if record.sessions > 1 and path.exists():
-        arrays = checkpoint.load_arrays(path)
-        present.sums = arrays.pop(_EPISODE)
-        program.restore(arrays)
+        try:
+            arrays = read_arrays(path)
+            present.sums = arrays.pop(_EPISODE)
+            program.restore(arrays)
+        except (KeyError, OptionError) as error:
+            raise checkpoint.unloadable(path, error.__cause__ or error) from None
     total = -(-max(record.steps, program.steps) // program.rollout) * program.rollout
     board = _Board(folder / TENSORBOARD)
     begin, piece = program.steps, min(_PIECE, record.checkpoint_every)

@@ -24,6 +24,9 @@ def test_dotted_names_are_nested() -> None:
         "gamma": 0.9,
         "policy_kwargs": {"net_arch": [64, 64], "n_critics": 1},
     }
+    given = {"policy_kwargs": {"net_arch": [64]}, "policy_kwargs.n_critics": 1}
+    assert nested_hyperparameters(given)["policy_kwargs"] == {"net_arch": [64], "n_critics": 1}
+    assert given["policy_kwargs"] == {"net_arch": [64]}
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation import load_sb3
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.export import export_onnx
-from sme_registry.io import write_arrays
+from sme_registry.io import read_arrays, write_arrays
 from sme_registry.jax.run import new_program
 from sme_registry.training import RunRecord, TrainingResult, checkpoint, jax_learn, train
 from sme_registry.training.episodes import read_episodes
@@ -182,9 +182,18 @@ def test_a_checkpoint_that_is_damaged_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupted(tmp_path / "run", monkeypatch)
-    (tmp_path / "run" / checkpoint.FILE).write_bytes(b"PK")
-    with pytest.raises(PolicyError, match=r"cannot be loaded: .*--force"):
-        jax_run(tmp_path / "run", resume=True)
+    path = tmp_path / "run" / checkpoint.FILE
+    whole = read_arrays(path)
+
+    def refused() -> None:
+        with pytest.raises(PolicyError, match=r"cannot be loaded: .*--force"):
+            jax_run(tmp_path / "run", resume=True)
+
+    path.write_bytes(b"PK")
+    refused()
+    for name in ("episode", "steps"):
+        write_arrays(path, {each: array for each, array in whole.items() if each != name})
+        refused()
 
 
 def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
@@ -192,7 +201,7 @@ def test_weights_that_are_not_finite_end_a_run_that_keeps_its_checkpoint(
 ) -> None:
     folder = tmp_path / "run"
     interrupted(folder, monkeypatch)
-    kept = dict(checkpoint.load_arrays(folder / checkpoint.FILE))
+    kept = read_arrays(folder / checkpoint.FILE)
     broken = {
         name: np.full_like(array, np.nan) if "action_net.bias" in name else array
         for name, array in kept.items()
