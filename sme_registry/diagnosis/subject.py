@@ -20,7 +20,7 @@ from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy, load_sb3
 from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
-from sme_registry.spec.study import INDEPENDENT, Cell
+from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
 from sme_registry.task.draw import Array
 from sme_registry.training import RunRecord, checkpoint
 from sme_registry.training import episodes as episode_files
@@ -116,10 +116,11 @@ def load_run(folder: str | Path) -> Subject | TeamSubject:
             advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
         raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
     path, checkpoint_step = folder / record.model_name, None
-    if record.independent and not path.exists():
+    if (record.independent or in_jax(record.algorithm)) and not path.exists():
+        agents = "independent agents" if record.independent else "agents in JAX"
         raise OptionError(
-            f"run={str(folder)!r}: independent agents are diagnosed when their training has ended. "
-            "Continue it with `sme train … --resume`."
+            f"run={str(folder)!r}: {agents} are diagnosed when their training has ended. Continue "
+            "it with `sme train … --resume`."
         )
     if not path.exists():
         path, checkpoint_step = folder / checkpoint.FILE, record.steps_done

@@ -103,8 +103,8 @@ class RunRecord(StrictModel):
         """
         if self.steps < min(previous.steps, previous.steps_done):
             raise OptionError(
-                f"steps={self.steps:,}: must be at least {previous.steps_done:,}, since the run in "
-                f"{folder} has done so many of its {previous.steps:,}. Resume it with more steps."
+                f"steps={self.steps:,}: must be at least {previous.steps_done:,}, the steps that "
+                f"the run in {folder} has done. Choose more, or keep {previous.steps:,}."
             )
         fields = ("spec_digest", "algorithm", "seed", "action_range", "num_envs", "independent")
         pairs = {field: (getattr(previous, field), getattr(self, field)) for field in fields}

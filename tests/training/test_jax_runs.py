@@ -19,6 +19,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("jax")
 
 from sme_registry import SMESpec, evaluate
+from sme_registry.diagnosis.subject import load_run
 from sme_registry.errors import (
     MissingDependencyError,
     OptionError,
@@ -103,6 +104,13 @@ def test_the_model_is_one_of_stable_baselines3(run: TrainingResult, tmp_path: Pa
     model = load_sb3(run.model_path)
     assert (type(model).__name__, model.num_timesteps, model.n_steps) == ("PPO", 128, 32)
     assert evaluate(run.model_path, TINY, PROTOCOL, name="PPO").regions == run.report.regions
+    # The last checkpoint precedes the last update.
+    program = new_program("jax:PPO", [TINY], [0], hyperparameters=PPO, steps=120)
+    arrays = read_arrays(run.folder / checkpoint.FILE)
+    program.restore({name: array for name, array in arrays.items() if name != "episode"})
+    program.finish()
+    for name, weight in model.policy.state_dict().items():
+        assert np.array_equal(weight.numpy(), program.weights(0)[name])
     pytest.importorskip("onnxruntime")
     exported = export_onnx(run.model_path, TINY, tmp_path / "policy.onnx")
     of_onnx = evaluate(exported, TINY, PROTOCOL).regions[0].similarity
@@ -168,6 +176,8 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit(
     assert not (folder / "model.zip").exists()
     with pytest.raises(OptionError, match="Use --resume"):
         jax_run(folder)
+    with pytest.raises(OptionError, match=r"agents in JAX are diagnosed when .* has ended"):
+        load_run(folder)
     shutil.copytree(folder, tmp_path / "longer")
 
     resumed = jax_run(folder, resume=True, hyperparameters={})
