@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from sme_registry import wrappers as wrappers
     from sme_registry.evaluation import EvaluationReport, evaluate
     from sme_registry.export import export_onnx
-    from sme_registry.spec import EvaluationProtocol, SMESpec
+    from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
     from sme_registry.task import Task, materialize
 
 __all__ = [
@@ -54,6 +54,7 @@ __all__ = [
     "EvaluationReport",
     "SMEError",
     "SMESpec",
+    "StreamSpec",
     "Task",
     "env_spec",
     "evaluate",
@@ -72,6 +73,7 @@ _LAZY = {
     "EvaluationProtocol": "sme_registry.spec",
     "EvaluationReport": "sme_registry.evaluation",
     "SMESpec": "sme_registry.spec",
+    "StreamSpec": "sme_registry.spec",
     "Task": "sme_registry.task",
     "evaluate": "sme_registry.evaluation",
     "export_onnx": "sme_registry.export",

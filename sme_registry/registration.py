@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast, overload
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from sme_registry.envs.team import SMETeamEnv
-    from sme_registry.spec import SMESpec, SpecLike
+    from sme_registry.spec import SMESpec, SpecLike, StreamSpec
+
+_S = TypeVar("_S")
 
 _ENTRY_POINTS: dict[str, Any] = {
     "entry_point": "sme_registry.envs:SMEEnv",
@@ -107,34 +109,47 @@ def register(spec: SMESpec, name: str) -> str:
     return env_id
 
 
-def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec:
-    """The spec of an id, a file's path, or a digest.
+@overload
+def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec: ...
+@overload
+def load(id_or_path_or_digest: str | os.PathLike[str], kind: type[_S]) -> _S: ...
+def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
+    """The spec or stream of an id, a file's path, or a digest.
 
     The task of a file is drawn here, to check that this machine draws its published numbers.
 
+    Args:
+      id_or_path_or_digest: the name.
+      kind: `SMESpec` or `StreamSpec`, to accept no other; None takes what the name stands for.
+        A type checker takes it for a spec then.
+
     Raises:
-      UnknownNameError: no task has this name; the message suggests the nearest.
+      UnknownNameError: nothing has this name; the message suggests the nearest.
       MalformedDocumentError, SpecError, DigestMismatchError: the file is invalid.
       FingerprintMismatchError: this machine draws other numbers than the file publishes.
       ResourceLimitError: the file's task would not fit in memory.
     """
-    from sme_registry.task import load_spec
+    from sme_registry.spec import SMESpec, StreamSpec
+    from sme_registry.spec.resolve import names_stream
+    from sme_registry.task import load_spec, load_stream
 
+    if kind is StreamSpec or (kind is not SMESpec and names_stream(id_or_path_or_digest)):
+        return load_stream(id_or_path_or_digest)
     return load_spec(id_or_path_or_digest)
 
 
 def save(
-    spec: SMESpec,
+    spec: SMESpec | StreamSpec,
     path: str | os.PathLike[str],
     name: str | None = None,
     *,
     description: str = "",
     tags: tuple[str, ...] = (),
 ) -> Path:
-    """Write a spec as a file that a colleague can `load`, with digest and fingerprint.
+    """Write a spec or a stream as a file that a colleague can `load`, with digest and fingerprint.
 
     Args:
-      spec: the spec.
+      spec: the spec, or the stream.
       path: the file to write; its folder is created. An existing file is replaced, completely
         or not at all.
       name: letters, digits, '_' and '-'; by default the file's name without its ending.
@@ -149,24 +164,27 @@ def save(
       ResourceLimitError: the task would not fit in memory.
       OptionError: the file cannot be written; an existing file is unchanged.
     """
-    from sme_registry.spec import as_spec
-    from sme_registry.spec.envelope import EnvFile
-    from sme_registry.task import materialize
+    from sme_registry.spec import EnvFile, StreamFile, as_spec, as_stream
+    from sme_registry.spec.resolve import names_stream
+    from sme_registry.task import materialize, materialize_stream
     from sme_registry.task.fingerprint import fingerprint_of
 
-    spec = as_spec(spec)
-    file = EnvFile.from_dict(
-        {
-            "name": Path(path).stem.removesuffix("-v1") if name is None else name,
-            "description": description,
-            "tags": tags,
-            "spec": spec.to_dict(),
-            "digest": spec.digest,
-            "fingerprint": fingerprint_of(materialize(spec)).to_dict(),
-        },
-        str(path),
-    )
-    file.write(path)
+    fields: dict[str, Any] = {
+        "name": Path(path).stem.removesuffix("-v1") if name is None else name,
+        "description": description,
+        "tags": tags,
+    }
+    if names_stream(spec):
+        stream = as_stream(cast("StreamSpec", spec))
+        tasks = dict(zip((p.spec for p in stream.pieces), materialize_stream(stream), strict=True))
+        prints = [fingerprint_of(tasks[phase.spec]).to_dict() for phase in stream.phases]
+        document = {"stream": stream.to_dict(), "digest": stream.digest, "fingerprints": prints}
+        StreamFile.from_dict(fields | document, str(path)).write(path)
+        return Path(path)
+    spec = as_spec(cast("SMESpec", spec))
+    fingerprint = fingerprint_of(materialize(spec)).to_dict()
+    document = {"spec": spec.to_dict(), "digest": spec.digest, "fingerprint": fingerprint}
+    EnvFile.from_dict(fields | document, str(path)).write(path)
     return Path(path)
 
 

@@ -18,11 +18,20 @@ from typer.testing import CliRunner, Result
 import sme_registry
 from sme_registry import EvaluationReport, SMESpec, load
 from sme_registry.cli import app
-from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, Suite, SuiteFile, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    StreamFile,
+    StudyFile,
+    Suite,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.task.certify import certify
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
-KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
+KINDS = (EnvFile, StreamFile, SuiteFile, ProtocolFile, StudyFile)
 COMMANDS = [
     *("list", "show", "new", "suite", "validate", "certify"),
     *("evaluate", "train", "diagnose", "study", "demo"),

@@ -16,9 +16,23 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.io import parse_json, read_json
-from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.spec.envelope import Envelope
-from sme_registry.spec.resolve import is_path, refuse_bare_spec, resolve
+from sme_registry.spec.resolve import (
+    is_path,
+    names_stream,
+    refuse_bare_spec,
+    resolve,
+    resolve_stream,
+)
 
 TaskName = Annotated[
     str,
@@ -59,6 +73,7 @@ ActionRange = Annotated[
 # A name stands for the first kind that has it: `smoke` is a suite here, and a study in `sme study`.
 KINDS: dict[str, type[Envelope]] = {
     "env": EnvFile,
+    "stream": StreamFile,
     "suite": SuiteFile,
     "protocol": ProtocolFile,
     "study": StudyFile,
@@ -68,7 +83,7 @@ _File = TypeVar("_File", bound=Envelope)
 
 
 def kind_of(file: Envelope) -> str:
-    """The kind of a file: `env`, `suite`, `protocol` or `study`."""
+    """The kind of a file: `env`, `stream`, `suite`, `protocol` or `study`."""
     return next(kind for kind, model in KINDS.items() if isinstance(file, model))
 
 
@@ -100,7 +115,7 @@ def find_any(name: str) -> Envelope | SMESpec:
     """The file of a name, path or digest; a spec alone if it has no file of its own.
 
     Raises:
-      UnknownNameError: no environment, suite, protocol or study has this name or digest.
+      UnknownNameError: no environment, stream, suite, protocol or study has this name or digest.
     """
     if is_path(name):
         return read_any(name)
@@ -108,6 +123,9 @@ def find_any(name: str) -> Envelope | SMESpec:
     for file in files:
         if name in (file.name, file.versioned_name, file.digest):
             return file
+    if names_stream(name):
+        stream = resolve_stream(name).stream
+        return next(f for f in files if isinstance(f, StreamFile) and f.digest == stream.digest)
     try:
         spec = resolve(name).spec
     except UnknownNameError as error:

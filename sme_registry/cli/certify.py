@@ -9,7 +9,15 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, find_any
 from sme_registry.errors import UnknownNameError
-from sme_registry.spec import EnvFile, ProtocolFile, SMESpec, StudyFile, SuiteFile, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    SMESpec,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.terminal import Table, err, out, print_json
 
 if TYPE_CHECKING:
@@ -65,7 +73,7 @@ def certify(
 
 def _tasks(name: str) -> list[tuple[str, SMESpec]]:
     """The label and spec of each task that a name stands for."""
-    from sme_registry.task import materialize
+    from sme_registry.task import materialize, materialize_stream
 
     document = find_any(name)
     if isinstance(document, SMESpec):
@@ -79,9 +87,13 @@ def _tasks(name: str) -> list[tuple[str, SMESpec]]:
             for member in document.suite.classes
             for spec in member.instances
         ]
+    if isinstance(document, StreamFile):
+        materialize_stream(document.stream, document.fingerprints)
+        phases = enumerate(document.stream.phases)
+        return [(f"{document.name} phase {index}", phase.spec) for index, phase in phases]
     assert isinstance(document, ProtocolFile | StudyFile)
     kind = "protocol" if isinstance(document, ProtocolFile) else "study"
-    raise UnknownNameError(f"{name!r}: is a {kind}. Give a task or a suite.")
+    raise UnknownNameError(f"{name!r}: is a {kind}. Give a task, a stream or a suite.")
 
 
 def _print_line(label: str, certificate: Certificate) -> None:

@@ -11,11 +11,18 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import KINDS, Json, kind_of
 from sme_registry.errors import UnknownNameError
-from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
+from sme_registry.spec import (
+    EnvFile,
+    ProtocolFile,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+    catalogue,
+)
 from sme_registry.spec.envelope import Envelope
 from sme_registry.terminal import Table, out, print_json
 
-Kind = enum.StrEnum("Kind", ["env", "suite", "protocol", "study"])
+Kind = enum.StrEnum("Kind", ["env", "stream", "suite", "protocol", "study"])
 
 
 def list_(
@@ -26,7 +33,7 @@ def list_(
     ] = None,
     json: Json = False,
 ) -> None:
-    """List the catalogue: environments, suites, protocols and studies.
+    """List the catalogue: environments, streams, suites, protocols and studies.
 
     Examples:
 
@@ -67,8 +74,9 @@ def summary(file: Envelope) -> dict[str, Any]:
         "tags": list(file.tags),
         "description": file.description,
     }
-    if isinstance(file, EnvFile):
+    if isinstance(file, EnvFile | StreamFile):
         entry["id"] = f"{catalogue.NAMESPACE}/{file.versioned_name}"
+    if isinstance(file, EnvFile):
         entry["spec"] = file.spec.to_dict()
     return entry
 
@@ -91,6 +99,14 @@ def _env_table(files: list[EnvFile]) -> Table:
         caption="n agents · S state channels, A action channels · L layers of π* · k reward "
         "interval · T horizon · actions are in [0, 1]; in [−1, 1] by SME/DefaultSymmetric-v1, …",
     )
+
+
+def _stream_table(files: list[StreamFile]) -> Table:
+    columns = {"name": "name", "phases": "number", "cycles": "number", "steps": "number"}
+    columns |= {"description": "text"}
+    streams = [file.stream for file in files]
+    counts = ((len(stream.phases), stream.cycles, stream.steps) for stream in streams)
+    return Table("Streams", columns, _rows(files, counts))
 
 
 def _suite_table(files: list[SuiteFile]) -> Table:
@@ -132,6 +148,7 @@ def _rows(
 
 _TABLES: dict[str, Any] = {
     "env": _env_table,
+    "stream": _stream_table,
     "suite": _suite_table,
     "protocol": _protocol_table,
     "study": study_table,

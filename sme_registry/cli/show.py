@@ -18,6 +18,8 @@ from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
     SMESpec,
+    StreamFile,
+    StreamSpec,
     StudyFile,
     StudyPlan,
     Suite,
@@ -32,11 +34,14 @@ from sme_registry.spec.resolve import known_specs
 from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
-    "Schema", "spec env-file suite suite-file protocol protocol-file study study-file"
+    "Schema",
+    "spec env-file stream stream-file suite suite-file protocol protocol-file study study-file",
 )
 _SCHEMAS: dict[str, type[BaseModel]] = {
     "spec": SMESpec,
     "env-file": EnvFile,
+    "stream": StreamSpec,
+    "stream-file": StreamFile,
     "suite": Suite,
     "suite-file": SuiteFile,
     "protocol": EvaluationProtocol,
@@ -66,7 +71,7 @@ def show(
         typer.Option("--digests", help="Print only the digests of a suite's tasks, one per line."),
     ] = False,
 ) -> None:
-    """Show a task, suite, protocol or study plan: its fields, its digest, and derived facts.
+    """Show a task, stream, suite, protocol or study plan: fields, digest and derived facts.
 
     For a suite, it lists the task of each class and seed; `sme train` takes their digests.
 
@@ -110,6 +115,8 @@ def _show_document(name: str, document: Envelope | SMESpec, json: bool) -> None:
     elif isinstance(document, StudyFile):
         out().print(study_table([document]))
         out().print(f"{document.digest}\nTo see its runs and times: sme study plan {escape(name)}")
+    elif isinstance(document, StreamFile):
+        _show_stream(document)
     elif isinstance(document, ProtocolFile):
         fields = {**document.protocol.to_dict(), "digest": document.digest}
         print_pairs(_title(document), fields)
@@ -226,6 +233,37 @@ def _ranges(channels: list[int]) -> str:
     runs = itertools.groupby(enumerate(channels), lambda pair: pair[1] - pair[0])
     ends = [(run[0][1], run[-1][1]) for run in (list(group) for _, group in runs)]
     return ", ".join(str(low) if low == high else f"{low}–{high}" for low, high in ends)
+
+
+def _show_stream(file: StreamFile) -> None:
+    """A stream's phases: when each begins, and in what its task differs from the one before."""
+    stream, before, begins = file.stream, SMESpec().every_field(), 0
+    rows = []
+    for index, phase in enumerate(stream.phases):
+        fields = phase.spec.every_field()
+        changes = [f"{k}={_plain(v)}" for k, v in fields.items() if v != before[k]]
+        if phase.drift is not None:
+            to, count = _plain(phase.drift.rotation), phase.drift.increments
+            changes.append(f"rotation drifts to {to} in {count} increments")
+        text, digest = ", ".join(changes) or "none", phase.spec.digest[:_SHORT]
+        rows.append((str(index), f"{begins:,}", f"{phase.steps:,}", text, digest))
+        before, begins = fields, begins + phase.steps
+    columns = {"phase": "number", "begins at": "number", "steps": "number", "changes": "text"}
+    caption = "changes: from the phase before; of phase 0, from the default task"
+    out().print(Table(_title(file), {**columns, "digest": "name"}, rows, caption=caption))
+    out().print()
+    facts = {
+        "cycles": stream.cycles,
+        "steps": f"{stream.steps:,}",
+        "phases end": {"episode": "at the next reset", "step": "at once"}[stream.switch],
+        "observes_phase": stream.observes_phase,
+        "digest": file.digest,
+    }
+    print_pairs("Stream", facts)
+
+
+def _plain(value: Any) -> Any:
+    return f"{value:.4g}" if isinstance(value, float) else value
 
 
 def _show_suite(file: SuiteFile, json: bool) -> None:

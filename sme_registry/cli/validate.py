@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, kind_of, read_any
 from sme_registry.errors import OptionError, SMEError
-from sme_registry.spec import EnvFile, StudyFile, SuiteFile
+from sme_registry.spec import EnvFile, StreamFile, StudyFile, SuiteFile
 from sme_registry.terminal import out, print_json
 
 
@@ -57,7 +57,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _check(path: Path) -> dict[str, Any]:
-    from sme_registry.task import materialize
+    from sme_registry.task import materialize, materialize_stream
 
     result: dict[str, Any] = {"path": str(path), "valid": False, "kind": None, "error": None}
     try:
@@ -65,6 +65,8 @@ def _check(path: Path) -> dict[str, Any]:
         result |= {"kind": kind_of(file), "name": file.versioned_name, "digest": file.digest}
         if isinstance(file, EnvFile):
             materialize(file.spec, file.fingerprint)
+        elif isinstance(file, StreamFile):
+            materialize_stream(file.stream, file.fingerprints)
         elif isinstance(file, SuiteFile):
             _ = file.suite.instances
         elif isinstance(file, StudyFile):

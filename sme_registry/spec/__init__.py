@@ -10,7 +10,14 @@ from sme_registry.spec.document import (
     StrictModel,
     TupleOf,
 )
-from sme_registry.spec.envelope import EnvFile, Fingerprint, ProtocolFile, StudyFile, SuiteFile
+from sme_registry.spec.envelope import (
+    EnvFile,
+    Fingerprint,
+    ProtocolFile,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+)
 from sme_registry.spec.protocol import EvaluationProtocol, ProtocolLike
 from sme_registry.spec.sme_spec import (
     ACTION_RANGES,
@@ -21,6 +28,7 @@ from sme_registry.spec.sme_spec import (
     TeamSpec,
     as_spec,
 )
+from sme_registry.spec.stream import Drift, Phase, Piece, StreamLike, StreamSpec, as_stream
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.suite import Suite, SuiteClass
 
@@ -31,11 +39,14 @@ __all__ = [
     "Cell",
     "Digest",
     "Document",
+    "Drift",
     "EnvFile",
     "EvaluationProtocol",
     "Fingerprint",
     "Integer",
     "Name",
+    "Phase",
+    "Piece",
     "PlannedCell",
     "ProtocolFile",
     "ProtocolLike",
@@ -43,6 +54,9 @@ __all__ = [
     "SMESpec",
     "SchemaVersion",
     "SpecLike",
+    "StreamFile",
+    "StreamLike",
+    "StreamSpec",
     "StrictModel",
     "StudyAlgorithm",
     "StudyFile",
@@ -53,4 +67,5 @@ __all__ = [
     "TeamSpec",
     "TupleOf",
     "as_spec",
+    "as_stream",
 ]

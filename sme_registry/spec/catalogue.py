@@ -13,16 +13,27 @@ from typing import Any, TypeVar, cast
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.io import read_json
-from sme_registry.spec.envelope import Envelope, EnvFile, ProtocolFile, StudyFile, SuiteFile
+from sme_registry.spec.envelope import (
+    Envelope,
+    EnvFile,
+    ProtocolFile,
+    StreamFile,
+    StudyFile,
+    SuiteFile,
+)
 from sme_registry.spec.sme_spec import SMESpec
 
 NAMESPACE = "SME"
 SYMMETRIC = "Symmetric"
 """Ends the name in an id of the same task with actions in [−1, 1]: `SME/DefaultSymmetric-v1`."""
 
+STREAM = "Stream"
+"""May begin the name of a stream in an id: `SME/StreamSwitch5-v1` is `SME/Switch5-v1`."""
+
 _E = TypeVar("_E", bound=Envelope)
 _FOLDERS: dict[type[Envelope], str] = {
     EnvFile: "envs",
+    StreamFile: "streams",
     SuiteFile: "suites",
     ProtocolFile: "protocols",
     StudyFile: "studies",

@@ -16,6 +16,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
@@ -197,6 +198,37 @@ class Document(StrictModel):
     def digest(self) -> str:
         """`sha256:` and 64 hex digits: the identity of this document."""
         return "sha256:" + hashlib.sha256(self.canonical_json()).hexdigest()
+
+
+class NamedDocument(Document):
+    """A document that a file or a registration may give a name, which is presentation.
+
+    The name is in no JSON, and makes no two documents unequal.
+    """
+
+    _name: str = PrivateAttr("")
+
+    @property
+    def name(self) -> str:
+        """What its file or registration calls it, such as `MyTask`; empty if nothing does."""
+        return self._name
+
+    def named(self, name: str) -> Self:
+        """This document under another name."""
+        copy = self.model_copy()
+        copy._name = name
+        return copy
+
+    @property
+    def content_name(self) -> str:
+        """`sha256-` and the first 12 hex digits of the digest: the name by content."""
+        return self.digest.replace(":", "-")[: len("sha256-") + 12]
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all fields are equal; the name is none of them."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return self.__dict__ == other.__dict__
 
 
 class _Named(Protocol):

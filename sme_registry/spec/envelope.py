@@ -16,6 +16,7 @@ from sme_registry.io import read_json, to_json, write_atomically
 from sme_registry.spec.document import Digest, Integer, Name, StrictModel
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.stream import StreamSpec
 from sme_registry.spec.study import StudyPlan
 from sme_registry.spec.suite import Suite
 
@@ -117,6 +118,20 @@ class EnvFile(Envelope):
 
     spec: SMESpec
     fingerprint: Fingerprint
+
+
+class StreamFile(Envelope):
+    """A stream's file: `specs/streams/*.json`, or what `sme_registry.save` writes.
+
+    Attributes:
+      fingerprints: of each phase's spec, in order.
+    """
+
+    content = "stream"
+    remedy = "save the changed stream as a new file, in Python `sme_registry.save(stream, path)`"
+
+    stream: StreamSpec
+    fingerprints: Annotated[tuple[Fingerprint, ...], Field(strict=False, max_length=1000)]
 
 
 class SuiteFile(Envelope):

@@ -1,24 +1,29 @@
-"""`resolve`: from the name of a task (an id, a path, a digest) to its `SMESpec`."""
+"""From the name of a task or stream (an id, a path, a digest) to its `SMESpec` or `StreamSpec`."""
 
 from __future__ import annotations
 
 import difflib
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sme_registry.errors import MalformedDocumentError, UnknownNameError
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
-from sme_registry.spec.envelope import EnvFile, Fingerprint, SuiteFile
+from sme_registry.spec.envelope import EnvFile, Fingerprint, StreamFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec, SpecLike, as_spec
+from sme_registry.spec.stream import StreamLike, StreamSpec, as_stream
 
 _HEX_DIGITS = 12  # fewest digits that name a spec
 
 # Specs registered in this process, by id; see `registration.register`.
 registered: dict[str, SMESpec] = {}
+registered_streams: dict[str, StreamSpec] = {}
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,19 @@ class ResolvedSpec:
     def derive(self, **overrides: Any) -> ResolvedSpec:
         """The derived spec; it has no published numbers, unless nothing is overridden."""
         return ResolvedSpec(self.spec.derive(**overrides)) if overrides else self
+
+
+@dataclass(frozen=True)
+class ResolvedStream:
+    """A stream, and what its file publishes about the numbers of its phases.
+
+    Attributes:
+      stream: the stream.
+      fingerprints: of each phase's spec; empty where the stream has no file.
+    """
+
+    stream: StreamSpec
+    fingerprints: tuple[Fingerprint, ...] = ()
 
 
 def resolve(task: SpecLike) -> ResolvedSpec:
@@ -59,16 +77,81 @@ def resolve(task: SpecLike) -> ResolvedSpec:
     if isinstance(task, os.PathLike) or is_path(name):
         file = read_env_file(name)
         return ResolvedSpec(file.spec.named(file.name), file.fingerprint)
-    short = name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
-    full = f"{catalogue.NAMESPACE}/{short}"
-    for env_id in registered:
-        if full in (env_id, env_id.rsplit("-v", 1)[0]):
-            return ResolvedSpec(registered[env_id])
+    short = _short(name)
+    own = _registered(short, registered)
+    if own is not None:
+        return ResolvedSpec(own)
     if short.startswith(("sha256:", "sha256-")):
-        return _by_content(short)
+        return _by_content(short, known_specs())
     refuse_symmetric_name(short)
     registered_names = [env_id.removeprefix(f"{catalogue.NAMESPACE}/") for env_id in registered]
-    return _of_file(catalogue.find(EnvFile, short, registered_names))
+    others = [*registered_names, *catalogue.names(StreamFile)]
+    return _of_file(catalogue.find(EnvFile, short, others))
+
+
+def resolve_stream(stream: StreamLike) -> ResolvedStream:
+    """The stream of a name, as `resolve` finds the spec of one.
+
+    Args:
+      stream: a stream; its fields as a mapping; an id (`SME/Switch5-v1`, `SME/StreamSwitch5-v1`,
+        `Switch5`); a name by content, a digest or a prefix of one; or the path of a file.
+
+    Raises:
+      UnknownNameError: no stream has this name; the message suggests the nearest.
+      SpecError: a file or mapping is not a valid stream.
+    """
+    if not isinstance(stream, str | os.PathLike):
+        return ResolvedStream(as_stream(stream))
+    name = str(stream)
+    if isinstance(stream, os.PathLike) or is_path(name):
+        file = StreamFile.read(name)
+        return ResolvedStream(file.stream.named(file.name), file.fingerprints)
+    short = _short(name)
+    own = _registered(short, registered_streams)
+    if own is not None:
+        return ResolvedStream(own)
+    if short.startswith(("sha256:", "sha256-")):
+        return _by_content(short, known_streams())
+    refuse_symmetric_name(short)
+    return _of_stream_file(catalogue.find(StreamFile, short.removeprefix(catalogue.STREAM)))
+
+
+def names_stream(value: Any) -> bool:
+    """Whether a value is a stream, or the name, path or content of one, rather than of a task.
+
+    A name that nothing has is none of a stream: `resolve` then says which are near.
+    """
+    if not isinstance(value, str | os.PathLike):
+        return isinstance(value, StreamSpec) or (isinstance(value, dict) and "phases" in value)
+    name = str(value)
+    if isinstance(value, os.PathLike) or is_path(name):
+        data = read_json(name)
+        return isinstance(data, dict) and StreamFile.content in data
+    short = _short(name)
+    if _registered(short, registered_streams) is not None:
+        return True
+    if short.startswith(("sha256:", "sha256-")):
+        digits = short[len("sha256:") :].partition("-v")[0].lower()
+        return len(digits) >= _HEX_DIGITS and any(
+            digest.removeprefix("sha256:").startswith(digits) for digest in known_streams()
+        )
+    short = re.sub(r"-v\d+$", "", short).removesuffix(catalogue.SYMMETRIC)
+    streams = {re.sub(r"-v\d+$", "", known) for known in catalogue.names(StreamFile)}
+    return short in streams or short.removeprefix(catalogue.STREAM) in streams
+
+
+def _short(name: str) -> str:
+    """An id without the module and the namespace before it."""
+    return name.removeprefix("sme_registry:").removeprefix(f"{catalogue.NAMESPACE}/")
+
+
+def _registered(short: str, known: Mapping[str, _T]) -> _T | None:
+    """What is registered in this process under an id, with or without its version."""
+    full = f"{catalogue.NAMESPACE}/{short}"
+    for env_id, document in known.items():
+        if full in (env_id, env_id.rsplit("-v", 1)[0]):
+            return document
+    return None
 
 
 def refuse_symmetric_name(name: str) -> None:
@@ -79,7 +162,8 @@ def refuse_symmetric_name(name: str) -> None:
     short = re.sub(r"-v\d+$", "", name)
     if short.endswith(catalogue.SYMMETRIC):
         task = short.removesuffix(catalogue.SYMMETRIC)
-        resolve(task)  # raises where this is unknown, too
+        if not names_stream(task):
+            resolve(task)  # raises where this is unknown, too
         raise UnknownNameError(
             f"{name!r}: stands for environments of the task {task!r} with actions in [−1, 1], not "
             f"for a task. Use {task!r}, and action_range='symmetric' where actions are meant."
@@ -129,8 +213,20 @@ def known_specs() -> dict[str, ResolvedSpec]:
     return known
 
 
-def _by_content(name: str) -> ResolvedSpec:
-    """The only known spec whose digest begins with the digits of `sha256:…`, of any version."""
+def known_streams() -> dict[str, ResolvedStream]:
+    """Digest → stream: of the catalogue, and of streams registered here."""
+    known = {file.digest: _of_stream_file(file) for file in catalogue.entries(StreamFile)}
+    for stream in registered_streams.values():
+        known.setdefault(stream.digest, ResolvedStream(stream))
+    return known
+
+
+def _of_stream_file(file: StreamFile) -> ResolvedStream:
+    return ResolvedStream(file.stream, file.fingerprints)
+
+
+def _by_content(name: str, documents: Mapping[str, _T]) -> _T:
+    """The only known document whose digest begins with the digits of `sha256:…`, of any version."""
     digits, _, version = name[len("sha256:") :].lower().partition("-v")
     versions = {str(file.version) for file in catalogue.entries(EnvFile)}
     if version and version not in versions:
@@ -140,7 +236,7 @@ def _by_content(name: str) -> ResolvedSpec:
         )
     if len(digits) < _HEX_DIGITS:
         raise UnknownNameError(f"{name!r}: give at least {_HEX_DIGITS} hex digits of the digest.")
-    known = {digest.removeprefix("sha256:"): spec for digest, spec in known_specs().items()}
+    known = {digest.removeprefix("sha256:"): each for digest, each in documents.items()}
     matches = [spec for digest, spec in known.items() if digest.startswith(digits)]
     if len(matches) == 1:
         return matches[0]

@@ -15,7 +15,6 @@ from pydantic import (
     Field,
     PlainSerializer,
     PlainValidator,
-    PrivateAttr,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
@@ -26,6 +25,7 @@ from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
     Document,
     Integer,
+    NamedDocument,
     Real,
     SchemaVersion,
     plain_number,
@@ -219,7 +219,7 @@ class Setting(Document):
         return self
 
 
-class SMESpec(Setting):
+class SMESpec(Setting, NamedDocument):
     """A complete task: a setting of the axes and the seed of its draw.
 
     Equal specs have equal digests, and equal digests are equal specs. The name that a file or a
@@ -227,18 +227,6 @@ class SMESpec(Setting):
     """
 
     seed: Seed = 0
-    _name: str = PrivateAttr("")
-
-    @property
-    def name(self) -> str:
-        """What its file or registration calls it, such as `MyTask`; empty if nothing does."""
-        return self._name
-
-    def named(self, name: str) -> SMESpec:
-        """This spec under another name."""
-        copy = self.model_copy()
-        copy._name = name
-        return copy
 
     def _repr_html_(self) -> str:
         """A card with every field that is set, and the digest, for notebooks."""
@@ -249,17 +237,6 @@ class SMESpec(Setting):
         if self.team is not None:
             fields["team"] = f"{len(self.team.agents)} agents, {self.team.reward} reward"
         return pairs_html(catalogue.title(self), {**fields, "digest": self.digest})
-
-    def __eq__(self, other: object) -> bool:
-        """Whether all fields are equal; the name is none of them."""
-        if not isinstance(other, SMESpec):
-            return NotImplemented
-        return self.__dict__ == other.__dict__
-
-    @property
-    def content_name(self) -> str:
-        """`sha256-` and the first 12 hex digits of the digest: the name by content."""
-        return self.digest.replace(":", "-")[: len("sha256-") + 12]
 
     def derive(self, **overrides: Any) -> SMESpec:
         """This spec with some fields changed: another task, with another digest.

@@ -1,7 +1,13 @@
 """From a spec to numbers and equations: the NumPy definition of every task."""
 
 from sme_registry.task.draw import Layer
-from sme_registry.task.loading import load_spec, load_task, materialize
+from sme_registry.task.loading import (
+    load_spec,
+    load_stream,
+    load_task,
+    materialize,
+    materialize_stream,
+)
 from sme_registry.task.step import Step, observe, step
 from sme_registry.task.task import Task
 
@@ -10,8 +16,10 @@ __all__ = [
     "Step",
     "Task",
     "load_spec",
+    "load_stream",
     "load_task",
     "materialize",
+    "materialize_stream",
     "observe",
     "step",
 ]

@@ -1,4 +1,4 @@
-"""From a name or a spec to a drawn task: `materialize`, `load_spec` and `load_task`.
+"""From a name or a spec to a drawn task: `materialize`, `load_spec`, `load_task`; and of streams.
 
 A digest fixes a spec but not the drawn numbers, so a file also publishes a fingerprint of them.
 It is checked where the file is named: `load_spec` and `load_task` draw the task and compare. A spec
@@ -10,8 +10,9 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from sme_registry.spec import Fingerprint, SMESpec, SpecLike, as_spec
-from sme_registry.spec.resolve import resolve
+from sme_registry.errors import FingerprintMismatchError
+from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamLike, StreamSpec, as_spec
+from sme_registry.spec.resolve import resolve, resolve_stream
 from sme_registry.task import draw, memory
 from sme_registry.task.fingerprint import check_fingerprint
 from sme_registry.task.task import Task
@@ -78,6 +79,51 @@ def load_spec(task: SpecLike) -> SMESpec:
     if resolved.fingerprint is not None:
         materialize(resolved.spec, resolved.fingerprint)
     return resolved.spec
+
+
+def materialize_stream(
+    stream: StreamSpec, fingerprints: tuple[Fingerprint, ...] = ()
+) -> tuple[Task, ...]:
+    """Draw the task of each piece of a cycle; pieces with equal specs share one.
+
+    Args:
+      stream: the stream.
+      fingerprints: published numbers of each phase's spec; empty compares with nothing.
+
+    Raises:
+      ResourceLimitError: all phases together would not fit in memory.
+      FingerprintMismatchError: a phase's numbers differ from the published ones; it is named.
+    """
+    specs = dict.fromkeys(piece.spec for piece in stream.pieces)
+    held = sum(map(memory.parameter_bytes, specs))
+    memory.refuse_above_limit(
+        held + max(map(memory.peak_bytes, specs)),
+        f"A stream of {len(stream.phases)} phases with {len(specs)} different tasks",
+        "Use fewer phases or increments, or smaller tasks.",
+    )
+    tasks = {spec: materialize(spec) for spec in specs}
+    for index, (phase, published) in enumerate(zip(stream.phases, fingerprints, strict=False)):
+        try:
+            check_fingerprint(published, tasks[phase.spec])
+        except FingerprintMismatchError as error:
+            raise FingerprintMismatchError(f"phases.{index}: {error}") from None
+    return tuple(tasks[piece.spec] for piece in stream.pieces)
+
+
+def load_stream(stream: StreamLike) -> StreamSpec:
+    """The stream of a name; one of a file is drawn to check the file's fingerprints.
+
+    Args:
+      stream: a stream, its fields, an id, a digest, or the path of a file.
+
+    Raises:
+      UnknownNameError, SpecError: no such stream, or a field is out of range.
+      ResourceLimitError, FingerprintMismatchError: see `materialize_stream`.
+    """
+    resolved = resolve_stream(stream)
+    if resolved.fingerprints:
+        materialize_stream(resolved.stream, resolved.fingerprints)
+    return resolved.stream
 
 
 def _draw(spec: SMESpec) -> Task:

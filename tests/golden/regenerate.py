@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.io import write_atomically
-from sme_registry.spec import EnvFile, ProtocolFile, StudyFile, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, ProtocolFile, StreamFile, StudyFile, SuiteFile, catalogue
 from sme_registry.task import load_task
 
 FOLDER = Path(__file__).parent
@@ -33,7 +33,7 @@ def digests() -> dict[str, dict[str, str]]:
     """The digest of every name in the catalogue, by kind."""
     return {
         kind.content: {file.versioned_name: file.digest for file in catalogue.entries(kind)}
-        for kind in (EnvFile, SuiteFile, ProtocolFile, StudyFile)
+        for kind in (EnvFile, SuiteFile, ProtocolFile, StudyFile, StreamFile)
     }
 
 

@@ -1,0 +1,259 @@
+"""`StreamSpec`: tasks in order, each for a number of environment steps; METHOD, section 7.
+
+A stream is piecewise constant: in each *piece* one spec is in force, so optimum and regret are
+exact. A phase is one piece, or n short ones whose `rotation` moves in equal increments (drift).
+"""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_right
+from functools import lru_cache
+from itertools import accumulate
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeAlias
+
+from pydantic import Field, model_validator
+
+from sme_registry.errors import SpecError, UnknownNameError
+from sme_registry.spec.document import (
+    Digest,
+    Integer,
+    NamedDocument,
+    Real,
+    SchemaVersion,
+    StrictModel,
+)
+from sme_registry.spec.sme_spec import FULL_TURN, SMESpec
+from sme_registry.spec.validation_errors import short_repr
+
+MAX_PIECES = 10_000  # of one cycle
+_SHARED = ("state_dim", "action_dim", "horizon")
+
+
+class Drift(StrictModel):
+    """A rotation that moves during a phase, from its spec's angle, in equal increments.
+
+    Attributes:
+      rotation: the angle θ towards which it moves, radians in [0, 2π]; 2π is a full turn from 0.
+      increments: n. Piece i of n has the angle θ₀ + i (θ − θ₀)/n, so that the first piece is the
+        phase's own spec, and the next phase may go on at θ.
+    """
+
+    rotation: Annotated[Real, Field(ge=0, le=FULL_TURN, description="θ to move towards, radians")]
+    increments: Annotated[Integer, Field(ge=2, le=MAX_PIECES)]
+
+
+class Phase(StrictModel):
+    """A task for a number of environment steps.
+
+    Attributes:
+      spec: the task. A name, id, digest or path of one is read as the spec that it stands for.
+      digest: of the spec; filled in, and refused where it is another's.
+      steps: environment steps, counted across episodes.
+      drift: how the spec's rotation moves within the phase; None where it does not.
+    """
+
+    spec: SMESpec
+    digest: Digest | None = None
+    steps: Annotated[Integer, Field(ge=1, le=10**12)]
+    drift: Drift | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_to_spec(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        named = data.get("spec", data.get("digest"))
+        if not isinstance(named, str | os.PathLike):
+            return data
+        from sme_registry.spec.resolve import resolve
+
+        try:
+            return {**data, "spec": resolve(named).spec.named("")}
+        except (UnknownNameError, SpecError) as error:
+            raise ValueError(f"spec: {error}") from None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.digest is None:
+            object.__setattr__(self, "digest", self.spec.digest)
+        if self.digest != self.spec.digest:
+            raise ValueError(
+                f"digest={self.digest!r}: this spec has {self.spec.digest!r}. One of them was "
+                "changed later. Remove the digest to keep the spec, or the spec to take the one "
+                "with this digest."
+            )
+        if self.drift is None:
+            return self
+        if self.drift.increments > self.steps:
+            raise ValueError(
+                f"drift.increments={self.drift.increments}: must be at most steps={self.steps}. "
+                "Use fewer increments or more steps."
+            )
+        if self.drift.rotation == self.spec.rotation:
+            raise ValueError(
+                f"drift.rotation={self.drift.rotation}: is the angle of the spec. Choose another "
+                "one, or leave drift out."
+            )
+        try:
+            self.spec.derive(rotation=1.0)
+        except SpecError as error:
+            raise ValueError(f"drift: {str(error).removeprefix('SMESpec: ')}") from None
+        return self
+
+
+class Piece(NamedTuple):
+    """A part of a cycle in which one spec is in force.
+
+    Attributes:
+      phase: the index of its phase.
+      spec: the spec.
+      start: environment steps of the cycle before it.
+    """
+
+    phase: int
+    spec: SMESpec
+    start: int
+
+
+class StreamSpec(NamedDocument):
+    """Phases in order, gone through `cycles` times.
+
+    The *lifetime* counts environment steps across episodes. After the last cycle, the last phase
+    goes on. Phases have the same state and action dimensions and horizon, so that one agent can
+    live through all of them.
+
+    Attributes:
+      phases: in order.
+      cycles: how often the phases are gone through.
+      switch: when a phase that is over is left: at the next reset ("episode"), or at once ("step");
+        then the state and r_cum carry over.
+      observes_phase: whether the observation ends with the phase's index, one-hot.
+    """
+
+    schema_version: SchemaVersion = 1
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1, max_length=1000, strict=False)]
+    cycles: Annotated[Integer, Field(ge=1, le=10**6)] = 1
+    switch: Literal["episode", "step"] = "episode"
+    observes_phase: bool = False
+
+    @model_validator(mode="after")
+    def _phases_fit_together(self) -> Self:
+        first = self.phases[0].spec
+        for index, phase in enumerate(self.phases):
+            if phase.spec.team is not None:
+                raise ValueError(
+                    f"phases.{index}.spec: is for a team of {len(phase.spec.team.agents)} agents, "
+                    "and streams are for a single one. Remove its team."
+                )
+            for field in _SHARED:
+                one, other = getattr(first, field), getattr(phase.spec, field)
+                if one != other:
+                    raise ValueError(
+                        f"phases.0 and phases.{index}: their specs have {field}={one} and {other}: "
+                        "must be equal, since one agent lives through both. Change one of them."
+                    )
+        pieces = sum(phase.drift.increments if phase.drift else 1 for phase in self.phases)
+        if pieces > MAX_PIECES:
+            raise ValueError(
+                f"phases: have {pieces:,} pieces together: must be at most {MAX_PIECES:,}. Use "
+                "fewer increments."
+            )
+        return self
+
+    @property
+    def state_dim(self) -> int:
+        """S of every phase."""
+        return self.phases[0].spec.state_dim
+
+    @property
+    def action_dim(self) -> int:
+        """A of every phase."""
+        return self.phases[0].spec.action_dim
+
+    @property
+    def horizon(self) -> int:
+        """T of every phase."""
+        return self.phases[0].spec.horizon
+
+    @property
+    def observation_dim(self) -> int:
+        """S + 2, and one for each phase where the agent observes it."""
+        return self.state_dim + 2 + (len(self.phases) if self.observes_phase else 0)
+
+    @property
+    def cycle_steps(self) -> int:
+        """Environment steps of one cycle."""
+        return sum(phase.steps for phase in self.phases)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the whole stream."""
+        return self.cycles * self.cycle_steps
+
+    @property
+    def pieces(self) -> tuple[Piece, ...]:
+        """The pieces of one cycle, in order."""
+        return _pieces(self.phases)[0]
+
+    def piece_at(self, lifetime: int) -> int:
+        """The index of the piece in force after so many environment steps; the last one at the end.
+
+        Args:
+          lifetime: environment steps since the life began, at least 0.
+        """
+        if lifetime >= self.steps:
+            return len(self.pieces) - 1
+        return bisect_right(_pieces(self.phases)[1], lifetime % self.cycle_steps) - 1
+
+    def next_switch(self, lifetime: int) -> int | None:
+        """The lifetime at which the piece in force is over; None in the last piece of the life."""
+        if lifetime >= self.steps:
+            return None
+        cycle, inside = divmod(lifetime, self.cycle_steps)
+        starts = _pieces(self.phases)[1]
+        after = bisect_right(starts, inside)
+        end = starts[after] if after < len(starts) else self.cycle_steps
+        switch = cycle * self.cycle_steps + end
+        return switch if switch < self.steps else None
+
+
+StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]
+"""A stream: itself, its fields, an id, a digest, or the path of its file."""
+
+
+def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
+    """A stream from itself or from plain data.
+
+    Raises:
+      SpecError: a field is wrong, missing or unknown, or `value` is neither.
+    """
+    if isinstance(value, StreamSpec):
+        return value
+    if isinstance(value, dict):
+        return StreamSpec.from_dict(value)
+    raise SpecError(f"{short_repr(value)}: must be a StreamSpec or a mapping of its fields.")
+
+
+@lru_cache(maxsize=32)
+def _pieces(phases: tuple[Phase, ...]) -> tuple[tuple[Piece, ...], list[int]]:
+    """The pieces of a cycle, and where each begins."""
+    begins = accumulate((phase.steps for phase in phases), initial=0)
+    pieces = tuple(
+        Piece(index, spec, begin + offset)
+        for index, (phase, begin) in enumerate(zip(phases, begins, strict=False))
+        for spec, offset in _pieces_of(phase)
+    )
+    return pieces, [piece.start for piece in pieces]
+
+
+def _pieces_of(phase: Phase) -> list[tuple[SMESpec, int]]:
+    """The specs of a phase's pieces, and the steps of the phase before each."""
+    if phase.drift is None:
+        return [(phase.spec, 0)]
+    n, begin = phase.drift.increments, phase.spec.rotation
+    move = phase.drift.rotation - begin
+    return [
+        (phase.spec.derive(rotation=(begin + move * i / n) % FULL_TURN), phase.steps * i // n)
+        for i in range(n)
+    ]

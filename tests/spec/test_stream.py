@@ -1,0 +1,222 @@
+"""Streams: what is valid, what is equal, which piece is in force, and files of streams."""
+
+import copy
+import json
+import math
+import pickle
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import sme_registry
+from sme_registry.errors import (
+    DigestMismatchError,
+    FingerprintMismatchError,
+    ResourceLimitError,
+    SMEError,
+    SpecError,
+    UnknownNameError,
+)
+from sme_registry.spec import SMESpec, StreamFile, StreamSpec, catalogue
+from sme_registry.task import materialize, materialize_stream
+
+SMALL = {"state_dim": 4, "action_dim": 2}
+DRIFT = {"rotation": 1.0, "increments": 4}
+
+
+def stream(*phases, **fields):
+    return StreamSpec.from_dict({"phases": list(phases), **fields})
+
+
+def phase(steps, drift=None, **spec):
+    return {"spec": SMALL | spec, "steps": steps, **({"drift": drift} if drift else {})}
+
+
+@st.composite
+def streams(draw):
+    phases = [
+        phase(
+            draw(st.integers(4, 50)),
+            draw(st.none() | st.just(DRIFT) | st.just({"rotation": 2 * math.pi, "increments": 3})),
+            seed=draw(st.integers(0, 3)),
+            k=draw(st.integers(1, 5)),
+        )
+        for _ in range(draw(st.integers(1, 4)))
+    ]
+    return stream(
+        *phases,
+        cycles=draw(st.integers(1, 3)),
+        switch=draw(st.sampled_from(["episode", "step"])),
+        observes_phase=draw(st.booleans()),
+    )
+
+
+@given(streams(), streams())
+def test_streams_are_equal_exactly_where_their_digests_are(one, other):
+    assert (one == other) == (one.digest == other.digest)
+    for twin in (
+        StreamSpec.from_dict(json.loads(one.canonical_json())),
+        pickle.loads(pickle.dumps(one)),
+        copy.deepcopy(one),
+        one.named("other"),
+    ):
+        assert twin == one
+        assert hash(twin) == hash(one)
+        assert twin.pieces == one.pieces
+
+
+@given(streams(), st.data())
+def test_the_piece_in_force_is_the_one_whose_steps_include_the_lifetime(spec, data):
+    in_force = [
+        index
+        for index, (piece, after) in enumerate(
+            pairwise([*spec.pieces, spec.pieces[-1]._replace(start=spec.cycle_steps)])
+        )
+        for _ in range(after.start - piece.start)
+    ] * spec.cycles
+    assert len(in_force) == spec.steps
+    lifetime = data.draw(st.integers(0, spec.steps + 10))
+    expected = in_force[lifetime] if lifetime < spec.steps else len(spec.pieces) - 1
+    assert spec.piece_at(lifetime) == expected
+    switch = spec.next_switch(lifetime)
+    later = range(lifetime + 1, spec.steps)
+    boundaries = [i for i in later if (i % spec.cycle_steps) in {p.start for p in spec.pieces}]
+    assert switch == (boundaries[0] if boundaries else None)
+
+
+def test_a_drift_is_short_phases_in_equal_increments_of_the_angle():
+    spec = stream(phase(10), phase(102, {"rotation": 2 * math.pi, "increments": 4}, rotation=1.0))
+    one, *drifting = spec.pieces
+    assert (one.phase, one.start, one.spec.rotation) == (0, 0, 0.0)
+    assert [piece.start for piece in drifting] == [10, 35, 61, 86]
+    angles = [piece.spec.rotation for piece in drifting]
+    np.testing.assert_allclose(angles, 1.0 + np.arange(4) / 4 * (2 * math.pi - 1.0), rtol=1e-15)
+    assert drifting[0].spec == spec.phases[1].spec
+
+
+def test_a_drift_over_the_full_turn_goes_on_from_zero():
+    spec = stream(phase(4, {"rotation": 0.0, "increments": 4}, rotation=6.0))
+    assert all(0 <= piece.spec.rotation < 2 * math.pi for piece in spec.pieces)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"phases": []}, "phases=[]: must be a list of 1 to 1000"),
+        ({"phases": [phase(0)]}, "phases.0.steps=0: must be an integer in [1"),
+        ({"phases": [phase(1)], "cycles": 0}, "cycles=0"),
+        ({"phases": [phase(1), {"spec": "Defult", "steps": 1}]}, "phases.1.spec: 'Defult'"),
+        (
+            {"phases": [phase(1), phase(1), phase(1, state_dim=5)]},
+            "phases.0 and phases.2: their specs have state_dim=4 and 5",
+        ),
+        ({"phases": [phase(1), phase(1, action_dim=3)]}, "action_dim=2 and 3"),
+        ({"phases": [phase(1), phase(1, horizon=9)]}, "horizon=100 and 9"),
+        ({"phases": [phase(1, rotation=7.0)]}, "phases.0.spec.rotation=7.0: must be a finite"),
+        (
+            {"phases": [phase(9, DRIFT, state_dim=1)]},
+            "phases.0.drift: rotation=1.0: must be 0, because a rotation needs two",
+        ),
+        ({"phases": [phase(3, DRIFT)]}, "phases.0.drift.increments=4: must be at most steps=3"),
+        (
+            {"phases": [phase(9, {"rotation": 0.0, "increments": 2})]},
+            "phases.0.drift.rotation=0.0: is the angle of the spec",
+        ),
+        (
+            {"phases": [phase(9, {"rotation": 6.3, "increments": 2})]},
+            "phases.0.drift.rotation=6.3: must be a finite number in [0",
+        ),
+        ({"phases": [{"spec": "Team2", "steps": 1}]}, "phases.0.spec: is for a team of 2"),
+        (
+            {"phases": [phase(1), {**phase(1), "digest": "sha256:" + "0" * 64}]},
+            "phases.1.digest='sha256:000",
+        ),
+        ({"phases": [{"digest": "sha256:" + "0" * 64, "steps": 1}]}, "phases.0.spec: 'sha256:000"),
+        ({"phases": [{**phase(1), "stps": 1}]}, "phases.0.stps=1: unknown field. Did you mean"),
+        ({"phases": [phase(1)], "swich": "step"}, "swich='step': unknown field. Did you mean"),
+        ({"phases": [phase(20_000, {"rotation": 1.0, "increments": 9_999})] * 2}, "19,998 pieces"),
+    ],
+)
+def test_a_bad_stream_is_refused_with_the_phase_that_is_wrong(fields, message):
+    with pytest.raises(SpecError) as error:
+        StreamSpec.from_dict(fields)
+    assert message in str(error.value)
+
+
+def test_a_phase_is_given_in_full_by_name_or_by_digest():
+    default = SMESpec()
+    spec = stream(
+        {"spec": "Default", "steps": 1},
+        {"spec": default, "steps": 2},
+        {"spec": default.digest, "steps": 3},
+        {"digest": default.digest, "steps": 4},
+        {"spec": default.to_dict(), "digest": default.digest, "steps": 5},
+    )
+    assert {each.spec for each in spec.phases} == {default}
+    assert {each.digest for each in spec.phases} == {default.digest}
+    assert json.loads(spec.canonical_json())["phases"][0]["spec"] == default.to_dict()
+
+
+def test_a_stream_is_saved_whole_and_loaded_by_path_name_and_content(tmp_path):
+    spec = stream(phase(10, seed=1), phase(20, DRIFT), cycles=2)
+    path = sme_registry.save(spec, tmp_path / "mine.json", description="two phases")
+    loaded = sme_registry.load(path)
+    assert loaded == spec
+    assert loaded.name == "mine"
+    released = sme_registry.load("SME/Switch5-v1", StreamSpec)
+    for name in ("Switch5", "SME/StreamSwitch5-v1", released.digest, released.content_name):
+        assert sme_registry.load(name) == released
+    with pytest.raises(UnknownNameError, match="Did you mean 'Switch5-v1'"):
+        sme_registry.load("Swich5")
+    with pytest.raises(UnknownNameError, match="no spec"):
+        sme_registry.load("Switch5", SMESpec)
+
+
+def test_a_changed_file_is_refused_with_the_phase_that_differs(tmp_path):
+    path = sme_registry.save(stream(phase(10, seed=1), phase(20)), tmp_path / "mine.json")
+    file = json.loads(path.read_text())
+    for change, error, message in [
+        (("stream", "phases", 1, "spec", "k", 2), SMEError, "phases.1.digest"),
+        (("stream", "cycles", 2), DigestMismatchError, "digest"),
+        (
+            ("fingerprints", 1, "optimal_action", 0, 0, 0.5),
+            FingerprintMismatchError,
+            "phases.1: fingerprint.optimal_action",
+        ),
+    ]:
+        changed = copy.deepcopy(file)
+        *place, name, value = change
+        inner = changed
+        for key in place:
+            inner = inner[key]
+        inner[name] = value
+        path.write_text(json.dumps(changed))
+        with pytest.raises(error, match=message):
+            sme_registry.load(path)
+
+
+def test_more_memory_than_the_limit_for_all_phases_together_is_refused(monkeypatch):
+    spec = stream(*(phase(1, seed=seed, complexity=3) for seed in range(40)))
+    one = stream(phase(1, complexity=3))
+    monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", "0.001")
+    assert len(materialize_stream(one)) == 1
+    with pytest.raises(ResourceLimitError, match="40 phases with 40 different tasks"):
+        materialize_stream(spec)
+
+
+def test_pieces_of_equal_specs_share_a_task():
+    spec = stream(phase(5, seed=1), phase(5, seed=2), phase(5, seed=1))
+    one, two, again = materialize_stream(spec)
+    assert one is again
+    assert one.spec != two.spec
+    np.testing.assert_array_equal(one.W, materialize(spec.phases[0].spec).W)
+
+
+@pytest.mark.parametrize("file", catalogue.entries(StreamFile), ids=lambda file: file.name)
+def test_released_streams_draw_their_published_numbers(file):
+    assert sme_registry.load(file.versioned_name) == file.stream
+    assert len(file.fingerprints) == len(file.stream.phases)
+    assert file.stream.steps in (100_000, 120_000)
