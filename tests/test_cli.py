@@ -21,7 +21,6 @@ from sme_registry.cli import app
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
-    SMESpec,
     StreamFile,
     StudyFile,
     Suite,
@@ -410,7 +409,13 @@ class TestNew:
 class TestValidate:
     def test_each_kind_is_told_and_folders_are_searched(self) -> None:
         results = json.loads(good("validate", catalogue.spec_folder(), "--json").stdout)
-        assert {result["kind"] for result in results} == {"env", "suite", "protocol", "study"}
+        assert {result["kind"] for result in results} == {
+            "env",
+            "stream",
+            "suite",
+            "protocol",
+            "study",
+        }
         assert all(result["valid"] for result in results)
         assert len(results) == sum(len(catalogue.paths(kind)) for kind in KINDS)
 
