@@ -65,10 +65,13 @@ class Refusing:
     workers: int = 1
     jobs: list[Job] = field(default_factory=list)
     meanwhile: Any = None  # called with the number of jobs so far
+    while_waiting: Any = None  # called where no job is available
 
     def map(self, jobs: Iterator[Job | None], progress: Any) -> Iterator[Outcome]:
         for job in jobs:
-            assert job is not None
+            if job is None:
+                self.while_waiting()
+                continue
             self.jobs.append(job)
             if self.meanwhile is not None:
                 self.meanwhile(len(self.jobs))
@@ -77,7 +80,8 @@ class Refusing:
 
 def claimed(file: StudyFile, study: Path, **options: Any) -> list[Job]:
     """The jobs of a run, those of a program first."""
-    executor = Refusing(meanwhile=options.pop("meanwhile", None))
+    hooks = {name: options.pop(name, None) for name in ("meanwhile", "while_waiting")}
+    executor = Refusing(**hooks)
     run_study(
         file, study, executor=executor, console=Console(file=io.StringIO()), device="cpu", **options
     )
@@ -186,12 +190,18 @@ def test_cells_that_another_run_holds_are_left_to_it_and_the_rest_to_others(
 
 
 def test_while_another_run_claims_a_program_this_one_waits(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path)
-    claiming = ledger.claim_lock()
+    claiming = Ledger(tmp_path).claim_lock()
     assert claiming is not None
-    assert ledger.claim_lock() is None
-    claiming.release()
-    assert ledger.claim_lock() is not None
+    waited: list[bool] = []
+
+    def release() -> None:
+        waited.append(True)
+        claiming.release()
+
+    only = ["algorithm=PPO", "class=delayed"]
+    (job,) = claimed(plan_file(), tmp_path, only=only, while_waiting=release)
+    assert len(job.cells) == 3
+    assert waited == [True]
 
 
 @pytest.mark.parametrize(
