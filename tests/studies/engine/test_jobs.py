@@ -275,6 +275,7 @@ def test_a_saved_state_decides_which_cells_go_on_together(tmp_path: Path) -> Non
     keys = [of_group[i].digest for i in (6, 0, 3)]
     made_with = Programs(cells(file)).program(of_group[0]).made_with
     saved = ledger.state_path(keys)
+    assert saved != ledger.state_path(keys, made_with)  # others leave it as it is
     write_state(saved, {"cells": keys, **made_with}, {})
     write_state(ledger.state_path(keys[:2]), {"cells": keys[:2], **made_with, "lanes": 2}, {})
     (tmp_path / "states" / "broken.npz").write_bytes(b"PK")
