@@ -120,7 +120,7 @@ def evaluate_many(
     for index, (policy, task) in enumerate(policies):
         spec = load_spec(task)
         subjects.append((as_policy(policy, spec), spec))
-        groups.setdefault(_same_draw(spec), []).append(index)
+        groups.setdefault(same_draw(spec), []).append(index)
 
     reports: dict[int, EvaluationReport | PolicyError] = {}
     states = protocol.states_per_region * len(protocol.edges)
@@ -170,9 +170,15 @@ class _Batch(NamedTuple):
 _ErrorsByKey = dict[int | str, Errors]
 
 
-def _same_draw(spec: SMESpec) -> str:
+def same_draw(spec: SMESpec) -> str:
     """The same for specs whose states, optimal actions and references are the same."""
     return spec.derive(k=1, r_min=0.0, D=0.0, horizon=1).digest
+
+
+def versions_behind(oracle: Engine) -> dict[str, str]:
+    """The versions of the packages that an evaluation's numbers depend on."""
+    numba = ["numba"] if oracle.backend == "numba" else []
+    return versions(["numpy", "scipy", "gymnasium", *numba], if_imported=_POLICY_LIBRARIES)
 
 
 def _offset(progress: Progress | None, before: int, total: int) -> Progress:
@@ -224,15 +230,7 @@ def _evaluate_together(
                 regions=whole.regions,
                 references=whole.references,
                 agents=by_agent,
-                versions=versions(
-                    [
-                        "numpy",
-                        "scipy",
-                        "gymnasium",
-                        *(["numba"] if oracle.backend == "numba" else []),
-                    ],
-                    if_imported=_POLICY_LIBRARIES,
-                ),
+                versions=versions_behind(oracle),
             )
         )
     return reports

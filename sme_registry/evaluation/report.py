@@ -17,13 +17,14 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.io import read_json, require_packages, to_json, write_atomically
+from sme_registry.evaluation.report_file import ReportFile
+from sme_registry.io import require_packages, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel, refuse_other_digest
+from sme_registry.spec.document import Integer, Real, StrictModel
 
 if TYPE_CHECKING:
     import pandas
@@ -103,7 +104,7 @@ class AgentReport(StrictModel):
     references: dict[str, _Regions]
 
 
-class EvaluationReport(StrictModel):
+class EvaluationReport(ReportFile):
     """A policy in every region of a protocol, and the references on the same states.
 
     `print(report)` shows it as a table. For a team, `regions` and `references` are over all action
@@ -123,6 +124,8 @@ class EvaluationReport(StrictModel):
       agents: each agent of a team by its name, over the channels that it owns, in their order.
       versions: of Python and the packages that the numbers depend on.
     """
+
+    documents = ("spec", "protocol")
 
     schema_version: Literal[1] = 1
     policy: str
@@ -144,33 +147,6 @@ class EvaluationReport(StrictModel):
             if not plain[field]:
                 del plain[field]
         return plain
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a report.
-
-        Raises:
-          MalformedDocumentError: not readable, or not strict JSON.
-          SpecError: a field is wrong, missing or unknown.
-          DigestMismatchError: a digest does not match the spec or protocol in the file.
-        """
-        report = cls.from_dict(read_json(path), str(path))
-        for what in ("spec", "protocol"):
-            refuse_other_digest(
-                getattr(report, f"{what}_digest"),
-                getattr(report, what),
-                f"{path}: {what}_digest",
-                "Get the report from its source again, or repeat the evaluation.",
-            )
-        return report
-
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the report as JSON, completely or not at all.
-
-        Raises:
-          OptionError: it cannot be written; an existing file is unchanged.
-        """
-        return write_atomically(path, to_json(self.to_dict()))
 
     @property
     def title(self) -> str:
@@ -240,21 +216,6 @@ class EvaluationReport(StrictModel):
             f"<EvaluationReport: {self.policy} on {catalogue.title(self.spec)}, "
             f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}>"
         )
-
-    def _repr_html_(self) -> str:
-        """The table, for notebooks."""
-        from sme_registry.terminal.html import table_html
-
-        return table_html(self.table())
-
-    def __str__(self) -> str:
-        from rich.console import Console
-
-        # Wide, so that no column wraps; a table is only as wide as its content.
-        console = Console(file=io.StringIO(), width=1000, color_system=None)
-        with console.capture() as capture:
-            console.print(self.table())
-        return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
     def table(self) -> Table:
         """The report as a table of 80 columns: a column for each region, a row for each policy.

@@ -38,6 +38,7 @@ def as_policy(
     action_range: str | None = None,
     name: str | None = None,
     algorithm: str | None = None,
+    observed_phases: int = 0,
 ) -> Policy | TeamPolicy:
     """Prepare a policy for a task.
 
@@ -63,6 +64,7 @@ def as_policy(
         model's own action space, and "unit" for any other policy.
       name: what reports call it; None takes its name, or that of its file, algorithm or function.
       algorithm: the class of a .zip that does not tell it, as in `load_sb3`.
+      observed_phases: entries at the end of its observations for the phase of a stream, one-hot.
 
     A recurrent model is memoryless here: it acts from its initial state in each observation.
     `Policy.start` makes it keep its state, as `rollouts` does.
@@ -85,17 +87,21 @@ def as_policy(
         policy.check_team(spec)
         return policy if name is None else replace(policy, name=name)
     if spec.team is None:
-        return _prepare(policy, interface_of(spec), range_, name)
+        return _prepare(policy, interface_of(spec, observed_phases), range_, name)
     if isinstance(policy, Mapping):
         return _separate_policies(policy, spec, range_, name)
     return _shared_policy(policy, spec, range_, name)
 
 
-def interface_of(spec: SMESpec) -> Interface:
-    """The widths of a policy for a task; of a team's, for the one that all agents share."""
+def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
+    """The widths of a policy for a task; of a team's, for the one that all agents share.
+
+    `observed_phases` are the phases of a stream that the policy observes, for a single agent.
+    """
     if spec.team is None:
         S, A = spec.state_dim, spec.action_dim
-        return Interface(S + 2, A, f"state_dim={S}, action_dim={A}")
+        observed = f" and {observed_phases} observed phases" if observed_phases else ""
+        return Interface(S + 2 + observed_phases, A, f"state_dim={S}, action_dim={A}{observed}")
     agents = draw.agents(spec)
     observation_dim = spec.state_dim + 2 + len(agents)
     action_dim = max(agent.action_dim for agent in agents)

@@ -1,0 +1,76 @@
+"""`ReportFile`: what reports have in common: files, the digests in them, and their tables as text."""
+
+from __future__ import annotations
+
+import io
+import os
+from abc import abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from sme_registry.io import read_json, to_json, write_atomically
+from sme_registry.spec.document import StrictModel, refuse_other_digest
+
+if TYPE_CHECKING:
+    from sme_registry.terminal import Table
+
+
+class ReportFile(StrictModel):
+    """A report that a file can hold, and that prints as a table.
+
+    Attributes:
+      documents: the fields that are documents; a field `<document>_digest` has the digest of each.
+    """
+
+    documents: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a report.
+
+        Raises:
+          MalformedDocumentError: not readable, or not strict JSON.
+          SpecError: a field is wrong, missing or unknown.
+          DigestMismatchError: a digest is not that of its document in the file.
+        """
+        report = cls.from_dict(read_json(path), str(path))
+        for what in cls.documents:
+            refuse_other_digest(
+                getattr(report, f"{what}_digest"),
+                getattr(report, what),
+                f"{path}: {what}_digest",
+                "Get the report from its source again, or repeat the evaluation.",
+            )
+        return report
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write the report as JSON, completely or not at all.
+
+        Raises:
+          OptionError: it cannot be written; an existing file is unchanged.
+        """
+        return write_atomically(path, to_json(self.to_dict()))
+
+    @abstractmethod
+    def table(self) -> Table:
+        """The report as a table."""
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        from sme_registry.terminal.html import table_html
+
+        return table_html(self.table())
+
+    def __str__(self) -> str:
+        return as_text(self.table())
+
+
+def as_text(table: Table) -> str:
+    """A table as plain text."""
+    from rich.console import Console
+
+    # Wide, so that no column wraps; a table is only as wide as its content.
+    console = Console(file=io.StringIO(), width=1000, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines())
