@@ -1,5 +1,13 @@
-"""Evaluation within and out of distribution: a policy and a task to a report."""
+"""Evaluation within and out of distribution: policies and tasks, or a stream, to a report."""
 
+from sme_registry.evaluation.continual import (
+    StreamReport,
+    across_seeds,
+    dynamic_regret,
+    evaluate_stream,
+    fresh_per_phase,
+    frozen_after_first,
+)
 from sme_registry.evaluation.evaluate import evaluate, evaluate_many, resolve_protocol
 from sme_registry.evaluation.policies import (
     OfflinePolicy,
@@ -26,10 +34,16 @@ __all__ = [
     "Perceptron",
     "Policy",
     "RegionReport",
+    "StreamReport",
     "TeamPolicy",
+    "across_seeds",
     "as_policy",
+    "dynamic_regret",
     "evaluate",
     "evaluate_many",
+    "evaluate_stream",
+    "fresh_per_phase",
+    "frozen_after_first",
     "interface_of",
     "load_sb3",
     "reference_policy",

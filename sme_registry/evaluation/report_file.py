@@ -1,4 +1,4 @@
-"""`ReportFile`: what reports have in common: files, the digests in them, and their tables as text."""
+"""`ReportFile`: what reports have in common: files, digests in them, and tables as text."""
 
 from __future__ import annotations
 

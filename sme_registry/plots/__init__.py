@@ -1,4 +1,4 @@
-"""Figures: regret during training, decay outside the training cube, similarity over the plane.
+"""Figures: regret in training, decay outside the cube, similarity over the plane, streams.
 
 Each function returns a Matplotlib `Figure`. It writes a file where it gets a `path`, PNG, PDF or
 SVG by its ending, and draws in the caller's axes where it gets `ax`. `save_figure` writes any
@@ -8,6 +8,22 @@ figure.
 from sme_registry.plots.curves import learning_curve, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
+from sme_registry.plots.streams import (
+    dynamic_regret_curve,
+    performance_curve,
+    plasticity_curve,
+    retention_map,
+)
 from sme_registry.plots.style import save_figure
 
-__all__ = ["decay_curve", "learning_curve", "save_figure", "similarity_map", "training_curve"]
+__all__ = [
+    "decay_curve",
+    "dynamic_regret_curve",
+    "learning_curve",
+    "performance_curve",
+    "plasticity_curve",
+    "retention_map",
+    "save_figure",
+    "similarity_map",
+    "training_curve",
+]

@@ -22,6 +22,7 @@ from sme_registry.spec.envelope import (
     SuiteFile,
 )
 from sme_registry.spec.sme_spec import SMESpec
+from sme_registry.spec.stream import StreamSpec
 
 NAMESPACE = "SME"
 SYMMETRIC = "Symmetric"
@@ -114,24 +115,26 @@ def find(kind: type[_E], name: str, others: Iterable[str] = ()) -> _E:
     )
 
 
-def unique_name(spec: SMESpec) -> str:
-    """A task's name in the catalogue (`Default-v1`), else its name by content: only its own."""
-    released = {file.digest: file.versioned_name for file in entries(EnvFile)}
-    return released.get(spec.digest, spec.content_name)
+def unique_name(document: SMESpec | StreamSpec) -> str:
+    """The name of a task or a stream in the catalogue (`Default-v1`), else its name by content."""
+    kind = StreamFile if isinstance(document, StreamSpec) else EnvFile
+    released = {file.digest: file.versioned_name for file in entries(kind)}
+    return released.get(document.digest, document.content_name)
 
 
-def title(spec: SMESpec) -> str:
-    """What tables and figures call a task.
+def title(document: SMESpec | StreamSpec) -> str:
+    """What tables and figures call a task or a stream.
 
     `SME/Default-v1` in the catalogue; else the name of its file, or the id it is registered under;
     else `SME/` and its name by content. A file that uses a name of the catalogue for another task
     is followed by its name by content: `Default (sha256-…)`.
     """
-    unique = unique_name(spec)
-    if unique != spec.content_name or not spec.name:
+    unique = unique_name(document)
+    if unique != document.content_name or not document.name:
         return f"{NAMESPACE}/{unique}"
-    released = {short for name in names(EnvFile) for short in (name, _VERSION.sub("", name))}
-    return f"{spec.name} ({unique})" if spec.name in released else spec.name
+    known = [*names(EnvFile), *names(StreamFile)]
+    released = {short for name in known for short in (name, _VERSION.sub("", name))}
+    return f"{document.name} ({unique})" if document.name in released else document.name
 
 
 def titles(specs: Iterable[SMESpec]) -> dict[str, str]:

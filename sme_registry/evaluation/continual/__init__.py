@@ -1,0 +1,33 @@
+"""Continual learning: what an agent retains in a stream, what its life cost, and its plasticity."""
+
+from sme_registry.evaluation.continual.dynamic_regret import (
+    DynamicRegret,
+    VisitRegret,
+    dynamic_regret,
+)
+from sme_registry.evaluation.continual.evaluate import (
+    evaluate_stream,
+    fresh_per_phase,
+    frozen_after_first,
+)
+from sme_registry.evaluation.continual.report import (
+    Retention,
+    StreamRegion,
+    StreamReport,
+    Visit,
+)
+from sme_registry.evaluation.continual.seeds import across_seeds
+
+__all__ = [
+    "DynamicRegret",
+    "Retention",
+    "StreamRegion",
+    "StreamReport",
+    "Visit",
+    "VisitRegret",
+    "across_seeds",
+    "dynamic_regret",
+    "evaluate_stream",
+    "fresh_per_phase",
+    "frozen_after_first",
+]

@@ -1,0 +1,200 @@
+"""Dynamic regret: the sum of the regret of every step of a life, in all and by visit.
+
+    D(t) = Σ_{i ≤ t} (1 − r_i)         r_i: gated step reward under the task in force at step i
+
+Each regret is exact, so D is: no oracle run is compared with. Rows of a log are single steps or
+whole episodes. A row belongs to the visit whose task was in force in it: under switch="episode"
+that of its begin. Under switch="step" an episode can lie in two visits; its regret is then divided
+in proportion to its steps, and only rows of single steps give exact sums by visit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import OptionError
+from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
+from sme_registry.spec.document import StrictModel
+from sme_registry.spec.resolve import resolve_stream
+from sme_registry.task.draw import Array
+
+_POINTS = 400  # of the curve; more would not be visible in a figure
+_Integers = npt.NDArray[np.int64]
+
+
+class VisitRegret(StrictModel):
+    """The regret of one visit.
+
+    Attributes:
+      visit: its index in the life.
+      phase: the index of its phase.
+      steps: environment steps counted.
+      dynamic_regret: Σ regret over them; with switch="step" and episodes to a fraction of one.
+      online_regret: its mean; None where no step was counted.
+    """
+
+    visit: Integer
+    phase: Integer
+    steps: Integer
+    dynamic_regret: Real
+    online_regret: Real | None
+
+
+class DynamicRegret(StrictModel):
+    """The regret of a life.
+
+    Attributes:
+      steps: environment steps counted: of all rows.
+      dynamic_regret: Σ regret over them.
+      online_regret: its mean.
+      visits: the same of each visit that was reached, in order.
+      lifetime: environment steps at the points of the curve, at most 400.
+      cumulative_regret: Σ regret until then.
+    """
+
+    steps: Integer
+    dynamic_regret: Real
+    online_regret: Real
+    visits: TupleOf[VisitRegret]
+    lifetime: TupleOf[Integer]
+    cumulative_regret: TupleOf[Real]
+
+
+def dynamic_regret(
+    stream: StreamLike,
+    step: npt.ArrayLike,
+    regret: npt.ArrayLike,
+    length: npt.ArrayLike = 1,
+    phase: npt.ArrayLike | None = None,
+) -> DynamicRegret:
+    """The dynamic regret of one life from its log.
+
+    Args:
+      stream: the stream.
+      step: `[N]` the lifetime at the end of each row, increasing: `info["lifetime"]`, or the column
+        `step` of an episodes.csv.
+      regret: `[N]` mean regret over each row's steps, in [0, 1].
+      length: `[N]` steps of each row, or one number for all: 1 where rows are steps, the column
+        `length` where they are episodes.
+      phase: `[N]` `info["phase"]` of each row. Needed only where rows are steps and
+        switch="episode": a phase then lasts until the episode has ended.
+
+    Raises:
+      OptionError: no rows, arrays of different lengths, values out of range, or rows that overlap.
+      UnknownNameError, SpecError: no such stream, or a field is out of range.
+    """
+    spec = resolve_stream(stream).stream
+    ends, lengths, means = _rows(step, length, regret)
+    sums = means * lengths
+    if spec.switch == "step":
+        steps, by_visit = _divided(spec, ends, lengths, sums)
+    else:
+        visits = _visit_at(spec, ends - lengths)
+        if phase is not None:
+            visits = _in_force(spec, visits, phase)
+        steps = np.bincount(visits, lengths).astype(np.float64)
+        by_visit = np.bincount(visits, sums).astype(np.float64)
+    cumulative = np.cumsum(sums)
+    drawn = np.unique(np.linspace(0, len(ends) - 1, _POINTS).round().astype(int))
+    P = len(spec.phases)
+    return DynamicRegret(
+        steps=int(lengths.sum()),
+        dynamic_regret=float(cumulative[-1]),
+        online_regret=float(cumulative[-1] / lengths.sum()),
+        visits=tuple(
+            VisitRegret(
+                visit=v,
+                phase=v % P,
+                steps=round(n),
+                dynamic_regret=float(total),
+                online_regret=float(total / n) if n else None,
+            )
+            for v, (n, total) in enumerate(zip(steps, by_visit, strict=True))
+        ),
+        lifetime=tuple(ends[drawn].tolist()),
+        cumulative_regret=tuple(cumulative[drawn].tolist()),
+    )
+
+
+def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
+    """`[V]` the lifetime at which each of the first visits is over."""
+    ends = np.cumsum([phase.steps for phase in stream.phases])
+    v = np.arange(visits)
+    return np.asarray(v // len(ends) * stream.cycle_steps + ends[v % len(ends)])
+
+
+def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
+    """`[N]` the visits to which lifetimes belong; the last visit goes on at the end."""
+    ends = np.cumsum([phase.steps for phase in stream.phases])
+    cycle, inside = np.divmod(lifetime, stream.cycle_steps)
+    visits = cycle * len(ends) + np.searchsorted(ends, inside, side="right")
+    return np.asarray(np.minimum(visits, stream.cycles * len(ends) - 1))
+
+
+def _in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
+    """`[N]` visits in force: the latest one of each row's phase that has begun."""
+    phases = _column("phase", phase, len(visits)).astype(np.int64)
+    P = len(stream.phases)
+    in_force = visits - (visits - phases) % P
+    if (phases < 0).any() or (phases >= P).any() or (in_force < 0).any():
+        raise OptionError(
+            f"phase: must be the index of a phase that has begun, in [0, {P - 1}]. Give "
+            "info['phase'] of each step."
+        )
+    return np.asarray(in_force)
+
+
+def _divided(
+    stream: StreamSpec, ends: _Integers, lengths: _Integers, sums: Array
+) -> tuple[Array, Array]:
+    """Steps and regret of each visit, rows divided in proportion where a switch lies in them."""
+    reached = int(_visit_at(stream, ends[-1:] - 1)[0]) + 1
+    bounds = np.concatenate([[0], visit_ends(stream, reached - 1), ends[-1:]])
+    at = np.stack([ends - lengths, ends], axis=1).ravel()
+
+    def of_visits(values: npt.NDArray[Any]) -> Array:
+        after = np.cumsum(values)
+        until = np.stack([after - values, after], axis=1).ravel()
+        return np.diff(np.interp(bounds, at, until))
+
+    return of_visits(lengths), of_visits(sums)
+
+
+def _rows(
+    step: npt.ArrayLike, length: npt.ArrayLike, regret: npt.ArrayLike
+) -> tuple[_Integers, _Integers, Array]:
+    """The checked columns of a log, `[N]` each."""
+    count = np.size(step)
+    if count == 0:
+        raise OptionError("step: has no rows. Give one or more finished episodes or steps.")
+    ends, lengths, means = (
+        _column(name, values, count)
+        for name, values in (("step", step), ("length", length), ("regret", regret))
+    )
+    if not (means >= 0.0).all() or not (means <= 1.0).all():
+        raise OptionError("regret: has entries outside [0, 1]. Give the mean of 1 − r of each row.")
+    begins = ends - lengths
+    if (lengths < 1).any() or begins[0] < 0 or (begins[1:] < ends[:-1]).any():
+        raise OptionError(
+            "step, length: rows must have a length of at least 1 and must not overlap. Give the "
+            "rows of one life in order; of parallel environments, each lives a life of its own."
+        )
+    return ends.astype(np.int64), lengths.astype(np.int64), means
+
+
+def _column(name: str, values: npt.ArrayLike, count: int) -> Array:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape not in ((), (count,)):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise OptionError(
+            f"{name}={values!r:.60}: must be {count} numbers, one for each row."
+        ) from None
+    array = np.broadcast_to(array, (count,))
+    if not np.isfinite(array).all():
+        raise OptionError(f"{name}: has NaN or infinite entries. Give finite numbers.")
+    return array

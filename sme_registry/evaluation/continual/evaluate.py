@@ -1,0 +1,170 @@
+"""`evaluate_stream`: the policies of a life, a stream and a protocol to a report.
+
+Fresh agents and reference agents are sequences of policies like any other: one policy for each
+visit. `frozen_after_first` and `fresh_per_phase` make such sequences of trained policies; the
+references of `report.LABELS` are exact, need no training, and are in every report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sme_registry.errors import OptionError, PolicyError, UnknownNameError
+from sme_registry.evaluation.continual.dynamic_regret import visit_ends
+from sme_registry.evaluation.continual.report import StreamReport, Visit, stream_regions
+from sme_registry.evaluation.continual.retention import Subject, final_specs, measure
+from sme_registry.evaluation.evaluate import Progress, resolve_protocol, versions_behind
+from sme_registry.evaluation.policies import Policy, as_policy
+from sme_registry.spec import ProtocolLike, StreamLike, StreamSpec
+from sme_registry.task import load_stream
+from sme_registry.task.draw import Array
+
+_Any = TypeVar("_Any")
+
+
+def evaluate_stream(
+    policies: Sequence[Any],
+    stream: StreamLike,
+    protocol: ProtocolLike = "paper-v1",
+    *,
+    initial: Any = None,
+    fresh: Sequence[Any] | None = None,
+    action_range: str | None = None,
+    name: str | None = None,
+    algorithm: str | None = None,
+    progress: Progress | None = None,
+) -> StreamReport:
+    """Evaluate an agent's life in a stream, exactly and without a rollout.
+
+    Args:
+      policies: the agent's policy at the end of each visit, in any form that `evaluate` accepts;
+        of a stream with P phases and C cycles C·P of them. A policy that observes the phase is
+        given the phase on whose task it is evaluated.
+      stream: a stream, its fields, an id, a digest or a path.
+      protocol: as in `evaluate`.
+      initial: the agent's policy before training, for the forward transfer.
+      fresh: for each phase the policy of an agent trained for as many steps on that phase alone,
+        for the plasticity.
+      action_range: as in `evaluate`, of all policies.
+      name: what the report calls the agent; None takes the name of the last policy.
+      algorithm: as in `evaluate`.
+      progress: called after each batch with the number of states done, and of all states.
+
+    Returns:
+      The report, with the reference agents on the same states.
+
+    Raises:
+      UnknownNameError, SpecError: no such stream or protocol, or a field is out of range.
+      OptionError: not one policy for each visit or phase.
+      PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
+      MissingDependencyError: the library that loads a policy is not installed.
+      ResourceLimitError: the tasks would not fit in memory together.
+    """
+    stream = load_stream(stream)
+    protocol = resolve_protocol(protocol)
+    P = len(stream.phases)
+    V = stream.cycles * P
+    _refuse_other_count(
+        "policies", policies, V, f"at the end of each visit ({stream.cycles} × {P})"
+    )
+    if fresh is not None:
+        _refuse_other_count("fresh", fresh, P, "for each phase")
+    observed = P if stream.observes_phase else 0
+    spec = stream.phases[0].spec
+
+    def subject(policy: Any, phases: Sequence[int], where: str) -> Subject:
+        try:
+            ready = as_policy(
+                policy,
+                spec,
+                action_range=action_range,
+                algorithm=algorithm,
+                observed_phases=observed,
+            )
+        except (PolicyError, UnknownNameError) as error:
+            raise type(error)(f"{where}: {error}") from error.__cause__
+        assert isinstance(ready, Policy)  # streams have no teams
+        return Subject(ready, phases, where)
+
+    everywhere = range(P)
+    subjects = [Subject(j, everywhere) for j in range(P)]
+    rows: dict[int, int] = {}
+    life = []
+    for v, policy in enumerate(policies):
+        if id(policy) not in rows:
+            rows[id(policy)] = len(subjects)
+            subjects.append(subject(policy, everywhere, f"policies[{v}]"))
+        life.append(rows[id(policy)])
+    start = len(subjects)
+    if initial is not None:
+        subjects.append(subject(initial, everywhere, "initial"))
+    alone = len(subjects)
+    for j, policy in enumerate(fresh or ()):
+        subjects.append(subject(policy, [j], f"fresh[{j}]"))
+
+    measured, oracle = measure(stream, subjects, protocol, progress)
+    regions, ood = stream_regions(
+        protocol,
+        measured[life],
+        measured[start] if initial is not None else None,
+        measured[alone + np.arange(P), np.arange(P)] if fresh is not None else None,
+        _references(measured[:P], V),
+    )
+    last = subjects[life[-1]].acts
+    assert isinstance(last, Policy)
+    digests = [each.digest for each in final_specs(stream)]
+    return StreamReport(
+        policy=name or last.name,
+        action_range=last.action_range,
+        stream=stream,
+        stream_digest=stream.digest,
+        name=stream.name,
+        protocol=protocol,
+        protocol_digest=protocol.digest,
+        visits=tuple(
+            Visit(visit=v, cycle=v // P, phase=v % P, lifetime=int(end), spec_digest=digests[v % P])
+            for v, end in enumerate(visit_ends(stream, V))
+        ),
+        regions=regions,
+        ood=ood,
+        versions=versions_behind(oracle),
+    )
+
+
+def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_Any]:
+    """The life of an agent that stops learning after the first visit: its policy at each visit.
+
+    Args:
+      stream: the stream.
+      policies: the agent's policies at the ends of the visits, or the first of them alone.
+    """
+    return [policies[0]] * (stream.cycles * len(stream.phases))
+
+
+def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:
+    """The life of an agent that starts anew in each phase: the policy at each visit.
+
+    Args:
+      stream: the stream.
+      fresh: for each phase a policy trained on that phase alone.
+    """
+    return [*fresh] * stream.cycles
+
+
+def _references(optima: Array, visits: int) -> dict[str, Array]:
+    """`[V, P, K]` of each reference agent, from the optima of the phases `[P, P, K]`."""
+    P = len(optima)
+    return {
+        "frozen_optimum": np.repeat(optima[:1], visits, axis=0),
+        "fresh_optimum": optima[np.arange(visits) % P],
+        "constant_half": np.ones((visits, *optima.shape[1:])),
+    }
+
+
+def _refuse_other_count(name: str, policies: Any, count: int, which: str) -> None:
+    if not isinstance(policies, Sequence) or isinstance(policies, str) or len(policies) != count:
+        given = f"{len(policies)} of them" if isinstance(policies, list | tuple) else repr(policies)
+        raise OptionError(f"{name}={given:.60}: must be {count} policies, one {which}.")

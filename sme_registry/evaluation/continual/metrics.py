@@ -1,0 +1,116 @@
+"""Metrics of continual learning: from a retention matrix to numbers. Pure functions.
+
+Axis letters: `V` visits, `P` phases, `K` sets of states (regions). Visit v is an occurrence of a
+phase in the life, φ(v) = v mod P; M[v, j] is the normalised regret on phase j's task at its end.
+
+    R[v, j] = 1 − M[v, j]                                     performance: 1 optimal, 0 constant ½
+    A(v)    = mean over j ≤ v of R[v, j]                      average performance
+    B(v)    = mean over j of R[v, j] − R[last(v, j), j]       backward transfer
+    F(v)    = mean over j of max_{u<v} R[u, j] − R[v, j]      forgetting
+    T       = mean over j ≥ 1 of R[j − 1, j] − R₀[j]          forward transfer
+    G       = mean over j of R[P + j, j] − R[j, j]            relearning
+
+B and F are over the phases that were visited before v, other than φ(v); last(v, j) is the last
+visit of phase j before v. R₀ is of the initial policy. In the last visit of a single cycle, A, B
+and T are ACC, BWT and FWT of Lopez-Paz & Ranzato (2017), and A and F are those of Chaudhry et al.
+(2018). With more cycles a visit is what a task is there: B compares with the last time that the
+phase was trained, F with the best time of all, T is of the first cycle, in which phases are new,
+and G compares the second visit of a phase with its first, after equal steps.
+
+A metric is NaN where nothing can be compared: B and F at the first visit, T without an initial
+policy or with one phase, G with one cycle.
+
+    plasticity ratio       M[v, φ(v)] / N[φ(v)]     above 1: it learned less than a fresh agent
+    plasticity difference  M[v, φ(v)] − N[φ(v)]     N: of agents that train on one phase
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sme_registry.task.draw import Array
+
+
+def average_performance(R: Array) -> Array:
+    """A(v), `[V, K]`: mean performance over the phases visited so far.
+
+    Args:
+      R: `[V, P, K]` performance, at most 1.
+    """
+    P = R.shape[1]
+    return np.array([row[: min(v + 1, P)].mean(axis=0) for v, row in enumerate(R)])
+
+
+def backward_transfer(R: Array) -> Array:
+    """B(v), `[V, K]`: how performance changed since a phase was last trained; below 0: for worse.
+
+    Args:
+      R: `[V, P, K]` performance, at most 1.
+    """
+    P = R.shape[1]
+    return _over_earlier_phases(R, lambda v, j: R[v, j] - R[v - 1 - (v - 1 - j) % P, j])
+
+
+def forgetting(R: Array) -> Array:
+    """F(v), `[V, K]`: how far performance is below its best so far; negative where it is the best.
+
+    Args:
+      R: `[V, P, K]` performance, at most 1.
+    """
+    return _over_earlier_phases(R, lambda v, j: R[:v, j].max(axis=0) - R[v, j])
+
+
+def forward_transfer(R: Array, initial: Array) -> Array:
+    """T, `[K]`: what was gained on phases before their first visit.
+
+    Args:
+      R: `[V, P, K]` performance, at most 1.
+      initial: `[P, K]` performance of the initial policy; NaN where there is none.
+    """
+    P = R.shape[1]
+    gains = [R[j - 1, j] - initial[j] for j in range(1, P)]
+    return np.asarray(np.mean(gains, axis=0)) if gains else np.full(R.shape[2], np.nan)
+
+
+def relearning(R: Array) -> Array:
+    """G, `[K]`: what the second visit of a phase gained on its first, after equal steps.
+
+    Args:
+      R: `[V, P, K]` performance, at most 1.
+    """
+    P = R.shape[1]
+    if len(R) < 2 * P:
+        return np.full(R.shape[2], np.nan)
+    return np.asarray(np.mean([R[P + j, j] - R[j, j] for j in range(P)], axis=0))
+
+
+def plasticity(M: Array, fresh: Array) -> tuple[Array, Array]:
+    """Ratio and difference, `[V, K]` each, between an agent and fresh ones after equal steps.
+
+    All phases of equal fields are draws of equal difficulty, so what a fresh agent learns and this
+    one does not is plasticity that was lost. Both are NaN where `fresh` is; the ratio is also NaN
+    where a fresh agent is optimal.
+
+    Args:
+      M: `[V, P, K]` normalised regret, at least 0.
+      fresh: `[P, K]` normalised regret on each phase of an agent trained for as many steps on that
+        phase alone.
+    """
+    V, P, _ = M.shape
+    phases = np.arange(V) % P
+    trained, alone = M[np.arange(V), phases], fresh[phases]
+    ratio = np.divide(trained, alone, out=np.full_like(trained, np.nan), where=alone > 0.0)
+    return ratio, trained - alone
+
+
+def _over_earlier_phases(R: Array, change: Callable[[int, int], Array]) -> Array:
+    """`[V, K]` means of `change(v, j)` over phases j visited before v, other than v's own."""
+    V, P, K = R.shape
+    means = np.full((V, K), np.nan)
+    for v in range(1, V):
+        changes = [change(v, j) for j in range(min(v, P)) if j != v % P]
+        if changes:
+            means[v] = np.mean(changes, axis=0)
+    return means

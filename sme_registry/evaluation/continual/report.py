@@ -1,0 +1,346 @@
+"""`StreamReport`: an agent's life in a stream in exact numbers, as a JSON document and as tables.
+
+`metrics` has the formulas, `retention` says what is measured, and `dynamic_regret` what is summed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
+from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.evaluation.continual import metrics
+from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
+from sme_registry.evaluation.regions import region_name
+from sme_registry.evaluation.report_file import ReportFile, as_text
+from sme_registry.spec import (
+    ActionRange,
+    EvaluationProtocol,
+    Integer,
+    Real,
+    StreamSpec,
+    TupleOf,
+    catalogue,
+)
+from sme_registry.spec.document import StrictModel
+from sme_registry.task.draw import Array
+
+if TYPE_CHECKING:
+    from sme_registry.terminal import Table
+
+SHELLS = "OOD"
+LABELS = {
+    "frozen_optimum": "optimum of phase 0",
+    "fresh_optimum": "optimum of each phase",
+    "constant_half": "constant ½",
+}
+"""The reference agents, which need no training: one optimum for the whole life, that of the phase
+just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½."""
+
+METRICS = {
+    "average_performance": "average performance",
+    "backward_transfer": "backward transfer",
+    "forgetting": "forgetting",
+    "forward_transfer": "forward transfer",
+    "relearning": "relearning",
+    "plasticity_ratio": "plasticity ratio",
+}
+"""The metrics of `Retention`, and their labels."""
+
+_Optional = TupleOf[Real | None]
+
+
+class Retention(StrictModel):
+    """A retention matrix and its metrics; `metrics` has the formulas.
+
+    A metric by visit is None where nothing can be compared; its last entry is that of the life.
+
+    Attributes:
+      normalised_regret: `[V][P]` of the policy at the end of each visit, on each phase's task.
+      initial_normalised_regret: `[P]` of the initial policy; None without one.
+      fresh_normalised_regret: `[P]` of an agent trained on that phase alone; None without them.
+      average_performance: `[V]` mean of 1 − normalised regret over the phases visited so far.
+      backward_transfer: `[V]` change of performance since a phase was last trained.
+      forgetting: `[V]` fall of performance below its best.
+      forward_transfer: gain over the initial policy on phases not visited yet.
+      relearning: gain of the second visit of a phase on its first.
+      plasticity_ratio: `[V]` normalised regret on the visited phase, over a fresh agent's.
+      plasticity_difference: `[V]` their difference.
+    """
+
+    normalised_regret: TupleOf[TupleOf[Real]]
+    initial_normalised_regret: TupleOf[Real] | None = None
+    fresh_normalised_regret: TupleOf[Real] | None = None
+    average_performance: TupleOf[Real]
+    backward_transfer: _Optional
+    forgetting: _Optional
+    forward_transfer: Real | None
+    relearning: Real | None
+    plasticity_ratio: _Optional
+    plasticity_difference: _Optional
+
+    def final(self, metric: str) -> float | None:
+        """A metric at the end of the life; the mean over visits of a plasticity."""
+        value = getattr(self, metric)
+        if not isinstance(value, tuple):
+            return None if value is None else float(value)
+        if metric.startswith("plasticity"):
+            known = [each for each in value if each is not None]
+            return float(np.mean(known)) if known else None
+        return None if value[-1] is None else float(value[-1])
+
+
+class StreamRegion(StrictModel):
+    """One region of the states.
+
+    Attributes:
+      name: `WD`, `OOD 1`, …; `OOD` for the mean over all shells.
+      epsilon_low: ε of the inner face; 0 for WD.
+      epsilon_high: ε of the outer face; 0 for WD.
+      states: number of states.
+      agent: the agent's matrix and metrics.
+      references: the same of each reference agent, by its name in `LABELS`.
+    """
+
+    name: str
+    epsilon_low: Real
+    epsilon_high: Real
+    states: Integer
+    agent: Retention
+    references: dict[str, Retention]
+
+
+class Visit(StrictModel):
+    """An occurrence of a phase in the life.
+
+    Attributes:
+      visit: its index.
+      cycle: the index of its cycle.
+      phase: the index of its phase.
+      lifetime: environment steps at its end.
+      spec_digest: of the task on which the phase is evaluated: of a drift the last one.
+    """
+
+    visit: Integer
+    cycle: Integer
+    phase: Integer
+    lifetime: Integer
+    spec_digest: str
+
+
+class StreamReport(ReportFile):
+    """An agent in a stream: what it retains after each visit, and what its life cost.
+
+    Attributes:
+      policy: the agent's name.
+      action_range: of its actions, "unit" or "symmetric".
+      stream: the stream.
+      stream_digest: its digest.
+      name: what the stream's file calls it; empty, and left out of the JSON, without a name.
+      protocol: the states.
+      protocol_digest: its digest.
+      visits: in order.
+      regions: WD, then OOD 1, 2, …
+      ood: the mean of the matrices over the shells.
+      dynamic_regret: of training; None without its log.
+      versions: of Python and the packages that the numbers depend on.
+    """
+
+    documents = ("stream", "protocol")
+
+    schema_version: Literal[1] = 1
+    policy: str
+    action_range: ActionRange
+    stream: StreamSpec
+    stream_digest: str
+    name: str = ""
+    protocol: EvaluationProtocol
+    protocol_digest: str
+    visits: TupleOf[Visit]
+    regions: Annotated[TupleOf[StreamRegion], Field(min_length=1)]
+    ood: StreamRegion
+    dynamic_regret: DynamicRegret | None = None
+    versions: dict[str, str]
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        if not plain["name"]:
+            del plain["name"]
+        return plain
+
+    @property
+    def title(self) -> str:
+        """The stream's name for people; see `catalogue.title`."""
+        return catalogue.title(self.stream.named(self.name))
+
+    def region(self, name: str = "WD") -> StreamRegion:
+        """A region by its name; `OOD` is the mean over the shells.
+
+        Raises:
+          UnknownNameError: no region has this name.
+        """
+        known = {each.name: each for each in (*self.regions, self.ood)}
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise UnknownNameError(f"region={name!r:.40}: must be one of {', '.join(known)}.{hint}")
+        return known[name]
+
+    def with_dynamic_regret(self, regret: DynamicRegret) -> Self:
+        """This report with the dynamic regret of the agent's training."""
+        return self.model_copy(update={"dynamic_regret": regret})
+
+    def __repr__(self) -> str:
+        final = self.regions[0].agent.average_performance[-1]
+        return (
+            f"<StreamReport: {self.policy} on {self.title}, {len(self.visits)} visits, "
+            f"average performance {final:.3f}>"
+        )
+
+    def __str__(self) -> str:
+        return f"{as_text(self.table())}\n\n{as_text(self.matrix())}"
+
+    def table(self) -> Table:
+        """The metrics at the end of the life: a column for each region."""
+        from rich.markup import escape
+
+        from sme_registry.terminal import Table
+
+        stream, regions = self.stream, self.regions
+        regret = self.dynamic_regret
+        cost = (
+            f"; dynamic regret {regret.dynamic_regret:,.1f} over {regret.steps:,} steps"
+            if regret
+            else ""
+        )
+        table = Table(
+            f"{escape(self.policy)} on {escape(self.title)} (S={stream.state_dim}, "
+            f"A={stream.action_dim}, {len(stream.phases)} phases, {len(self.visits)} visits)\n"
+            f"{self.stream_digest}\n{regions[0].states:,} states per region{cost}",
+            {"": "name"}
+            | {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in regions},
+            caption="Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
+        )
+        shown = {self.policy: [region.agent for region in regions]}
+        for name in regions[0].references:
+            shown[LABELS.get(name, name)] = [region.references[name] for region in regions]
+        for metric, label in METRICS.items():
+            rows = {
+                name: [retention.final(metric) for retention in each]
+                for name, each in shown.items()
+            }
+            rows = {name: values for name, values in rows.items() if None not in values}
+            if not rows:
+                continue
+            table.add_row(label, style="italic")
+            for name, values in rows.items():
+                style = "bold" if name == self.policy else None
+                cells = [f"{value:.3f}" for value in values]
+                table.add_row(f"  {escape(name)}", *cells, style=style)
+            table.add_section()
+        return table
+
+    def matrix(self, region: str = "WD") -> Table:
+        """The retention matrix of a region: a row for each visit, a column for each phase.
+
+        Raises:
+          UnknownNameError: no region has this name.
+        """
+        from sme_registry.terminal import Table
+
+        agent, P = self.region(region).agent, len(self.stream.phases)
+        table = Table(
+            f"Normalised regret in {region} on the task of each phase",
+            {"policy at the end of": "name"} | {f"phase {j}": "number" for j in range(P)},
+        )
+        if agent.initial_normalised_regret:
+            table.add_row("initial policy", *_cells(agent.initial_normalised_regret))
+        for visit, row in zip(self.visits, agent.normalised_regret, strict=True):
+            table.add_row(f"visit {visit.visit}: phase {visit.phase}", *_cells(row))
+        if agent.fresh_normalised_regret:
+            table.add_row("fresh agent of the phase", *_cells(agent.fresh_normalised_regret))
+        return table
+
+
+def _cells(row: Iterable[float]) -> list[str]:
+    return [f"{value:.3f}" for value in row]
+
+
+def stream_regions(
+    protocol: EvaluationProtocol,
+    agent: Array,
+    initial: Array | None,
+    fresh: Array | None,
+    references: Mapping[str, Array],
+) -> tuple[tuple[StreamRegion, ...], StreamRegion]:
+    """The regions of a report, and the mean over the shells.
+
+    Args:
+      protocol: the states, of `K` regions.
+      agent: `[V, P, K]` normalised regret.
+      initial: `[P, K]` of the initial policy.
+      fresh: `[P, K]` of fresh agents, each on its phase.
+      references: `[V, P, K]` of each reference agent.
+    """
+    edges, states = protocol.edges, protocol.states_per_region
+    names = [(region_name(k), *edge, states) for k, edge in enumerate(edges)]
+    names.append((SHELLS, edges[1][0], edges[-1][1], states * (len(edges) - 1)))
+    of_agent = _retentions(agent, initial, fresh)
+    of_references = {name: _retentions(M, None, None) for name, M in references.items()}
+    regions = [
+        StreamRegion(
+            name=name,
+            epsilon_low=low,
+            epsilon_high=high,
+            states=count,
+            agent=of_agent[k],
+            references={name: each[k] for name, each in of_references.items()},
+        )
+        for k, (name, low, high, count) in enumerate(names)
+    ]
+    return tuple(regions[:-1]), regions[-1]
+
+
+def _retentions(M: Array, initial: Array | None, fresh: Array | None) -> list[Retention]:
+    """The matrix and the metrics in each region, then of the mean over the shells."""
+    P = M.shape[1]
+    M = _and_shells(M)
+    none = np.full((P, M.shape[2]), np.nan)
+    before = none if initial is None else _and_shells(initial)
+    alone = none if fresh is None else _and_shells(fresh)
+    R = 1.0 - M
+    ratio, difference = metrics.plasticity(M, alone)
+    by_visit = {
+        "average_performance": metrics.average_performance(R),
+        "backward_transfer": metrics.backward_transfer(R),
+        "forgetting": metrics.forgetting(R),
+        "plasticity_ratio": ratio,
+        "plasticity_difference": difference,
+        "forward_transfer": metrics.forward_transfer(R, 1.0 - before),
+        "relearning": metrics.relearning(R),
+    }
+    return [
+        Retention(
+            normalised_regret=tuple(map(tuple, M[..., k].tolist())),
+            initial_normalised_regret=None if initial is None else tuple(before[:, k].tolist()),
+            fresh_normalised_regret=None if fresh is None else tuple(alone[:, k].tolist()),
+            **{name: _known(values[..., k]) for name, values in by_visit.items()},
+        )
+        for k in range(M.shape[2])
+    ]
+
+
+def _and_shells(values: Array) -> Array:
+    """Values `[…, K]` and their mean over the shells: `[…, K + 1]`."""
+    return np.concatenate([values, values[..., 1:].mean(axis=-1, keepdims=True)], axis=-1)
+
+
+def _known(values: Array) -> Any:
+    """Numbers as JSON has them: None for NaN."""
+    if values.ndim == 0:
+        return None if math.isnan(values) else float(values)
+    return tuple(None if math.isnan(value) else value for value in values.tolist())

@@ -1,0 +1,98 @@
+"""`across_seeds`: the numbers of several runs of one stream, with intervals over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation.continual.report import StreamReport
+from sme_registry.statistics import (
+    DRAWS,
+    Array,
+    Estimate,
+    Statistic,
+    aggregate,
+    iqm,
+    stratified_bootstrap,
+)
+
+_FIELDS = (
+    "normalised_regret",
+    "average_performance",
+    "backward_transfer",
+    "forgetting",
+    "forward_transfer",
+    "relearning",
+    "plasticity_ratio",
+    "plasticity_difference",
+)
+
+
+def across_seeds(
+    reports: Sequence[StreamReport],
+    region: str = "WD",
+    *,
+    draws: int = DRAWS,
+    statistic: Statistic = iqm,
+) -> dict[str, Estimate]:
+    """The IQM over runs of every number of a region, with 95 % intervals.
+
+    Args:
+      reports: of one agent on one stream, one for each seed of its training.
+      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+      draws: samples of the bootstrap.
+      statistic: over runs.
+
+    Returns:
+      From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row,
+      `[V]` of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends
+      of intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where
+      every report has them.
+
+    Raises:
+      OptionError: no report, or reports of different streams or protocols.
+      UnknownNameError: no region has this name.
+    """
+    same_stream(reports)
+    runs = {
+        field: np.stack([_numbers(getattr(r.region(region).agent, field)) for r in reports])
+        for field in _FIELDS
+    }
+    regrets = [report.dynamic_regret for report in reports]
+    logs = [regret for regret in regrets if regret is not None]
+    if len(logs) == len(reports):
+        runs["dynamic_regret"] = np.array([[log.dynamic_regret] for log in logs])
+        if len({len(log.visits) for log in logs}) == 1:
+            runs["visit_dynamic_regret"] = np.array(
+                [[visit.dynamic_regret for visit in log.visits] for log in logs]
+            )
+    digest = reports[0].stream_digest
+    return {name: _estimate(values, digest, draws, statistic) for name, values in runs.items()}
+
+
+def same_stream(reports: Sequence[StreamReport]) -> None:
+    """Raise OptionError unless there is a report, and all are of one stream and protocol."""
+    if not reports:
+        raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
+    for field in ("stream_digest", "protocol_digest"):
+        found = {getattr(report, field) for report in reports}
+        if len(found) > 1:
+            raise OptionError(
+                f"reports: have {len(found)} different values of {field}. Runs of one stream, "
+                "evaluated with one protocol, can be compared. Remove the others."
+            )
+
+
+def _estimate(values: Array, seed: str, draws: int, statistic: Statistic) -> Estimate:
+    classes = {"": values}
+    return Estimate(
+        aggregate(classes, statistic), *stratified_bootstrap(classes, draws, seed, statistic)
+    )
+
+
+def _numbers(value: Any) -> Array:
+    """A number, a row or a matrix as `[K]`; None is NaN."""
+    return np.atleast_1d(np.array(value, dtype=np.float64)).ravel()

@@ -1,0 +1,386 @@
+"""Figures of an agent in a stream: what it retains, what its life cost, and its plasticity."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import StreamReport
+from sme_registry.evaluation.continual.seeds import same_stream
+from sme_registry.plots.style import (
+    GREY,
+    canvas,
+    draw_band,
+    entitle,
+    figure_of,
+    literal,
+    look,
+    name_bands,
+)
+from sme_registry.statistics import iqm
+from sme_registry.task.draw import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Report = StreamReport | str | os.PathLike[str]
+Runs = Report | Sequence[Report]
+Methods = Runs | Mapping[str, Runs]
+
+FILE = "stream.json"  # of a report, in the folder of a run
+_MOST_NUMBERS = 12  # of columns of a map whose cells show their values
+_POINTS = 400  # of a line; more would not be visible at this size
+
+
+def retention_map(
+    runs: Runs,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    region: str = "WD",
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw a retention matrix: normalised regret after each visit (rows) on each phase (columns).
+
+    Bright is good. The cell of the phase that was just visited is outlined. The first row is the
+    initial policy, where the reports have one.
+
+    Args:
+      runs: the report of an agent, or one for each seed: then the cells are their IQM. A report
+        may be given by its path, or by the folder that contains its stream.json.
+      path: a file to write, .png, .pdf or .svg; None writes none.
+      region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
+      title: above a new figure; None names the agent, the stream and the region.
+      ax: the axes to draw in, without title; None for a new figure.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError: no report, reports of different streams, or the file cannot be written.
+      UnknownNameError: no region has this name.
+      SpecError: a file is not a report.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    reports = _runs(runs)
+    agents = [report.region(region).agent for report in reports]
+    M = iqm([agent.normalised_regret for agent in agents])
+    labels = [f"visit {visit.visit}" for visit in reports[0].visits]
+    visited: list[tuple[int, int]] = [(visit.visit, visit.phase) for visit in reports[0].visits]
+    initial = [each for agent in agents if (each := agent.initial_normalised_regret)]
+    if len(initial) == len(agents):
+        M = np.concatenate([iqm(initial)[None], M])
+        labels = ["initial", *labels]
+        visited = [(row + 1, column) for row, column in visited]
+    V, P = M.shape
+    size = (max(3.6, 1.9 + 0.52 * min(P, 20)), max(2.8, 1.5 + 0.32 * min(V, 30)))
+    with canvas(ax, size, path) as (axes,):
+        top = max(1.0, float(M.max()))
+        image = axes.imshow(
+            M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
+        )
+        axes.grid(visible=False)
+        if P <= _MOST_NUMBERS:
+            for row, column in np.ndindex(V, P):
+                colour = "white" if M[row, column] > 0.5 * top else "black"
+                axes.text(
+                    column, row, f"{M[row, column]:.2f}", ha="center", va="center", fontsize=8,
+                    color=colour,
+                )  # fmt: skip
+        for row, column in visited:
+            _outline(axes, row, column)
+        _tick(axes.yaxis, labels)
+        _tick(axes.xaxis, [str(j) for j in range(P)])
+        axes.set_xlabel("evaluated on the task of phase")
+        axes.set_ylabel("policy at the end of")
+        bar = figure_of(axes).colorbar(
+            image, ax=axes, label="normalised regret\n(0 = optimal, 1 = constant ½)"
+        )
+        bar.outline.set_visible(False)
+        if ax is None:
+            entitle(figure_of(axes), _title(reports, title, f", {region}"))
+    return figure_of(axes)
+
+
+def performance_curve(
+    runs: Runs,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    region: str = "WD",
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw the performance on each phase's task over the visits: a line for each phase.
+
+    Filled marks are the visits of the line's own phase: between them one sees what is forgotten,
+    and before the first of them what is known in advance. Performance is 1 − normalised regret.
+
+    Args:
+      runs, path, region, title, ax: as in `retention_map`; lines are the IQM of several seeds, and
+        bands their quartiles.
+
+    Returns:
+      The figure.
+
+    Raises:
+      As `retention_map`.
+    """
+    reports = _runs(runs)
+    agents = [report.region(region).agent for report in reports]
+    R = 1.0 - np.array([agent.normalised_regret for agent in agents])  # [n, V, P]
+    initial = [each for agent in agents if (each := agent.initial_normalised_regret)]
+    x = np.arange(R.shape[1], dtype=float)
+    if len(initial) == len(agents):
+        R = np.concatenate([1.0 - np.array(initial)[:, None], R], axis=1)
+        x = np.concatenate([[-1.0], x])
+    phases = np.array([visit.phase for visit in reports[0].visits])
+    P = R.shape[2]
+    with canvas(ax, (6.2, 4.0), path) as (axes,):
+        for j in range(P):
+            style = look(j)
+            of_phase = R[..., j]
+            middle = iqm(of_phase)
+            if len(R) > 1:
+                low, high = np.quantile(of_phase, [0.25, 0.75], axis=0)
+                draw_band(axes, x, low, high, style["color"])
+            axes.plot(
+                x, middle, **style, markersize=4.5, linewidth=1.6, markerfacecolor="white",
+                label=f"phase {j}",
+            )  # fmt: skip
+            own = np.isin(x, np.flatnonzero(phases == j))
+            axes.plot(x[own], middle[own], **style, markersize=6, linestyle="none")
+        _reference(axes, 1.0, "optimal", "-")
+        _reference(axes, 0.0, "constant ½", (0, (4, 4)))
+        if len(R) > 1:
+            name_bands(axes, f"quartiles of {len(R)} seeds (line: IQM)")
+        _tick_visits(axes, reports[0], initial=x[0] < 0)
+        axes.set_ylabel(f"performance in {region}  (1 − normalised regret)")
+        if ax is None:
+            entitle(figure_of(axes), _title(reports, title))
+    return figure_of(axes)
+
+
+def dynamic_regret_curve(
+    runs: Methods,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw the dynamic regret of training over the lifetime, with a band for each visit.
+
+    Args:
+      runs: as in `retention_map`, or a mapping from each agent's name to its runs; reports with a
+        dynamic regret. Lines are the median of several seeds, and bands their quartiles.
+      path, title, ax: as in `retention_map`.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError: a report without a dynamic regret; and as `retention_map`.
+      SpecError: a file is not a report.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    methods = _methods(runs)
+    first = next(iter(methods.values()))
+    curves = {name: [_curve(report) for report in reports] for name, reports in methods.items()}
+    with canvas(ax, (6.2, 4.0), path) as (axes,):
+        for index, (name, each) in enumerate(curves.items()):
+            end = min(x[-1] for x, _ in each)
+            x = np.linspace(0.0, end, _POINTS)
+            values = np.array([np.interp(x, *curve) for curve in each])
+            low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
+            style = look(index)
+            if len(each) > 1:
+                draw_band(axes, x, low, high, style["color"])
+            label = _label(name, len(each))
+            axes.plot(x, middle, **style, linewidth=2, markersize=4.5, markevery=0.13, label=label)
+        if any(len(each) > 1 for each in curves.values()):
+            name_bands(axes, "quartiles of seeds (line: median)")
+        axes.set_xlim(0.0, max(x[-1] for each in curves.values() for x, _ in each))
+        axes.set_ylim(bottom=0.0)
+        _shade_visits(axes, first[0])
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+        axes.set_xlabel("lifetime (environment steps)")
+        axes.set_ylabel("dynamic regret  (Σ of 1 − r)")
+        if ax is None:
+            entitle(figure_of(axes), _title(first, title, named=len(methods) == 1))
+    return figure_of(axes)
+
+
+def plasticity_curve(
+    runs: Methods,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    region: str = "WD",
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw the plasticity ratio by visit: regret on the visited phase over a fresh agent's.
+
+    Above 1 the agent learns less than a fresh one in as many steps.
+
+    Args:
+      runs: as in `dynamic_regret_curve`; reports with fresh agents. Lines are the IQM of several
+        seeds, and bands their quartiles.
+      path, region, title, ax: as in `retention_map`.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError: a report without fresh agents; and as `retention_map`.
+      UnknownNameError: no region has this name.
+      SpecError: a file is not a report.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    methods = _methods(runs)
+    first = next(iter(methods.values()))
+    with canvas(ax, (6.2, 4.0), path) as (axes,):
+        for index, (name, reports) in enumerate(methods.items()):
+            ratios = np.array([_ratios(report, region) for report in reports])
+            x, style = np.arange(ratios.shape[1]), look(index)
+            if len(ratios) > 1:
+                low, high = np.quantile(ratios, [0.25, 0.75], axis=0)
+                draw_band(axes, x, low, high, style["color"])
+            label = _label(name, len(ratios))
+            axes.plot(x, iqm(ratios), **style, linewidth=2, markersize=5, label=label)
+        if any(len(reports) > 1 for reports in methods.values()):
+            name_bands(axes, "quartiles of seeds (line: IQM)")
+        _reference(axes, 1.0, "as a fresh agent", "-")
+        _tick_visits(axes, first[0])
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(f"plasticity ratio in {region}\n(regret / fresh agent's, > 1: lost)")
+        if ax is None:
+            entitle(figure_of(axes), _title(first, title, named=len(methods) == 1))
+    return figure_of(axes)
+
+
+def _methods(given: Methods) -> dict[str, list[StreamReport]]:
+    """The runs of each agent; all of one stream and protocol."""
+    if not isinstance(given, Mapping):
+        runs = _runs(given)
+        return {runs[0].policy: runs}
+    methods = {str(name): _runs(runs) for name, runs in given.items()}
+    same_stream([report for runs in methods.values() for report in runs])
+    return methods
+
+
+def _runs(given: Runs) -> list[StreamReport]:
+    """One report or several, those given by their paths read."""
+    alone = isinstance(given, StreamReport | str | os.PathLike) or not isinstance(given, Sequence)
+    each: Any = [given] if alone else given
+    reports = [_report(one) for one in each]
+    same_stream(reports)
+    return reports
+
+
+def _report(given: Any) -> StreamReport:
+    if isinstance(given, StreamReport):
+        return given
+    if not isinstance(given, str | os.PathLike):
+        raise OptionError(
+            f"runs={given!r:.60}: must be a StreamReport, the path of a {FILE}, or the folder of a "
+            "run."
+        )
+    path = Path(given)
+    return StreamReport.read(path / FILE if path.is_dir() else path)
+
+
+def _curve(report: StreamReport) -> tuple[Array, Array]:
+    regret = report.dynamic_regret
+    if regret is None:
+        raise OptionError(
+            "runs: a report has no dynamic regret. Add it from the log of the training: "
+            "report.with_dynamic_regret(dynamic_regret(…))."
+        )
+    zero = np.zeros(1)
+    return (
+        np.concatenate([zero, np.array(regret.lifetime, dtype=float)]),
+        np.concatenate([zero, np.array(regret.cumulative_regret)]),
+    )
+
+
+def _ratios(report: StreamReport, region: str) -> Array:
+    """`[V]` plasticity ratios; NaN where a fresh agent is optimal."""
+    agent = report.region(region).agent
+    if agent.fresh_normalised_regret is None:
+        raise OptionError(
+            "runs: a report has no fresh agents. Give evaluate_stream their policies, fresh=…."
+        )
+    return np.array(agent.plasticity_ratio, dtype=float)
+
+
+def _label(name: str, runs: int) -> str:
+    return literal(name) + (f" (n = {runs})" if runs > 1 else "")
+
+
+def _title(
+    reports: Sequence[StreamReport], title: str | None, end: str = "", *, named: bool = True
+) -> str:
+    if title is not None:
+        return title
+    who = f"{reports[0].policy} on " if named else ""
+    seeds = f", {len(reports)} seeds" if named and len(reports) > 1 else ""
+    return f"{who}{reports[0].title}{end}{seeds}"
+
+
+def _outline(axes: Axes, row: int, column: int) -> None:
+    """A frame of two strokes, visible on dark and on light colours."""
+    x = column + np.array([-0.5, 0.5, 0.5, -0.5, -0.5]) * 0.94
+    y = row + np.array([-0.5, -0.5, 0.5, 0.5, -0.5]) * 0.94
+    for colour, width in (("white", 2.4), ("black", 1.0)):
+        axes.plot(x, y, color=colour, linewidth=width)
+
+
+def _reference(axes: Axes, value: float, label: str, dash: Any) -> None:
+    axes.axhline(value, color=GREY, linewidth=1.1, linestyle=dash, label=label, zorder=1.5)
+
+
+def _tick(axis: Any, labels: Sequence[str]) -> None:
+    """As many of the labels as are legible."""
+    every = -(-len(labels) // 20)
+    axis.set_ticks(range(0, len(labels), every), labels[::every])
+    axis.set_tick_params(length=0)
+
+
+def _tick_visits(axes: Axes, report: StreamReport, *, initial: bool = False) -> None:
+    visits = report.visits
+    every = -(-len(visits) // 15)
+    shown = visits[::every]
+    places, labels = [visit.visit for visit in shown], [str(visit.phase) for visit in shown]
+    if initial:
+        places, labels = [-1, *places], ["initial", *labels]
+    axes.set_xticks(places, labels)
+    axes.set_xlabel("end of the visit of phase")
+
+
+def _shade_visits(axes: Axes, report: StreamReport) -> None:
+    """A band for every other visit, and the phase of each above."""
+    begin, end = 0, axes.get_xlim()[1]
+    few = len(report.visits) <= 20
+    for visit in report.visits:
+        if begin >= end:
+            break
+        until = end if visit is report.visits[-1] else min(visit.lifetime, end)
+        if visit.visit % 2 == 0:
+            axes.axvspan(begin, until, color=GREY, alpha=0.1, linewidth=0, zorder=0)
+        if few:
+            axes.text(
+                (begin + until) / 2, 1.01, f"{visit.phase}", ha="center", va="bottom", fontsize=8,
+                color=GREY, transform=axes.get_xaxis_transform(),
+            )  # fmt: skip
+        begin = visit.lifetime
+    if few:
+        axes.text(
+            0.0, 1.01, "phase ", ha="right", va="bottom", fontsize=8, color=GREY,
+            transform=axes.transAxes,
+        )  # fmt: skip

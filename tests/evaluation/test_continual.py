@@ -1,0 +1,360 @@
+"""Streams: retention without a rollout, the papers' metrics, dynamic regret, reports, seeds."""
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sme_registry import SMESpec, evaluate, materialize
+from sme_registry.errors import (
+    DigestMismatchError,
+    OptionError,
+    PolicyError,
+    SMEError,
+    UnknownNameError,
+)
+from sme_registry.evaluation import (
+    Perceptron,
+    StreamReport,
+    across_seeds,
+    dynamic_regret,
+    evaluate_stream,
+    fresh_per_phase,
+    frozen_after_first,
+)
+from sme_registry.evaluation.continual import metrics
+from sme_registry.evaluation.continual.retention import final_specs
+from sme_registry.spec import StreamSpec
+
+PROTOCOL = {"states_per_region": 300, "epsilons": [0.5, 1.0]}
+SPEC = SMESpec(state_dim=4, action_dim=2, hidden_width=8, complexity=2, horizon=10)
+
+
+def stream_of(*specs, cycles=1, steps=50, **fields):
+    phases = [{"spec": spec, "steps": steps} for spec in specs]
+    return StreamSpec(phases=phases, cycles=cycles, **fields)
+
+
+THREE = stream_of(SPEC, SPEC.derive(seed=1, k=5, r_min=0.5), SPEC.derive(rotation=1.0))
+TWICE = stream_of(SPEC, SPEC.derive(seed=1), cycles=2)
+
+
+def network(seed, inputs=SPEC.state_dim + 2):
+    random = np.random.default_rng(seed)
+    W = random.normal(size=(inputs, SPEC.action_dim)) / 2
+    return Perceptron([(W, np.full(SPEC.action_dim, 0.5), "identity")])
+
+
+def half(observations):
+    return np.full((len(observations), SPEC.action_dim), 0.5)
+
+
+def matrix(report, region="WD"):
+    return np.array(report.region(region).agent.normalised_regret)
+
+
+@functools.cache
+def report(seed=0):
+    policies = [network(3 * seed + v) for v in range(3)]
+    fresh = [network(100 + seed), "linear", half]
+    return evaluate_stream(policies, THREE, PROTOCOL, initial=half, fresh=fresh, name="agent")
+
+
+# Retention
+
+
+def test_the_matrix_has_the_normalised_regret_of_an_evaluation_on_each_phases_task():
+    for j, phase in enumerate(THREE.phases):
+        for v in range(3):
+            single = evaluate(network(v), phase.spec, PROTOCOL)
+            for region in single.regions:
+                found = matrix(report(), region.name)[v, j]
+                assert found == pytest.approx(region.normalised_regret, rel=1e-12)
+        shells = [matrix(report(), name)[:, j] for name in ("OOD 1", "OOD 2")]
+        np.testing.assert_allclose(matrix(report(), "OOD")[:, j], np.mean(shells, axis=0))
+
+
+def test_initial_and_fresh_agents_are_measured_on_their_phases():
+    agent = report().region().agent
+    assert agent.initial_normalised_regret == pytest.approx((1.0, 1.0, 1.0))
+    alone = [network(100), "linear", half]
+    for j, policy in enumerate(alone):
+        # The name of a reference policy stands for that of the first phase.
+        policy = evaluate_stream([policy] * 3, THREE, PROTOCOL)
+        assert agent.fresh_normalised_regret[j] == matrix(policy)[0, j]
+    ratio = np.diag(matrix(report())) / agent.fresh_normalised_regret
+    assert agent.plasticity_ratio == pytest.approx(tuple(ratio))
+    assert agent.final("plasticity_ratio") == pytest.approx(ratio.mean())
+
+
+def test_a_drifting_phase_is_evaluated_on_its_last_piece():
+    drift = {"rotation": 2.0, "increments": 4}
+    stream = StreamSpec(phases=[{"spec": SPEC, "steps": 40, "drift": drift}])
+    assert final_specs(stream) == (SPEC.derive(rotation=1.5),)
+    drifted = evaluate_stream([network(0)], stream, PROTOCOL)
+    last = evaluate_stream([network(0)], stream_of(SPEC.derive(rotation=1.5)), PROTOCOL)
+    assert (matrix(drifted) == matrix(last)).all()
+    assert drifted.visits[0].spec_digest == SPEC.derive(rotation=1.5).digest
+
+
+def test_a_policy_that_observes_the_phase_is_given_that_of_the_task():
+    specs = [SPEC, SPEC.derive(seed=1)]
+    tasks = [materialize(spec) for spec in specs]
+
+    def oracle(observations):
+        assert observations.shape[1] == SPEC.state_dim + 2 + 2
+        (phase,) = np.unique(observations[:, -2:].argmax(axis=1))
+        assert (observations[:, -2:].sum(axis=1) == 1.0).all()
+        return tasks[phase].optimal_action(observations[:, : SPEC.state_dim])
+
+    observed = evaluate_stream([oracle] * 2, stream_of(*specs, observes_phase=True), PROTOCOL)
+    assert np.abs(matrix(observed)).max() < 1e-12
+    with pytest.raises(PolicyError, match=r"policies\[0\].*shape"):
+        evaluate_stream([network(0)] * 2, stream_of(*specs, observes_phase=True), PROTOCOL)
+
+
+def test_each_policy_acts_once_in_each_state():
+    seen = []
+
+    def counted(observations):
+        seen.append(len(observations))
+        observations[:] = 0.0  # must not change what others observe
+        return half(observations)
+
+    evaluate_stream([counted, network(0), counted], THREE, PROTOCOL)
+    assert sum(seen) == 3 * PROTOCOL["states_per_region"]
+    beside = evaluate_stream([counted, network(0), counted], THREE, PROTOCOL)
+    assert (matrix(beside)[1] == matrix(report())[0]).all()
+
+
+def test_reference_agents_are_exact():
+    references = report().regions[0].references
+    M = {name: np.array(each.normalised_regret) for name, each in references.items()}
+    assert M.keys() == {"frozen_optimum", "fresh_optimum", "constant_half"}
+    assert (M["constant_half"] == 1.0).all()
+    assert (np.diag(M["fresh_optimum"]) == 0.0).all()
+    assert (M["frozen_optimum"] == M["fresh_optimum"][0]).all()
+    for j, phase in enumerate(THREE.phases):
+        task = materialize(SPEC)
+        single = evaluate(lambda o: task.optimal_action(o[:, :4]), phase.spec, PROTOCOL)  # noqa: B023
+        assert M["frozen_optimum"][0, j] == pytest.approx(single.wd_regret, abs=1e-12)
+
+
+def test_lives_of_agents_that_are_frozen_or_start_anew():
+    assert frozen_after_first(TWICE, ["a", "b"]) == ["a"] * 4
+    assert fresh_per_phase(TWICE, ["a", "b"]) == ["a", "b", "a", "b"]
+
+
+# Metrics
+
+
+def test_metrics_of_one_cycle_are_those_of_the_papers():
+    T = 5
+    a = np.random.default_rng(0).random((T, T))  # after task i on task j
+    b = np.random.default_rng(1).random(T)  # of the initial policy
+    R, initial = a[..., None], b[:, None]
+    # Lopez-Paz & Ranzato 2017, equations 2 to 4
+    ACC = sum(a[T - 1, i] for i in range(T)) / T
+    BWT = sum(a[T - 1, i] - a[i, i] for i in range(T - 1)) / (T - 1)
+    FWT = sum(a[i - 1, i] - b[i] for i in range(1, T)) / (T - 1)
+    assert metrics.average_performance(R)[-1, 0] == pytest.approx(ACC)
+    assert metrics.backward_transfer(R)[-1, 0] == pytest.approx(BWT)
+    assert metrics.forward_transfer(R, initial)[0] == pytest.approx(FWT)
+    # Chaudhry et al. 2018, equations 2 and 3, for each k
+    for k in range(1, T):
+        f = [max(a[i, j] for i in range(k)) - a[k, j] for j in range(k)]
+        assert metrics.forgetting(R)[k, 0] == pytest.approx(sum(f) / k)
+        A = sum(a[k, j] for j in range(k + 1)) / (k + 1)
+        assert metrics.average_performance(R)[k, 0] == pytest.approx(A)
+    assert np.isnan(metrics.relearning(R)[0])
+
+
+def test_metrics_of_several_cycles_are_by_visits():
+    R = np.array([[0.8, 0.1], [0.2, 0.7], [0.9, 0.3], [0.4, 0.6]])[..., None]
+    assert metrics.backward_transfer(R)[:, 0] == pytest.approx(
+        [np.nan, 0.2 - 0.8, 0.3 - 0.7, 0.4 - 0.9], nan_ok=True
+    )
+    assert metrics.forgetting(R)[:, 0] == pytest.approx(
+        [np.nan, 0.8 - 0.2, 0.7 - 0.3, 0.9 - 0.4], nan_ok=True
+    )
+    assert metrics.average_performance(R)[:, 0] == pytest.approx([0.8, 0.45, 0.6, 0.5])
+    assert metrics.relearning(R)[0] == pytest.approx((0.1 - 0.1) / 2)
+    assert metrics.forward_transfer(R, np.array([[0.5], [0.3]]))[0] == pytest.approx(0.1 - 0.3)
+
+
+def test_plasticity_compares_the_visited_phase_with_a_fresh_agent():
+    M = np.array([[0.2, 1.0], [1.0, 0.6], [0.4, 1.0], [1.0, 0.9]])[..., None]
+    ratio, difference = metrics.plasticity(M, np.array([[0.2], [0.0]]))
+    assert ratio[:, 0] == pytest.approx([1.0, np.nan, 2.0, np.nan], nan_ok=True)
+    assert difference[:, 0] == pytest.approx([0.0, 0.6, 0.2, 0.9])
+
+
+def test_what_cannot_be_compared_is_none():
+    alone = evaluate_stream([half], stream_of(SPEC), PROTOCOL)
+    agent = alone.regions[0].agent
+    assert agent.backward_transfer == agent.forgetting == agent.plasticity_ratio == (None,)
+    assert agent.forward_transfer is agent.relearning is agent.final("forgetting") is None
+    assert "forgetting" not in str(alone)
+
+
+def test_an_unknown_region_is_refused():
+    with pytest.raises(UnknownNameError, match=r"region='OD 1': .* Did you mean 'OOD 1'"):
+        report().region("OD 1")
+
+
+# Dynamic regret
+
+
+@st.composite
+def lives(draw):
+    """A stream, and for each step of a life its regret and phase; and its episodes' lengths."""
+    steps = draw(st.lists(st.integers(3, 12), min_size=1, max_size=3))
+    phases = [{"spec": SPEC.derive(seed=i), "steps": n} for i, n in enumerate(steps)]
+    switch = draw(st.sampled_from(["episode", "step"]))
+    stream = StreamSpec(phases=phases, cycles=draw(st.integers(1, 3)), switch=switch)
+    lengths = draw(st.lists(st.integers(1, 5), min_size=1, max_size=30))
+    regrets = np.random.default_rng(draw(st.integers(0, 9))).random(sum(lengths))
+    return stream, np.array(lengths), regrets
+
+
+@given(lives())
+def test_dynamic_regret_by_visit_is_that_of_the_task_in_force(life):
+    stream, lengths, regrets = life
+    P, V = len(stream.phases), len(stream.phases) * stream.cycles
+    ends = np.cumsum([phase.steps for phase in stream.phases] * stream.cycles)
+    visits = []
+    for begin, length in zip(np.cumsum(lengths) - lengths, lengths, strict=True):
+        for i in range(length):
+            at = begin if stream.switch == "episode" else begin + i
+            visits.append(min(int((ends <= at).sum()), V - 1))
+    expected = np.bincount(visits, regrets)
+    step = np.arange(1, len(regrets) + 1)
+    of_steps = dynamic_regret(stream, step, regrets, phase=np.array(visits) % P)
+    found = [visit.dynamic_regret for visit in of_steps.visits]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert [visit.steps for visit in of_steps.visits] == np.bincount(visits).tolist()
+    assert of_steps.steps == len(regrets)
+    assert of_steps.dynamic_regret == pytest.approx(regrets.sum())
+    np.testing.assert_allclose(of_steps.cumulative_regret, np.cumsum(regrets))
+
+    means = [part.mean() for part in np.split(regrets, np.cumsum(lengths)[:-1])]
+    of_episodes = dynamic_regret(stream, np.cumsum(lengths), means, lengths)
+    by_visit = [visit.dynamic_regret for visit in of_episodes.visits]
+    assert sum(by_visit) == pytest.approx(regrets.sum())
+    if stream.switch == "episode":
+        np.testing.assert_allclose(by_visit, expected, atol=1e-9)
+
+
+def test_an_episode_in_two_visits_is_divided_in_proportion():
+    stream = stream_of(SPEC, SPEC.derive(seed=1), steps=10, switch="step")
+    divided = dynamic_regret(stream, [8, 12], [0.5, 1.0], [8, 4])
+    assert [visit.dynamic_regret for visit in divided.visits] == [4.0 + 2.0, 2.0]
+    assert [visit.steps for visit in divided.visits] == [10, 2]
+    stream = stream_of(SPEC, SPEC.derive(seed=1), steps=10)
+    whole = dynamic_regret(stream, [8, 12], [0.5, 1], [8, 4])
+    assert [visit.dynamic_regret for visit in whole.visits] == [8.0]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (([], []), "step: has no rows"),
+        (([1, 2], [0.5]), "regret=.*must be 2 numbers"),
+        (([1, 2], [0.5, 1.5]), "outside"),
+        (([1, 2], [0.5, float("nan")]), "regret: has NaN"),
+        (([2, 1], [0.5, 0.5]), "must not overlap"),
+        (([4, 6], [0.5, 0.5], 3), "must not overlap"),
+        (([1], [0.5], 1, [3]), r"phase: must be .* in \[0, 2\]"),
+        (([1], [0.5], 1, [1]), "phase: must be .* has begun"),
+    ],
+)
+def test_an_invalid_log_is_refused(columns, message):
+    with pytest.raises(OptionError, match=message):
+        dynamic_regret(THREE, *columns)
+
+
+# Reports
+
+
+def test_a_report_is_the_same_after_it_was_written_and_read(tmp_path):
+    regret = dynamic_regret(THREE, [10, 20], [0.5, 0.25], 10)
+    written = report().with_dynamic_regret(regret)
+    path = written.write(tmp_path / "stream.json")
+    assert StreamReport.read(path) == written
+    assert "dynamic regret 7.5 over 20 steps" in str(written)
+    path.write_text(path.read_text().replace('"switch": "episode"', '"switch": "step"'))
+    with pytest.raises(DigestMismatchError, match="stream_digest"):
+        StreamReport.read(path)
+
+
+def test_the_tables_have_the_reports_numbers():
+    text = str(report())
+    agent = report().regions[0].agent
+    for value in (*np.ravel(agent.normalised_regret), agent.forward_transfer, agent.forgetting[-1]):
+        assert f"{value:.3f}" in text
+    assert f"{report().ood.agent.normalised_regret[1][2]:.3f}" in str_of(report().matrix("OOD"))
+
+
+def str_of(table):
+    from sme_registry.evaluation.report_file import as_text
+
+    return as_text(table)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (([half], THREE), OptionError, "policies=1 of them: must be 3 policies"),
+        ((half, THREE), OptionError, "policies=.*must be 3 policies"),
+        ((["constant", "constant"], THREE), OptionError, "policies=2 of them"),
+        (([half, half, lambda o: o], THREE), PolicyError, r"policies\[2\]: policy 'policy'"),
+        (([half, half, "linaer"], THREE), UnknownNameError, r"policies\[2\]: .*'linear'"),
+        (([half] * 5, "Swich5"), UnknownNameError, "Switch5"),
+    ],
+)
+def test_bad_input_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        evaluate_stream(*arguments, PROTOCOL)
+    assert issubclass(error, SMEError)
+
+
+def test_fresh_agents_are_one_for_each_phase():
+    message = "fresh=1 of them: must be 2 policies, one for each phase"
+    with pytest.raises(OptionError, match=message):
+        evaluate_stream([half] * 4, TWICE, PROTOCOL, fresh=[half])
+
+
+# Seeds
+
+
+def test_the_seed_is_the_unit_of_intervals():
+    reports = [report(seed) for seed in range(5)]
+    estimates = across_seeds(reports)
+    runs = np.array([matrix(each).ravel() for each in reports])
+    from scipy.stats import trim_mean
+
+    np.testing.assert_allclose(estimates["normalised_regret"].value, trim_mean(runs, 0.25))
+    forgetting = estimates["forgetting"]
+    assert np.isnan(forgetting.value[0])
+    assert (forgetting.low[1:] < forgetting.value[1:]).all()
+    assert "dynamic_regret" not in estimates
+    alone = across_seeds(reports[:1], "OOD")
+    assert np.isnan(alone["average_performance"].low).all()
+
+    logs = [
+        each.with_dynamic_regret(dynamic_regret(THREE, [50, 100], [0.1 * i, 0.5], 50))
+        for i, each in enumerate(reports)
+    ]
+    estimates = across_seeds(logs)
+    assert estimates["dynamic_regret"].value == pytest.approx(5 * 2 + 25)
+    assert estimates["visit_dynamic_regret"].value == pytest.approx([10, 25])
+
+
+def test_only_runs_of_one_stream_are_combined():
+    other = evaluate_stream([half] * 4, TWICE, PROTOCOL)
+    with pytest.raises(OptionError, match="2 different values of stream_digest"):
+        across_seeds([report(), other])
+    with pytest.raises(OptionError, match="one or more"):
+        across_seeds([])
