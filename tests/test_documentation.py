@@ -24,7 +24,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
     "page",
     [
         "README.md", "docs/specs.md", "docs/teams.md", "docs/training.md", "docs/datasets.md",
-        "docs/figures.md", "docs/frameworks.md",
+        "docs/figures.md", "docs/frameworks.md", "docs/retention.md",
     ],
 )  # fmt: skip
 def test_the_python_of_a_page_runs_from_top_to_bottom(

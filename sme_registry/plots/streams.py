@@ -13,6 +13,7 @@ from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
 from sme_registry.evaluation.continual.seeds import same_stream
 from sme_registry.plots.style import (
+    COLOURS,
     GREY,
     canvas,
     draw_band,
@@ -123,7 +124,7 @@ def performance_curve(
 
     Args:
       runs, path, region, title, ax: as in `retention_map`; lines are the IQM of several seeds, and
-        bands their quartiles.
+        bands their quartiles, up to seven phases.
 
     Returns:
       The figure.
@@ -146,7 +147,7 @@ def performance_curve(
             style = look(j)
             of_phase = R[..., j]
             middle = iqm(of_phase)
-            if len(R) > 1:
+            if len(R) > 1 and len(COLOURS) >= P:
                 low, high = np.quantile(of_phase, [0.25, 0.75], axis=0)
                 draw_band(axes, x, low, high, style["color"])
             axes.plot(
@@ -157,7 +158,7 @@ def performance_curve(
             axes.plot(x[own], middle[own], **style, markersize=6, linestyle="none")
         _reference(axes, 1.0, "optimal", "-")
         _reference(axes, 0.0, "constant ½", (0, (4, 4)))
-        if len(R) > 1:
+        if len(R) > 1 and len(COLOURS) >= P:
             name_bands(axes, f"quartiles of {len(R)} seeds (line: IQM)")
         _tick_visits(axes, reports[0], initial=x[0] < 0)
         axes.set_ylabel(f"performance in {region}  (1 − normalised regret)")
@@ -358,7 +359,7 @@ def _tick_visits(axes: Axes, report: StreamReport, *, initial: bool = False) -> 
     shown = visits[::every]
     places, labels = [visit.visit for visit in shown], [str(visit.phase) for visit in shown]
     if initial:
-        places, labels = [-1, *places], ["initial", *labels]
+        places, labels = [-1, *places], ["\ninitial", *labels]
     axes.set_xticks(places, labels)
     axes.set_xlabel("end of the visit of phase")
 

@@ -1,0 +1,137 @@
+"""Figures of streams: complete files, the reports' numbers, readable."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec
+from sme_registry.errors import SMEError, UnknownNameError
+from sme_registry.evaluation import dynamic_regret, evaluate_stream
+from sme_registry.spec import StreamSpec
+
+pytest.importorskip("matplotlib")
+
+from sme_registry import plots
+from sme_registry.statistics import iqm
+from tests.geometry import assert_readable
+
+SPEC = SMESpec(state_dim=3, action_dim=2, hidden_width=8)
+PROTOCOL = {"states_per_region": 20, "epsilons": [0.5, 1.0]}
+FIGURES = ("retention_map", "performance_curve", "dynamic_regret_curve", "plasticity_curve")
+
+
+def stream_of(phases, cycles):
+    steps = {"steps": 100}
+    specs = [SPEC.derive(seed=seed) for seed in range(phases)]
+    return StreamSpec(phases=[{"spec": spec, **steps} for spec in specs], cycles=cycles)
+
+
+@functools.cache
+def report(seed, phases=3, cycles=2):
+    stream = stream_of(phases, cycles)
+    random = np.random.default_rng(seed)
+
+    def agent(weight):
+        return lambda observations: 0.5 + (observations[:, :2] - 0.5) * weight
+
+    V = len(stream.phases) * cycles
+    made = evaluate_stream(
+        [agent(weight) for weight in random.normal(size=V)],
+        stream,
+        PROTOCOL,
+        initial="constant",
+        fresh=[agent(weight) for weight in random.normal(size=phases)],
+        name=r"a $\frac$ name",
+    )
+    step = np.arange(10, stream.steps + 1, 10)
+    return made.with_dynamic_regret(dynamic_regret(stream, step, random.random(len(step)), 10))
+
+
+def plain():
+    """A report without fresh agents and without a log."""
+    return evaluate_stream(["constant"] * 2, stream_of(2, 1), PROTOCOL)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_is_written_and_readable(tmp_path, figures, name):
+    draw = getattr(plots, name)
+    for runs in (report(0), [report(0), report(1), report(2)]):
+        draw(runs, tmp_path / f"{name}.pdf")
+    draw(report(0, phases=14, cycles=2), tmp_path / f"{name}.png")
+    assert {path.suffix for path in tmp_path.iterdir()} == {".pdf", ".png"}
+    for figure in figures:
+        assert_readable(figure)
+    assert r"a \$\frac\$ name on SME/sha256-" in figures[0].get_suptitle()
+    assert "3 seeds" in figures[1].get_suptitle()
+
+
+def test_a_retention_map_shows_the_matrix_and_outlines_the_visited_phases(tmp_path, figures):
+    seeds = [report(seed) for seed in range(4)]
+    plots.retention_map(seeds, tmp_path / "map.png", region="OOD 2")
+    axes = figures[0].axes[0]
+    M = iqm([each.region("OOD 2").agent.normalised_regret for each in seeds])
+    np.testing.assert_allclose(axes.images[0].get_array()[1:], M)
+    np.testing.assert_allclose(axes.images[0].get_array()[0], 1.0)  # the initial policy is ½
+    centres = [(line.get_ydata()[:4].mean(), line.get_xdata()[:4].mean()) for line in axes.lines]
+    outlined = {(round(row), round(column)) for row, column in centres}
+    assert outlined == {(v + 1, v % 3) for v in range(6)}
+    assert f"{M[0, 0]:.2f}" in [text.get_text() for text in axes.texts]
+    with pytest.raises(UnknownNameError, match="region='OOD 9'"):
+        plots.retention_map(seeds, region="OOD 9")
+
+
+def test_a_performance_curve_has_a_line_for_each_phase_and_marks_its_visits(tmp_path, figures):
+    plots.performance_curve(report(0), tmp_path / "curve.png")
+    R = 1.0 - np.array(report(0).region().agent.normalised_regret)
+    lines = {line.get_label(): line for line in figures[0].axes[0].lines}
+    own = [line for line in figures[0].axes[0].lines if line.get_linestyle() == "None"]
+    for j in range(3):
+        drawn = lines[f"phase {j}"]
+        np.testing.assert_allclose(drawn.get_ydata(), [0.0, *R[:, j]], atol=1e-12)
+        assert own[j].get_xdata().tolist() == [j, 3 + j]
+        np.testing.assert_allclose(own[j].get_ydata(), R[[j, 3 + j], j])
+
+
+def test_a_dynamic_regret_curve_ends_at_the_sum_and_has_bands_for_visits(tmp_path, figures):
+    runs = {"one": report(0), "two": [report(1), report(2)]}
+    plots.dynamic_regret_curve(runs, tmp_path / "curve.png")
+    axes = figures[0].axes[0]
+    line, median = axes.lines[:2]
+    assert line.get_ydata()[-1] == pytest.approx(report(0).dynamic_regret.dynamic_regret)
+    sums = [report(seed).dynamic_regret.dynamic_regret for seed in (1, 2)]
+    assert median.get_ydata()[-1] == pytest.approx(np.mean(sums))
+    shaded = sorted(patch.get_x() for patch in axes.patches)
+    assert shaded == [0, 200, 400]  # of every other of six visits
+    assert [text.get_text() for text in axes.texts[:-1]] == list("012012")
+    labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert labels[:2] == ["one", "two (n = 2)"]
+
+
+def test_a_plasticity_curve_shows_the_ratio_of_each_visit(tmp_path, figures):
+    plots.plasticity_curve(report(0), tmp_path / "curve.png")
+    ratio = report(0).region().agent.plasticity_ratio
+    assert figures[0].axes[0].lines[0].get_ydata() == pytest.approx(ratio)
+
+
+def test_reports_are_read_from_files_and_folders(tmp_path, figures):
+    report(0).write(tmp_path / "stream.json")
+    plots.retention_map([tmp_path, tmp_path / "stream.json"], tmp_path / "map.png")
+    assert "2 seeds" in figures[0].get_suptitle()
+
+
+@pytest.mark.parametrize(
+    ("draw", "runs", "message"),
+    [
+        (plots.retention_map, [], "one or more stream reports"),
+        (plots.retention_map, 3, "runs=3: must be a StreamReport"),
+        (plots.performance_curve, ["missing.json"], "missing.json"),
+        (plots.plasticity_curve, lambda: [report(0), report(0, 2)], "different values of stream"),
+        (plots.plasticity_curve, lambda: {"a": report(0), "b": report(0, 2)}, "stream_digest"),
+        (plots.plasticity_curve, plain, "has no fresh agents"),
+        (plots.dynamic_regret_curve, plain, "has no dynamic regret"),
+    ],
+)
+def test_bad_input_is_refused(draw, runs, message):
+    with pytest.raises(SMEError, match=message):
+        draw(runs() if callable(runs) else runs)
