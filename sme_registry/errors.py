@@ -2,6 +2,7 @@
 
     SMEError
     ├── SpecError                 an invalid or missing field of a document (also a ValueError)
+    │   ├── StreamError               a stream where a single task is needed
     │   ├── UnexpectedKeywordError    an environment has no such argument (also a TypeError)
     │   ├── MalformedDocumentError    not JSON, or not the JSON of this kind of document
     │   ├── DigestMismatchError       a file's digest is not the digest of its spec
@@ -33,6 +34,10 @@ class SMEError(Exception):
 
 class SpecError(SMEError, ValueError):
     """A field of a document is invalid, missing, unknown, or conflicts with another."""
+
+
+class StreamError(SpecError):
+    """A stream was given where a single task is needed."""
 
 
 class UnexpectedKeywordError(SpecError, TypeError):

@@ -17,29 +17,39 @@ if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from sme_registry.envs.team import SMETeamEnv
-    from sme_registry.spec import SMESpec, SpecLike, StreamSpec
+    from sme_registry.spec import SMESpec, SpecLike, StreamLike, StreamSpec
 
 _S = TypeVar("_S")
 
-_ENTRY_POINTS: dict[str, Any] = {
-    "entry_point": "sme_registry.envs:SMEEnv",
-    "vector_entry_point": "sme_registry.envs:SMEVectorEnv",
+# By the argument of the environment that takes the document.
+_ENTRY_POINTS: dict[str, dict[str, Any]] = {
+    "spec": {
+        "entry_point": "sme_registry.envs:SMEEnv",
+        "vector_entry_point": "sme_registry.envs:SMEVectorEnv",
+    },
+    "stream": {
+        "entry_point": "sme_registry.envs:SMEStreamEnv",
+        "vector_entry_point": "sme_registry.envs:SMEStreamVectorEnv",
+    },
 }
 
 
-def _register(env_id: str, spec: dict[str, Any] | str, team: bool) -> None:
-    """Register an id with PettingZoo for a team; else with Gymnasium, and its symmetric id."""
+def _register(env_id: str, argument: str, document: dict[str, Any] | str) -> None:
+    """Register an id with Gymnasium, and its symmetric id."""
     from sme_registry.spec.catalogue import symmetric_name
 
+    kwargs, entry_points = {argument: document}, _ENTRY_POINTS[argument]
+    gymnasium.register(env_id, **entry_points, kwargs=kwargs)
+    if "/sha256-" not in env_id:
+        symmetric = {**kwargs, "action_range": "symmetric"}
+        gymnasium.register(symmetric_name(env_id), **entry_points, kwargs=symmetric)
+
+
+def _register_team(env_id: str, spec: dict[str, Any] | str) -> None:
+    """Register the id of a team with PettingZoo."""
     kwargs = {"spec": spec}
-    if team:
-        pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
-        pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
-    else:
-        gymnasium.register(env_id, **_ENTRY_POINTS, kwargs=kwargs)
-        if "/sha256-" not in env_id:
-            symmetric = {**kwargs, "action_range": "symmetric"}
-            gymnasium.register(symmetric_name(env_id), **_ENTRY_POINTS, kwargs=symmetric)
+    pettingzoo.register("parallel", env_id, "sme_registry.teams:parallel_env", kwargs=kwargs)
+    pettingzoo.register("aec", env_id, "sme_registry.teams:env", kwargs=kwargs)
 
 
 def _is_registered(env_id: str) -> bool:
@@ -47,43 +57,55 @@ def _is_registered(env_id: str) -> bool:
 
 
 def register_catalogue() -> None:
-    """Register every file of `specs/envs` by its name and by its content, without validation.
+    """Register every task and stream of `specs/` by its name and by its content, unvalidated.
 
-    The name of a single agent's task is registered once more with actions in [−1, 1]:
-    `SME/DefaultSymmetric-v1`.
+    The name of a single agent's task or of a stream is registered once more with actions in
+    [−1, 1]: `SME/DefaultSymmetric-v1`. A stream also has the name `SME/StreamSwitch5-v1`.
 
     Gymnasium's `register` scans its whole registry each time: keep this to the catalogue.
     """
-    from sme_registry.spec.catalogue import NAMESPACE, released
+    from sme_registry.spec.catalogue import NAMESPACE, STREAM, released
 
-    for versioned_name, content_name, team in released():
+    for kind, versioned_name, content_name in released():
         version = versioned_name.rsplit("-v", 1)[1]
-        for name in (versioned_name, f"{content_name}-v{version}"):
-            if not _is_registered(f"{NAMESPACE}/{name}"):
-                _register(f"{NAMESPACE}/{name}", versioned_name, team)
+        names = [versioned_name, f"{content_name}-v{version}"]
+        if kind == "stream":
+            names.append(f"{STREAM}{versioned_name}")
+        for env_id in (f"{NAMESPACE}/{name}" for name in names):
+            if _is_registered(env_id):
+                continue
+            if kind == "team":
+                _register_team(env_id, versioned_name)
+            else:
+                _register(env_id, kind, versioned_name)
 
 
-def register(spec: SMESpec, name: str) -> str:
-    """Register a spec under a name, in this process.
+def register(spec: SMESpec | StreamSpec, name: str) -> str:
+    """Register a spec or a stream under a name, in this process.
 
     Args:
-      spec: the spec, or its fields as a mapping.
+      spec: the spec or stream, or its fields as a mapping.
       name: letters, digits, '_' and '-', as in `MyTask` or `MyTask-v1`.
 
     Returns:
-      The id, such as `SME/MyTask-v1`. A single agent's task can also be made by
+      The id, such as `SME/MyTask-v1`. A single agent's task and a stream can also be made by
       `SME/MyTaskSymmetric-v1`, with actions in [−1, 1].
 
     Raises:
       OptionError: the name has invalid characters, or ends with "Symmetric".
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
     """
-    from sme_registry.spec import as_spec
+    from sme_registry.envs.base import argument_of
+    from sme_registry.spec import StreamSpec, as_spec, as_stream
     from sme_registry.spec.catalogue import NAMESPACE, SYMMETRIC
-    from sme_registry.spec.resolve import registered, resolve
+    from sme_registry.spec.resolve import names_stream, registered, registered_streams
     from sme_registry.task.streams import DYNAMICS_VERSION
 
-    spec = as_spec(spec)
+    document = (
+        as_stream(cast("StreamSpec", spec))
+        if names_stream(spec)
+        else as_spec(cast("SMESpec", spec))
+    )
     short = str(name).removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{DYNAMICS_VERSION}")
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", short) or re.search(r"-v\d+$", short):
         raise OptionError(
@@ -97,16 +119,29 @@ def register(spec: SMESpec, name: str) -> str:
         )
     env_id = f"{NAMESPACE}/{short}-v{DYNAMICS_VERSION}"
     if _is_registered(env_id):
-        existing = resolve(env_id).spec
-        if existing == spec:
+        existing = _document_of(env_id)
+        if existing == document:
             return env_id
         raise NameTakenError(
-            f"{env_id!r} stands for another spec ({existing.digest[:19]}…). Choose another "
-            "name: a released id never changes its numbers."
+            f"{env_id!r} stands for another {argument_of(existing)} ({existing.digest[:19]}…). "
+            "Choose another name: a released id never changes its numbers."
         )
-    _register(env_id, spec.to_dict(), spec.team is not None)
-    registered[env_id] = spec.named(env_id)
+    if isinstance(document, StreamSpec):
+        registered_streams[env_id] = document.named(env_id)
+    else:
+        registered[env_id] = document.named(env_id)
+        if document.team is not None:
+            _register_team(env_id, document.to_dict())
+            return env_id
+    _register(env_id, argument_of(document), document.to_dict())
     return env_id
+
+
+def _document_of(name: str) -> SMESpec | StreamSpec:
+    """The spec or the stream that a name stands for; draws nothing."""
+    from sme_registry.spec.resolve import names_stream, resolve, resolve_stream
+
+    return resolve_stream(name).stream if names_stream(name) else resolve(name).spec
 
 
 @overload
@@ -188,11 +223,11 @@ def save(
     return Path(path)
 
 
-def env_spec(spec: SpecLike, **kwargs: Any) -> EnvSpec:
-    """Gymnasium's `EnvSpec` of any spec, unregistered; its kwargs are plain JSON.
+def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
+    """Gymnasium's `EnvSpec` of any spec or stream, unregistered; its kwargs are plain JSON.
 
     Args:
-      spec: the spec, or a name, digest or path as for `load`.
+      spec: the spec or stream, or a name, digest or path as for `load`.
       **kwargs: spec fields to override, which give the derived spec its own id; and arguments of
         the environment, such as `action_range`.
 
@@ -200,24 +235,32 @@ def env_spec(spec: SpecLike, **kwargs: Any) -> EnvSpec:
       What `gymnasium.make` and `gymnasium.make_vec` take in place of an id.
 
     Raises:
-      UnknownNameError, SpecError: see `load`.
+      UnknownNameError, SpecError: see `load`. A stream has no fields of a spec to override.
       FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
     """
+    from sme_registry.envs import SMEStreamEnv, arguments
     from sme_registry.envs.base import content_id
     from sme_registry.spec import SMESpec
-    from sme_registry.task import load_spec
+    from sme_registry.spec.resolve import names_stream
+    from sme_registry.task import load_spec, load_stream
 
+    if names_stream(spec):
+        for name in SMESpec.model_fields.keys() & kwargs.keys():
+            arguments.refuse_override(SMEStreamEnv, name)
+        stream = load_stream(cast("StreamLike", spec))
+        kwargs = {"stream": stream.to_dict(), **kwargs}
+        return EnvSpec(id=content_id(stream), **_ENTRY_POINTS["stream"], kwargs=kwargs)
     overrides = {name: kwargs.pop(name) for name in [*kwargs] if name in SMESpec.model_fields}
-    derived = load_spec(spec).derive(**overrides)
+    derived = load_spec(cast("SpecLike", spec)).derive(**overrides)
     kwargs = {"spec": derived.to_dict(), **kwargs}
-    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS, kwargs=kwargs)
+    return EnvSpec(id=content_id(derived), **_ENTRY_POINTS["spec"], kwargs=kwargs)
 
 
-def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """`gymnasium.make` for an id, a digest, a path or a spec.
+def make(spec_or_id: SpecLike | StreamLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """`gymnasium.make` for an id, a digest, a path, a spec or a stream.
 
     Args:
-      spec_or_id: the task.
+      spec_or_id: the task or stream.
       **kwargs: spec fields to override (`complexity=10`), `action_range`, `render_mode`, and
         other arguments of `gymnasium.make`.
 
@@ -231,14 +274,14 @@ def make(spec_or_id: SpecLike, **kwargs: Any) -> gymnasium.Env[Any, Any]:
 
 
 def make_vec(
-    spec_or_id: SpecLike,
+    spec_or_id: SpecLike | StreamLike,
     num_envs: int = 1,
     **kwargs: Any,
 ) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
-    """`gymnasium.make_vec` for an id, a digest, a path or a spec; native batch by default.
+    """`gymnasium.make_vec` for an id, a digest, a path, a spec or a stream; a native batch.
 
     Args:
-      spec_or_id: the task.
+      spec_or_id: the task or stream.
       num_envs: the lanes.
       **kwargs: spec fields to override, `action_range`, `autoreset_mode`, and other
         arguments of `gymnasium.make_vec`.
@@ -249,7 +292,7 @@ def make_vec(
     return gymnasium.make_vec(registered_or_new(spec_or_id), num_envs=num_envs, **kwargs)
 
 
-def registered_or_new(spec_or_id: SpecLike) -> EnvSpec:
+def registered_or_new(spec_or_id: SpecLike | StreamLike) -> EnvSpec:
     """The `EnvSpec` of an id as it is registered, which keeps the id's name; else `env_spec`."""
     if isinstance(spec_or_id, str):
         name = spec_or_id.removeprefix("sme_registry:")

@@ -23,8 +23,8 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 @pytest.mark.parametrize(
     "page",
     [
-        "README.md", "docs/specs.md", "docs/teams.md", "docs/training.md", "docs/datasets.md",
-        "docs/figures.md", "docs/frameworks.md", "docs/retention.md",
+        "README.md", "docs/specs.md", "docs/streams.md", "docs/teams.md", "docs/training.md",
+        "docs/datasets.md", "docs/figures.md", "docs/frameworks.md", "docs/retention.md",
     ],
 )  # fmt: skip
 def test_the_python_of_a_page_runs_from_top_to_bottom(

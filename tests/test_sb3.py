@@ -310,3 +310,39 @@ def test_a_vec_env_is_shown_with_its_task_and_its_lanes() -> None:
     name = SMEVecEnv("Default", 2, k=3).get_attr("sme_spec")[0].content_name
     assert repr(SMEVecEnv("Default", 2, k=3)) == f"SMEVecEnv(SME/{name}, num_envs=2)"
     assert "num_envs=8, 2 teams of 4 agents" in repr(SMETeamVecEnv("Team4", 2))
+
+
+@pytest.mark.parametrize("switch", ["episode", "step"])
+def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch: str) -> None:
+    fields = {"horizon": 12, "D": 0.3, "complexity": 2}
+    phases = [{"spec": fields | {"k": k, "seed": k}, "steps": 40} for k in (5, 2)]
+    stream = sme_registry.StreamSpec(phases=phases, cycles=2, switch=switch, observes_phase=True)
+    ours, theirs = SMEVecEnv(stream, 3), dummy(stream, 3)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.seed(1) == theirs.seed(1)
+    assert_same(ours.reset(), theirs.reset())
+    assert_same(ours.reset_infos, theirs.reset_infos)
+    rng = np.random.default_rng(0)
+    lifetimes = set()
+    for t in range(200):
+        lanes = zip(ours.get_attr("task"), ours.get_attr("state"), strict=True)
+        optimal = np.array([task.optimal_action(s) for task, s in lanes])
+        share = rng.uniform(0.0, 0.6, (3, 1))
+        action = 2 * ((1 - share) * optimal + share * rng.random(optimal.shape)) - 1
+        got, expected = ours.step(action.astype(np.float32)), theirs.step(action.astype(np.float32))
+        assert_same(got, expected)
+        assert_same(ours.reset_infos, theirs.reset_infos)
+        lifetimes.add(got[3][0]["lifetime"] - t)
+        if t == 90:
+            assert_same(ours.reset(), theirs.reset())  # goes on
+            ours = pickle.loads(pickle.dumps(ours))
+    assert lifetimes == {1}
+    assert ours.env_method("reset", indices=1, seed=0)[0][1]["lifetime"] == 0
+    assert ours.get_attr("spec", 0)[0].id == f"SME/{stream.content_name}-v1"
+
+
+def test_sb3_learns_on_a_stream_by_name() -> None:
+    env = VecMonitor(SMEVecEnv("Switch5", 2))
+    PPO("MlpPolicy", env, n_steps=32, batch_size=16, n_epochs=1, device="cpu").learn(64)
+    with pytest.raises(SpecError, match="for a stream"):
+        SMEVecEnv("Switch5", 2, complexity=3)

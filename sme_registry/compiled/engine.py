@@ -194,7 +194,8 @@ def _numpy_engine(task: Task) -> Engine:
             return False
         done = step(task, np.ascontiguousarray(s.T), t, accumulated.T, action)
         moved[:] = done.state.T
-        observation[:] = observe(task.spec, done.state, t + 1, done.accumulated_reward)
+        observed = observe(task.spec, done.state, t + 1, done.accumulated_reward)
+        observation[:, : observed.shape[1]] = observed  # a stream may append its phase
         optimal[:] = done.optimal_action
         values[SIMILARITY] = done.similarity.T
         values[STEP_REWARD] = done.step_reward.T

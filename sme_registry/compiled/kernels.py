@@ -178,7 +178,8 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
     lane[v + _REWARD] = reward
     lane[v + _R_CUM] = accumulated
     observation[S] = t / T
-    observation[S + _U1] = accumulated / k
+    waiting = accumulated / k
+    observation[S + _U1] = waiting if waiting < 1.0 else 1.0
     return reward, end
 
 
@@ -401,7 +402,8 @@ def _block_payout(p, first, count, t, accumulated, column, values, ends, observa
                 kept = 0.0 if paid else total
                 values[REWARD, agent, i] = total if paid else 0.0
                 values[ACCUMULATED_REWARD, agent, i] = kept
-                column[lane] = kept / k
+                waiting = kept / k  # above 1 only where a stream went on to a smaller k
+                column[lane] = waiting if waiting < 1.0 else 1.0
         for lane in range(count):
             observation[first + lane, S + 1 + agent] = column[lane]
     for lane in range(count):

@@ -8,12 +8,13 @@ the task's digest.
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.envs.stream_tasks import StreamTasks
 from sme_registry.envs.types import Array, Mask
 from sme_registry.errors import (
     ActionError,
@@ -24,8 +25,9 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike
-from sme_registry.task import Task, load_task
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike
+from sme_registry.spec.resolve import resolve_stream
+from sme_registry.task import Task, load_task, materialize_stream
 
 
 def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
@@ -46,6 +48,38 @@ def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]
                 f"{did_you_mean(name, [*named, *fields]) or ' Remove it.'}"
             )
     return load_task(spec, **overrides)
+
+
+def load_stream_tasks(
+    environment: type, stream: StreamLike, overrides: dict[str, Any]
+) -> StreamTasks:
+    """The tasks of a stream; an environment class of streams was called with these overrides.
+
+    Raises:
+      UnexpectedKeywordError: there is an override: a stream has no fields of a spec to change.
+      SpecError, UnknownNameError, ResourceLimitError: see `load_stream`.
+    """
+    for name in overrides:
+        refuse_override(environment, name)
+    resolved = resolve_stream(stream)
+    return StreamTasks(resolved.stream, materialize_stream(resolved.stream, resolved.fingerprints))
+
+
+def refuse_override(environment: type, name: str) -> NoReturn:
+    """Raise UnexpectedKeywordError on a keyword that is no argument of a stream's environment."""
+    parameters = inspect.signature(environment).parameters.values()
+    named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    advice = did_you_mean(name, named) or " Remove it."
+    if name in SMESpec.model_fields:
+        advice = (
+            " It is a field of specs: to change it, make another stream in Python, such as "
+            f"`StreamSpec(phases=[{{'spec': phase.spec.derive({name}=…), 'steps': phase.steps}} "
+            "for phase in stream.phases])`."
+        )
+    raise UnexpectedKeywordError(
+        f"{environment.__name__}() got an unexpected keyword argument {name!r} for a stream: must "
+        f"be {', '.join(named)}.{advice}"
+    )
 
 
 def action_space(action_range: str, action_dim: int) -> tuple[gymnasium.spaces.Box, bool]:

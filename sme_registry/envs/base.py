@@ -11,7 +11,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from sme_registry.errors import EpisodeError, OptionError, WrapperError
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.catalogue import NAMESPACE
 from sme_registry.task import Task
 from sme_registry.task.streams import DYNAMICS_VERSION
@@ -34,6 +34,11 @@ class TaskMixin:
         """The spec of the task that is run, overrides included."""
         return self._task.spec
 
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the environment runs: its spec, or a stream."""
+        return self._task.spec
+
 
 class GymnasiumMixin(TaskMixin):
     """A task's environment in Gymnasium's registry."""
@@ -50,7 +55,7 @@ class GymnasiumMixin(TaskMixin):
 
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
-        self._env_spec = renamed_by_content(value, self.sme_spec)
+        self._env_spec = renamed_by_content(value, self.document)
 
 
 class RenderMixin(TaskMixin):
@@ -124,12 +129,17 @@ def check_time_limit(max_episode_steps: int, horizon: int) -> None:
         )
 
 
-def content_id(spec: SMESpec) -> str:
+def content_id(document: SMESpec | StreamSpec) -> str:
     """`SME/sha256-<first 12 hex of the digest>-v1`."""
-    return f"{NAMESPACE}/{spec.content_name}-v{DYNAMICS_VERSION}"
+    return f"{NAMESPACE}/{document.content_name}-v{DYNAMICS_VERSION}"
 
 
-def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | None:
+def argument_of(document: SMESpec | StreamSpec) -> str:
+    """The argument of an environment that takes the document: "spec" or "stream"."""
+    return "stream" if isinstance(document, StreamSpec) else "spec"
+
+
+def renamed_by_content(env_spec: EnvSpec | None, document: SMESpec | StreamSpec) -> EnvSpec | None:
     """Gymnasium's spec of an environment, as plain JSON; a derived task gets the id of its content.
 
     `SME/Default-v1` with `complexity=10` is another task, and must not be recorded under the name
@@ -140,7 +150,8 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
         return None
     fields = SMESpec.model_fields.keys()
     registered = gymnasium.registry.get(env_spec.id)
-    task = env_spec.kwargs.get("spec")
+    argument = argument_of(document)
+    value = env_spec.kwargs.get(argument)
     is_named = registered is None or registered.kwargs.items() <= env_spec.kwargs.items()
     named = is_named and not fields & env_spec.kwargs.keys()
 
@@ -150,11 +161,11 @@ def renamed_by_content(env_spec: EnvSpec | None, spec: SMESpec) -> EnvSpec | Non
         for key, value in plain.kwargs.items()
         if key not in fields and key != "max_episode_steps"
     }
-    plain.max_episode_steps = spec.horizon
-    if not named or not isinstance(task, str | dict):
-        plain.kwargs["spec"] = spec.to_dict()
+    plain.max_episode_steps = document.horizon
+    if not named or not isinstance(value, str | dict):
+        plain.kwargs[argument] = document.to_dict()
     if not named:
-        plain.id = content_id(spec)
+        plain.id = content_id(document)
         # EnvSpec derives these from the id only in its constructor.
         plain.name = plain.id.removeprefix(f"{NAMESPACE}/").rsplit("-v", 1)[0]
         plain.version = DYNAMICS_VERSION

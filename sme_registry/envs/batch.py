@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import engine
+from sme_registry.compiled.engine import StepMany
 from sme_registry.compiled.values import ROWS
 from sme_registry.envs.arguments import not_finite_error
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import ActionError
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import Task, observe
 from sme_registry.task.memory import refuse_above_limit
 
@@ -32,7 +36,8 @@ class BatchStep(NamedTuple):
     """The result of one step of all lanes; no later step writes to an array that is still held.
 
     Attributes:
-      observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k.
+      observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
+        shows its phase, one-hot behind them.
       optimal: `[B, A]` π* of the states acted in, in the unit range.
       values: `[5, n, B]` the rows of `compiled.values`: similarity, step reward, regret, reward,
         and r_cum after a payout.
@@ -148,6 +153,8 @@ class Batch:
       ResourceLimitError: a batch this large would not fit in memory.
     """
 
+    lived: Mapping[str, Lanes] = MappingProxyType({})  # `life()` at the end of the last step
+
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
         self._shape = (lanes, A)
@@ -165,11 +172,21 @@ class Batch:
         self._reuse = reuse
         self._load_engine()
 
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What is run: the task's spec."""
+        return self.task.spec
+
+    @property
+    def observation_dim(self) -> int:
+        """Entries of a joint observation, S + 1 + n."""
+        return self.task.spec.state_dim + 1 + len(self._accumulated)
+
     def _load_engine(self) -> None:
         S, A, n = self.task.spec.state_dim, self.task.spec.action_dim, len(self._accumulated)
-        self._step_many = engine(self.task).step_many
+        self._step_many: StepMany = engine(self.task).step_many
         self._moved = np.empty((S, self.lanes))
-        results = _Results(self.lanes, S + 1 + n, A, n)
+        results = _Results(self.lanes, self.observation_dim, A, n)
         in_turn = itertools.cycle([results.take(), results.take()])
         self._take = in_turn.__next__ if self._reuse else results.take
 
@@ -186,6 +203,22 @@ class Batch:
     def state(self) -> Array:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._s.T.copy()  # a copy even where the transpose is contiguous
+
+    def task_of(self, lane: int) -> Task:
+        """The task of a lane, which is that of every lane."""
+        return self.task
+
+    def life(self) -> dict[str, Lanes]:
+        """What infos say of each lane's life, `[B]`, at a reset; nothing, for a task."""
+        return {}
+
+    def life_of(self, lane: int) -> dict[str, Any]:
+        """The same of one lane, as NumPy's numbers."""
+        return {}
+
+    def seed(self, lane: int, seed: int) -> None:
+        """Restart the generator of a lane's initial states."""
+        self.initial_states.seed(lane, seed)
 
     def observe(self) -> Observation:
         """The present joint observations of all lanes, `[B, S + 1 + n]`."""
@@ -214,11 +247,13 @@ class Batch:
         self._t[:] = t
         self._accumulated[:] = accumulated.T
 
-    def advance(self, actions: Array) -> BatchStep:
+    def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
         """One step of every lane.
 
         Args:
           actions: `[B, A]` float64 of the unit range; clipped.
+          resting: `[B]` lanes whose step is not one of their environment, since their episodes have
+            ended; None: no lane.
 
         Raises:
           ActionError: of another shape, or not finite; no lane has changed then.

@@ -42,7 +42,9 @@ class BatchRenderer:
             raise OptionError(f"render_lanes={lanes!r}: must be a list of lanes, such as [0, 1].")
         chosen = [integer_in("render_lanes", lane, 0, batch.lanes - 1) for lane in chosen]
         self._batch, self._space = batch, space
-        self._renderers = {lane: Renderer(batch.task, "rgb_array", METADATA) for lane in chosen}
+        self._renderers = {
+            lane: Renderer(batch.task_of(lane), "rgb_array", METADATA) for lane in chosen
+        }
 
     def record(
         self, began: Iterable[int], unit: Array | None = None, step: BatchStep | None = None
@@ -56,7 +58,11 @@ class BatchRenderer:
         """
         states, reset = self._batch.state, set(began)
         for lane, renderer in self._renderers.items():
-            view: Any = SimpleNamespace(state=states[lane], action_space=self._space)
+            view: Any = SimpleNamespace(
+                state=states[lane],
+                action_space=self._space,
+                sme_spec=self._batch.task_of(lane).spec,
+            )
             if lane in reset:
                 renderer.record(view, None)
             elif unit is not None and step is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from sme_registry.envs.types import Array
+from sme_registry.spec import SMESpec
+from sme_registry.task import Task
 
 
 class Lane:
@@ -13,7 +15,7 @@ class Lane:
     Args:
       owner: the batched environment.
       index: the row of the batch.
-      **shared: attributes with the same value in each lane, such as `task` and `action_space`.
+      **shared: attributes with the same value in each lane, such as `action_space`.
     """
 
     def __init__(self, owner: Any, index: int, **shared: Any) -> None:
@@ -25,6 +27,17 @@ class Lane:
         """The present state s, `[S]` float64 in [0, 1] (a copy)."""
         state: Array = self._owner._batch.state[self._index]
         return state
+
+    @property
+    def task(self) -> Task:
+        """The task that the lane runs; of a stream the one in force."""
+        task: Task = self._owner._batch.task_of(self._index)
+        return task
+
+    @property
+    def sme_spec(self) -> SMESpec:
+        """Its spec."""
+        return self.task.spec
 
     @property
     def unwrapped(self) -> Lane:

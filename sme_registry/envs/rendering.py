@@ -85,7 +85,7 @@ class Renderer:
         Raises:
           OptionError: no window can be opened in mode "human".
         """
-        self._state = env.state
+        self._state, self._spec = env.state, env.sme_spec  # a stream's spec may change
         if last is None:
             self._begun = True
             self._similarities: list[float] = []

@@ -27,6 +27,7 @@ from sme_registry.envs.types import Action, Array, Observation
 from sme_registry.errors import EpisodeError
 from sme_registry.spec import ActionRange, SpecLike
 from sme_registry.spec.catalogue import title
+from sme_registry.task import Task
 
 _FLOAT32 = np.dtype(np.float32)
 _POOL_BYTES = 4096
@@ -65,14 +66,25 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        self._task = arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
+        self._task = self._load(spec, overrides)
         S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
         space, self._rescaled = arguments.action_space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)
-        self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (S + 2,), np.float32)
+        width = S + 2 + len(self._phase_shown)
+        self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._action_shape = (A,)
         self._state = "created"
         self._load_engine()
+
+    # What `SMEStreamEnv` has besides. They stand here because a step of a stream is a step of its
+    # task: one that called this one would cost a sixth more.
+    _phase: Any = None  # in force, NumPy's number
+    _lifetimes: list[Any] | None = None  # those of the next steps, the last one first
+    _phase_shown: Observation = np.empty(0, np.float32)  # what observations end with
+
+    def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
+        """The task at the beginning."""
+        return arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
 
     def _load_engine(self) -> None:
         compiled = engine(self._task)
@@ -97,13 +109,17 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._buffer,
             self._rows.pop,
             *self._values,
+            self._phase,
+            self._lifetimes,
         )
 
     def _refill(self) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
-        S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
+        S, A, shown = self.sme_spec.state_dim, self.sme_spec.action_dim, self._phase_shown
         count = max(1, _POOL_BYTES // (8 * max(S + 2, A)))
-        optimal, observations = np.empty((count, A)), np.empty((count, S + 2), np.float32)
+        optimal = np.empty((count, A))
+        observations = np.empty((count, S + 2 + len(shown)), np.float32)
+        observations[:, S + 2 :] = shown
         self._rows.extend(zip(optimal, observations, strict=True))
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
@@ -152,16 +168,21 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         if options and "state" in options:
             start = arguments.initial_states(options["state"], (S,))
         super().reset(seed=seed)  # nothing changes before every argument is checked
+        life = self._begin_life(seed)
         s = self.np_random.random(S) if start is None else start
         self._lane[:LANE_STATE] = 0.0
         self._lane[LANE_STATE:] = s
-        observation = np.zeros(S + 2, np.float32)
-        observation[:S] = s
+        observation = np.zeros(S + 2 + len(self._phase_shown), np.float32)
+        observation[:S], observation[S + 2 :] = s, self._phase_shown
         self._state = "running"
         self._prepare_step()
         if self.render_mode is not None:
             self._record(self, None)
-        return observation, infos.at_reset(self._action_shape[0])
+        return observation, {**infos.at_reset(self._action_shape[0]), **life}
+
+    def _begin_life(self, seed: int | None) -> dict[str, Any]:
+        """Called by each reset before it draws a state; what it returns is added to the info."""
+        return {}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -179,7 +200,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         # Written for speed: each look-up and branch here costs one percent of a step.
         (
             plain_dtype, step_float32, buffer, next_rows,
-            similarity, step_reward, regret, accumulated_reward,
+            similarity, step_reward, regret, accumulated_reward, phase, lifetimes,
         ) = self._fast_step  # fmt: skip
         try:
             optimal, observation = next_rows()
@@ -195,19 +216,33 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         else:
             action = self._checked(action)
             reward, end = self._step_float64(buffer, action, optimal, observation)
-        info = {
-            "optimal_action": optimal,
-            "similarity": similarity[()],
-            "step_reward": step_reward[()],
-            "regret": regret[()],
-            "accumulated_reward": accumulated_reward[()],
-        }
+        if lifetimes is None:
+            info = {
+                "optimal_action": optimal,
+                "similarity": similarity[()],
+                "step_reward": step_reward[()],
+                "regret": regret[()],
+                "accumulated_reward": accumulated_reward[()],
+            }
+        else:  # written out: a dictionary that grows to seven keys costs twice as much
+            info = {
+                "optimal_action": optimal,
+                "similarity": similarity[()],
+                "step_reward": step_reward[()],
+                "regret": regret[()],
+                "accumulated_reward": accumulated_reward[()],
+                "phase": phase,
+                "lifetime": lifetimes.pop(),
+            }
+            plain = plain and lifetimes
         if end or not plain:
-            self._after(end, action, info)
+            self._after(end, action, info, observation)
             return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
         return observation, reward, False, False, info
 
-    def _after(self, end: float, action: Action, info: dict[str, Any]) -> None:
+    def _after(
+        self, end: float, action: Action, info: dict[str, Any], observation: Observation
+    ) -> None:
         """What the fast path leaves out: refused actions, the end, other ranges, frames."""
         if end < 0.0:
             self._checked(action)  # raises where the size is wrong
@@ -220,7 +255,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
 
     def __repr__(self) -> str:
-        return f"SMEEnv({title(self.sme_spec)})"
+        return f"{type(self).__name__}({title(self.document)})"
 
     def _checked(self, action: Any) -> Array:
         """The action as `[A]` float64 in the unit range."""

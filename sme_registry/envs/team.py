@@ -301,7 +301,9 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     def _joint_view(self) -> SimpleNamespace:
         """What a renderer needs of an environment, of all agents together."""
-        return SimpleNamespace(state=self.state(), action_space=self._joint_space)
+        return SimpleNamespace(
+            state=self.state(), action_space=self._joint_space, sme_spec=self.sme_spec
+        )
 
     def _record_step(self, joint: Array, done: BatchStep) -> None:
         """Record a step of the team as one: all channels, and the means over the agents."""

@@ -20,7 +20,7 @@ from sme_registry.envs.rendering import Frame
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ActionRange, SpecLike
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamSpec
 from sme_registry.spec.catalogue import title
 
 _NO_LANE: Lanes = np.empty(0, np.int64)
@@ -65,15 +65,14 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**METADATA, "autoreset_mode": self.autoreset_mode}
         self.render_mode = render_mode
-        self._task = arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
-        sme = self._task.spec
+        self._batch = self._load(spec, num_envs, overrides)
+        self._task = self._batch.task
         if max_episode_steps is not None:
-            check_time_limit(max_episode_steps, sme.horizon)
-        self._batch = Batch(self._task, num_envs)
+            check_time_limit(max_episode_steps, self.document.horizon)
         self.num_envs = num_envs
-        S, A = sme.state_dim, sme.action_dim
+        A, width = self.document.action_dim, self._batch.observation_dim
         self.single_action_space, self._rescaled = arguments.action_space(action_range, A)
-        self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (S + 2,), np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._renderer = batch_renderer(
@@ -84,6 +83,16 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self._ended = np.zeros(num_envs, bool)
         self._all_begun, self._any_ended = False, False
         self._lanes: list[Lane] = []
+
+    def _load(self, spec: Any, num_envs: int, overrides: dict[str, Any]) -> Batch:
+        """The batch that is stepped."""
+        task = arguments.load_overridden(type(self), spec, overrides)
+        return Batch(arguments.single_agent(task), num_envs)
+
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the environment runs: its spec, or a stream."""
+        return self._batch.document
 
     @property
     def state(self) -> Array:
@@ -116,7 +125,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         seeds = self._seeds(seed)[lanes]
         states = None
         if "state" in options:
-            S = self.sme_spec.state_dim
+            S = self.document.state_dim
             one_for_all = np.asarray(options["state"], dtype=object).ndim == 1
             shape = (S,) if one_for_all else (self.num_envs, S)
             states = arguments.initial_states(options["state"], shape)
@@ -124,15 +133,15 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         # Every argument is checked: from here on, the state changes.
         for lane, lane_seed in zip(lanes, seeds, strict=True):
             if lane_seed is not None:
-                self._batch.initial_states.seed(int(lane), lane_seed)
+                self._batch.seed(int(lane), lane_seed)
         observation = self._batch.observe()
         self._begin(lanes, observation, states)
         self._begun[lanes] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
         if self._renderer is not None:
             self._renderer.record(lanes.tolist())
-        info = infos.batch_at_reset(self.num_envs, self.sme_spec.action_dim)
-        return observation, infos.masked(info, mask)
+        info = infos.batch_at_reset(self.num_envs, self.document.action_dim)
+        return observation, infos.masked({**info, **self._batch.life()}, mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
         self, actions: Any
@@ -149,7 +158,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
           ActionError: wrong shape, not numbers, or not finite; the states are unchanged then.
           EpisodeError: before the first reset, or (mode "Disabled") lanes have ended.
         """
-        B, A = self.num_envs, self.sme_spec.action_dim
+        B, A = self.num_envs, self.document.action_dim
         if not self._all_begun:
             raise EpisodeError("step: the episodes have not begun. Call reset() first.")
         ended_before, any_ended_before = self._ended, self._any_ended
@@ -160,19 +169,19 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
                 f"{first}). Call reset(options={{'reset_mask': terminated | truncated}}) first."
             )
         # In mode NEXT_STEP the actions of lanes that have ended are ignored.
-        unit_actions = arguments.to_unit(
-            actions, (B, A), self._rescaled, ignored=ended_before if any_ended_before else None
-        )
+        resting = ended_before if any_ended_before else None
+        unit_actions = arguments.to_unit(actions, (B, A), self._rescaled, ignored=resting)
 
-        done = self._batch.advance(unit_actions)
+        done = self._batch.advance(unit_actions, resting)
         observation, optimal, values, terminated, truncated = done
         similarity, step_reward, regret, reward, accumulated = values[:, 0]
-        info = {
+        info: dict[str, npt.NDArray[Any]] = {
             "optimal_action": arguments.from_unit(optimal, self._rescaled),
             "similarity": similarity,
             "step_reward": step_reward,
             "regret": regret,
             "accumulated_reward": accumulated,
+            **self._batch.lived,
         }
         began = _NO_LANE
         if any_ended_before:
@@ -204,7 +213,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         return None if self._renderer is None else self._renderer.frame_of_each()
 
     def _last(
-        self, observation: Observation, info: dict[str, Array], ended: Mask
+        self, observation: Observation, info: dict[str, npt.NDArray[Any]], ended: Mask
     ) -> dict[str, Any]:
         """Gymnasium's `final_obs` and `final_info` of the lanes `ended` `[B]`."""
         final = np.full(self.num_envs, None, dtype=object)
@@ -245,28 +254,28 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         """The lanes, created when they are first asked for: most batches never need them."""
         if not self._lanes:
             shared = {
-                "task": self.task, "sme_spec": self.sme_spec, "spec": self.spec,
-                "action_space": self.single_action_space, "render_mode": self.render_mode,
+                "spec": self.spec, "render_mode": self.render_mode,
+                "action_space": self.single_action_space,
                 "observation_space": self.single_observation_space,
             }  # fmt: skip
             self._lanes = [Lane(self, lane, **shared) for lane in range(self.num_envs)]
         return self._lanes
 
     def __repr__(self) -> str:
-        return f"SMEVectorEnv({title(self.sme_spec)}, num_envs={self.num_envs})"
+        return f"{type(self).__name__}({title(self.document)}, num_envs={self.num_envs})"
 
     def _begin(
         self,
         lanes: Lanes,
         observation: Observation,
         states: Array | None = None,
-        info: dict[str, Array] | None = None,
+        info: dict[str, npt.NDArray[Any]] | None = None,
     ) -> None:
         """Put lanes at the start of an episode, and write their observations and infos."""
         self._batch.begin(lanes, observation, states)
         self._ended[lanes] = False
-        for value in (info or {}).values():
-            value[lanes] = np.nan
+        if info is not None:
+            infos.write_reset(info, lanes, self._batch.life())
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""

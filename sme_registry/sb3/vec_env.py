@@ -28,13 +28,13 @@ from sme_registry.envs.batch_rendering import METADATA, batch_renderer
 from sme_registry.envs.lanes import Lane
 from sme_registry.envs.rendering import Frame
 from sme_registry.envs.shared import shared_action_dim, shared_observation, shared_observation_dim
+from sme_registry.envs.stream_batch import StreamBatch
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import EpisodeError, OptionError
 from sme_registry.io import integer_in
 from sme_registry.registration import registered_or_new
-from sme_registry.spec import ActionRange, SMESpec, SpecLike
+from sme_registry.spec import ActionRange, SMESpec, SpecLike, StreamLike
 from sme_registry.spec.catalogue import title
-from sme_registry.task import Task
 
 StepResult: TypeAlias = tuple[Observation, npt.NDArray[np.float32], Mask, list[dict[str, Any]]]
 """Observations, rewards, dones and infos."""
@@ -129,8 +129,7 @@ class _BatchVecEnv(LanesVecEnv):
 
     def __init__(
         self,
-        task: Task,
-        num_envs: int,
+        batch: Batch,
         action_range: str,
         observation_dim: int,
         action_dim: int,
@@ -138,13 +137,14 @@ class _BatchVecEnv(LanesVecEnv):
         render_mode: str | None = None,
         render_lanes: Sequence[int] | None = None,
     ) -> None:
-        self.num_teams, self.agents = integer_in("num_envs", num_envs, 1), task.names
-        self._task, self._batch, self._action_dim = task, Batch(task, self.num_teams), action_dim
+        task = batch.task
+        self.num_teams, self.agents = batch.lanes, task.names
+        self._task, self._batch, self._action_dim = task, batch, action_dim
         self._begun, self._owned = np.zeros(self.num_teams, bool), task.owned
         action_space, self._rescaled = arguments.action_space(action_range, action_dim)
         observation_space = gymnasium.spaces.Box(0.0, 1.0, (observation_dim,), np.float32)
         shared = {
-            "render_mode": render_mode, "spec": env_spec, "sme_spec": task.spec, "task": task,
+            "render_mode": render_mode, "spec": env_spec,
             "observation_space": observation_space, "action_space": action_space,
         }  # fmt: skip
         teams = range(self.num_teams)
@@ -164,7 +164,7 @@ class _BatchVecEnv(LanesVecEnv):
         lanes = f"num_envs={self.num_envs}"
         if self.num_envs != self.num_teams:
             lanes += f", {self.num_teams} teams of {len(self.agents)} agents"
-        return f"{type(self).__name__}({title(self._task.spec)}, {lanes})"
+        return f"{type(self).__name__}({title(self._batch.document)}, {lanes})"
 
     def get_images(self) -> list[Frame]:
         """The frames of the chosen lanes or teams, each `[H, W, 3]` uint8; `render` tiles them.
@@ -195,7 +195,8 @@ class _BatchVecEnv(LanesVecEnv):
 
     def _info_at_reset(self, lane: int) -> dict[str, Any]:
         owned = self._owned[lane % len(self.agents)]
-        return infos.at_reset(owned.stop - owned.start)
+        life = self._batch.life_of(lane // len(self.agents))
+        return {**infos.at_reset(owned.stop - owned.start), **life}
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Seed team e with seed + e at the next reset; None draws a seed.
@@ -231,7 +232,7 @@ class _BatchVecEnv(LanesVecEnv):
         for team, (_, start) in teams.items():
             seed = seeds[team]
             if seed is not None:
-                self._batch.initial_states.seed(team, seed)
+                self._batch.seed(team, seed)
             self._batch.begin(np.array([team]), joint, start)
             self._begun[team] = True
         if self._renderer is not None:
@@ -274,6 +275,7 @@ class _BatchVecEnv(LanesVecEnv):
         columns: dict[str, list[Any]] = {
             "optimal_action": [row[part] for row in optimal for part in self._owned],
             **{key: [view[()] for view in views] for key, views in self._numbers.items()},
+            **{key: list(values) for key, values in self._batch.lived.items()},
             "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
         }
         lane_infos: list[dict[str, Any]] = [
@@ -283,10 +285,10 @@ class _BatchVecEnv(LanesVecEnv):
         dones = np.repeat(ended, n)
         if ended.any():
             last = self._observations(done.observation.copy())
+            self._batch.begin(np.flatnonzero(ended), done.observation)
             for lane in np.flatnonzero(dones).tolist():
                 lane_infos[lane]["terminal_observation"] = last[lane]
                 self.reset_infos[lane] = self._info_at_reset(lane)
-            self._batch.begin(np.flatnonzero(ended), done.observation)
         if self._renderer is not None:
             self._renderer.record(np.flatnonzero(ended).tolist(), joint, done)
         return self._observations(done.observation), reward.astype(np.float32), dones, lane_infos
@@ -301,15 +303,16 @@ class _BatchVecEnv(LanesVecEnv):
 
 
 class SMEVecEnv(_BatchVecEnv):
-    """`num_envs` lanes of one task for SB3's algorithms and `VecEnv` wrappers.
+    """`num_envs` lanes of one task or stream for SB3's algorithms and `VecEnv` wrappers.
 
     As in SB3's `VecEnv`s, a finished lane begins its next episode at once, its last observation is
     `terminal_observation` in its info, `TimeLimit.truncated` is True where it was truncated and
     not terminated, and `seed(n)` seeds lane i with n + i at the next reset. Observations are
-    `[B, S + 2]`, as those of `SMEEnv`.
+    `[B, S + 2]`, as those of `SMEEnv`. A stream's lives go on at each `reset()` without a seed;
+    observations and infos are those of `SMEStreamEnv`.
 
     Args:
-      spec_or_id: the task: a spec, its fields, an id, a digest or a path.
+      spec_or_id: the task or stream: a document, its fields, an id, a digest or a path.
       num_envs: B, the lanes, at least 1.
       action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
       render_mode: None or "rgb_array", for `VecVideoRecorder`.
@@ -324,7 +327,7 @@ class SMEVecEnv(_BatchVecEnv):
 
     def __init__(
         self,
-        spec_or_id: SpecLike,
+        spec_or_id: SpecLike | StreamLike,
         num_envs: int = 1,
         *,
         action_range: ActionRange = "symmetric",
@@ -332,16 +335,18 @@ class SMEVecEnv(_BatchVecEnv):
         render_lanes: Sequence[int] | None = None,
         **overrides: Any,
     ) -> None:
-        named = registered_or_new(spec_or_id)
-        task = arguments.single_agent(
-            arguments.load_overridden(type(self), named.kwargs["spec"], overrides)
-        )
+        named, num_envs = registered_or_new(spec_or_id), integer_in("num_envs", num_envs, 1)
+        batch: Batch
+        if "stream" in named.kwargs:
+            tasks = arguments.load_stream_tasks(type(self), named.kwargs["stream"], overrides)
+            batch = StreamBatch(tasks, num_envs)
+        else:
+            task = arguments.load_overridden(type(self), named.kwargs["spec"], overrides)
+            batch = Batch(arguments.single_agent(task), num_envs)
         kwargs = {**named.kwargs, "action_range": action_range, **overrides}
-        env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), task.spec)
-        S, A = task.spec.state_dim, task.spec.action_dim
-        super().__init__(
-            task, num_envs, action_range, S + 2, A, env_spec, render_mode, render_lanes
-        )
+        env_spec = renamed_by_content(dataclasses.replace(named, kwargs=kwargs), batch.document)
+        A, width = batch.document.action_dim, batch.observation_dim
+        super().__init__(batch, action_range, width, A, env_spec, render_mode, render_lanes)
 
 
 class SMETeamVecEnv(_BatchVecEnv):
@@ -382,8 +387,9 @@ class SMETeamVecEnv(_BatchVecEnv):
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])
         observation_dim, action_dim = shared_observation_dim(task), shared_action_dim(task)
+        batch = Batch(task, integer_in("num_envs", num_envs, 1))
         super().__init__(
-            task, num_envs, action_range, observation_dim, action_dim,
+            batch, action_range, observation_dim, action_dim,
             render_mode=render_mode, render_lanes=render_lanes,
         )  # fmt: skip
 

@@ -153,13 +153,16 @@ def symmetric_name(versioned_name: str) -> str:
     return _VERSION.sub(lambda version: SYMMETRIC + version[0], versioned_name)
 
 
-def released() -> Iterator[tuple[str, str, bool]]:
-    """`(versioned name, name by content, is a team)` of every environment, without validation.
+def released() -> Iterator[tuple[str, str, str]]:
+    """`(kind, versioned name, name by content)` of every environment, without validation.
+
+    The kind is "spec" for a single agent's task, "team" or "stream".
 
     For registering the catalogue at import, which must stay cheap; making an environment validates
     its file.
     """
-    for path in paths(EnvFile):
+    for path in [*paths(EnvFile), *paths(StreamFile)]:
         file = read_json(path)
         content_name = file["digest"].replace(":", "-")[: len("sha256-") + 12]
-        yield path.stem, content_name, file["spec"]["team"] is not None
+        kind = "stream" if "stream" in file else "team" if file["spec"]["team"] else "spec"
+        yield kind, path.stem, content_name

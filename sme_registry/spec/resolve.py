@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sme_registry.errors import MalformedDocumentError, UnknownNameError
+from sme_registry.errors import MalformedDocumentError, SpecError, StreamError, UnknownNameError
 from sme_registry.io import read_json
 from sme_registry.spec import catalogue
 from sme_registry.spec.envelope import EnvFile, Fingerprint, StreamFile, SuiteFile
 from sme_registry.spec.sme_spec import SMESpec, SpecLike, as_spec
 from sme_registry.spec.stream import StreamLike, StreamSpec, as_stream
+from sme_registry.spec.validation_errors import short_repr
 
 _HEX_DIGITS = 12  # fewest digits that name a spec
 
@@ -70,7 +71,23 @@ def resolve(task: SpecLike) -> ResolvedSpec:
     Raises:
       UnknownNameError: no task has this name; the message suggests the nearest.
       SpecError: a file or mapping is not a valid spec.
+      StreamError: it is a stream's.
     """
+    try:
+        return _resolve(task)
+    except (UnknownNameError, SpecError):
+        if not names_stream(task):
+            raise
+    label = short_repr(str(task) if isinstance(task, str | os.PathLike) else task)
+    raise StreamError(
+        f"{label}: is a stream, and this needs a single task. Use that of one phase, in Python "
+        "`sme_registry.load(STREAM).phases[0].spec`; for the command line, save it as a file, "
+        "`sme_registry.save(spec, 'phase0.json')`. Environments run streams: "
+        "`sme_registry.make(STREAM)`."
+    )
+
+
+def _resolve(task: SpecLike) -> ResolvedSpec:
     if not isinstance(task, str | os.PathLike):
         return ResolvedSpec(as_spec(task))
     name = str(task)

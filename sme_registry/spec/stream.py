@@ -116,6 +116,34 @@ class Piece(NamedTuple):
     start: int
 
 
+class Schedule(NamedTuple):
+    """Which piece is in force after how many environment steps.
+
+    Attributes:
+      starts: environment steps of a cycle before each piece.
+      cycle_steps: environment steps of one cycle.
+      cycles: how often the pieces are gone through.
+    """
+
+    starts: list[int]
+    cycle_steps: int
+    cycles: int
+
+    def piece_at(self, lifetime: int) -> int:
+        """The index of the piece in force; see `StreamSpec.piece_at`."""
+        if lifetime >= self.cycles * self.cycle_steps:
+            return len(self.starts) - 1
+        return bisect_right(self.starts, lifetime % self.cycle_steps) - 1
+
+    def next_switch(self, lifetime: int) -> int | None:
+        """The lifetime at which that piece is over; see `StreamSpec.next_switch`."""
+        cycle, inside = divmod(lifetime, self.cycle_steps)
+        after = bisect_right(self.starts, inside)
+        end = self.starts[after] if after < len(self.starts) else self.cycle_steps
+        switch = cycle * self.cycle_steps + end
+        return switch if switch < self.cycles * self.cycle_steps else None
+
+
 class StreamSpec(NamedDocument):
     """Phases in order, gone through `cycles` times.
 
@@ -196,26 +224,22 @@ class StreamSpec(NamedDocument):
         """The pieces of one cycle, in order."""
         return _pieces(self.phases)[0]
 
+    @property
+    def schedule(self) -> Schedule:
+        """`piece_at` and `next_switch`, without the cost of finding the pieces at each call."""
+        return Schedule(_pieces(self.phases)[1], self.cycle_steps, self.cycles)
+
     def piece_at(self, lifetime: int) -> int:
         """The index of the piece in force after so many environment steps; the last one at the end.
 
         Args:
           lifetime: environment steps since the life began, at least 0.
         """
-        if lifetime >= self.steps:
-            return len(self.pieces) - 1
-        return bisect_right(_pieces(self.phases)[1], lifetime % self.cycle_steps) - 1
+        return self.schedule.piece_at(lifetime)
 
     def next_switch(self, lifetime: int) -> int | None:
         """The lifetime at which the piece in force is over; None in the last piece of the life."""
-        if lifetime >= self.steps:
-            return None
-        cycle, inside = divmod(lifetime, self.cycle_steps)
-        starts = _pieces(self.phases)[1]
-        after = bisect_right(starts, inside)
-        end = starts[after] if after < len(starts) else self.cycle_steps
-        switch = cycle * self.cycle_steps + end
-        return switch if switch < self.steps else None
+        return self.schedule.next_switch(lifetime)
 
 
 StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]

@@ -93,7 +93,8 @@ def observe(
 ) -> npt.NDArray[np.float32]:
     """The joint observation, (s, t/T, r_cum/k of each agent), `[B, S + 1 + n]` float32.
 
+    r_cum/k is at most 1: it exceeds 1 only where a stream carries r_cum over to a smaller k.
     A single agent observes all of it, an agent of a team only its part; see `envs.team`.
     """
-    columns = [s, (t / spec.horizon)[:, None], accumulated_reward / spec.k]
+    columns = [s, (t / spec.horizon)[:, None], np.minimum(accumulated_reward / spec.k, 1.0)]
     return np.concatenate(columns, axis=-1).astype(np.float32)

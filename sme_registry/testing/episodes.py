@@ -17,6 +17,7 @@ Make = Callable[..., Any]  # creates an environment, as the classes of `sme_regi
 
 MAX_STEPS = 250  # of one episode: horizons may be long
 LONGEST_HORIZON = 10_000  # that the optimal policy is followed to
+LONGEST_LIFE = 1000  # steps of a stream
 INFO_KEYS = {"optimal_action", "similarity", "step_reward", "regret", "accumulated_reward"}
 
 
@@ -38,7 +39,16 @@ def mixed_actions(optimal: npt.NDArray[Any], rng: np.random.Generator) -> npt.ND
 
 def next_action(env: Any, rng: np.random.Generator) -> Any:
     """`mixed_actions` in the current state, in the form that the environment's `step` takes."""
-    return as_action(env, mixed_actions(env.task.optimal_action(_state(env)), rng))
+    return as_action(env, mixed_actions(_optimal(env), rng))
+
+
+def _optimal(env: Any) -> npt.NDArray[np.float64]:
+    """π* in the current state; in a batch of a stream, of the task in force in each lane."""
+    if hasattr(env, "stream") and hasattr(env, "num_envs"):
+        lanes = zip(env.get_attr("task"), env.state, strict=True)
+        return np.stack([task.optimal_action(s) for task, s in lanes])
+    optimal: npt.NDArray[np.float64] = env.task.optimal_action(_state(env))
+    return optimal
 
 
 def as_action(env: Any, unit: npt.NDArray[Any]) -> Any:
@@ -108,7 +118,7 @@ def expect_same_copies(kind: str, env: Any, horizon: int, seed: int) -> None:
     """Pickled and deep copies taken in mid-episode continue as the original does."""
     env.reset(seed=seed)
     if horizon > 1:
-        env.step(as_action(env, env.task.optimal_action(_state(env))))
+        env.step(as_action(env, _optimal(env)))
     before = np.copy(_state(env))
     copies = {"a pickled copy": pickle.loads(pickle.dumps(env)), "a deep copy": copy.deepcopy(env)}
     played = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -15,8 +15,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.registration import env_spec
-from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike
-from sme_registry.task import load_spec, materialize
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
+from sme_registry.spec.resolve import names_stream
+from sme_registry.task import load_spec, load_stream, materialize
 from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
     TOLERANCE,
@@ -26,7 +27,14 @@ from sme_registry.testing.comparing import (
     expect_passes,
     expect_same,
 )
-from sme_registry.testing.episodes import INFO_KEYS, LONGEST_HORIZON, MAX_STEPS, Make, next_action
+from sme_registry.testing.episodes import (
+    INFO_KEYS,
+    LONGEST_HORIZON,
+    LONGEST_LIFE,
+    MAX_STEPS,
+    Make,
+    next_action,
+)
 
 
 def check_sme(
@@ -51,16 +59,23 @@ def check_sme(
     check_env_spec(task)
 
 
-def check_gymnasium(task: SpecLike, *, single: Make = SMEEnv) -> None:
+def load_document(task: SpecLike | StreamLike) -> SMESpec | StreamSpec:
+    """The spec or stream of a name; checks that treat both alike take either."""
+    if names_stream(task):
+        return load_stream(cast("StreamLike", task))
+    return load_spec(cast("SpecLike", task))
+
+
+def check_gymnasium(task: SpecLike | StreamLike, *, single: Make = SMEEnv) -> None:
     """Gymnasium's own `check_env` passes without warnings in both action ranges.
 
     It treats an episode of one step as an error, so tasks of horizon 1 are skipped.
     """
-    spec = load_spec(task)
-    if spec.horizon == 1:
+    document = load_document(task)
+    if document.horizon == 1:
         return
     for action_range in ACTION_RANGES:
-        make = functools.partial(single, spec, action_range=action_range)
+        make = functools.partial(single, document, action_range=action_range)
         test = functools.partial(_create_and_check, make)
         expect_passes(f"Gymnasium's check_env, {action_range}", test)
 
@@ -160,39 +175,50 @@ def check_optimum(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> No
         episodes.expect_optimum(env, optimal, spec.horizon, seed)
 
 
-def check_determinism(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
+def check_determinism(task: SpecLike | StreamLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
     """A seed fixes the episode and the following ones; another seed gives another episode."""
-    episodes.expect_determinism(functools.partial(single, load_spec(task)), seed)
+    episodes.expect_determinism(functools.partial(single, load_document(task)), seed)
 
 
 def check_pickling(
-    task: SpecLike, *, single: Make = SMEEnv, vector: Make = SMEVectorEnv, seed: int = 0
+    task: SpecLike | StreamLike,
+    *,
+    single: Make = SMEEnv,
+    vector: Make = SMEVectorEnv,
+    seed: int = 0,
 ) -> None:
     """Pickled and deep copies taken in mid-episode continue as the original does."""
-    spec = load_spec(task)
-    batch = vector(spec, 3, autoreset_mode=AutoresetMode.NEXT_STEP.value)
-    episodes.expect_same_copies("single environment", single(spec), spec.horizon, seed)
-    episodes.expect_same_copies("vector environment", batch, spec.horizon, seed)
+    document = load_document(task)
+    batch = vector(document, 3, autoreset_mode=AutoresetMode.NEXT_STEP.value)
+    episodes.expect_same_copies("single environment", single(document), document.horizon, seed)
+    episodes.expect_same_copies("vector environment", batch, document.horizon, seed)
 
 
 def check_vector(
-    task: SpecLike, *, single: Make = SMEEnv, vector: Make = SMEVectorEnv, seed: int = 0
+    task: SpecLike | StreamLike,
+    *,
+    single: Make = SMEEnv,
+    vector: Make = SMEVectorEnv,
+    seed: int = 0,
 ) -> None:
     """A batch equals single environments bit for bit, in all three autoreset modes.
 
     Gymnasium's `SyncVectorEnv` steps the single environments, for more than one episode each.
     """
-    spec, lanes = load_spec(task), 3
+    document, lanes = load_document(task), 3
+    steps = min(document.horizon + 5, MAX_STEPS)
+    if isinstance(document, StreamSpec):
+        steps = min(document.steps + document.horizon, LONGEST_LIFE)
     for mode, action_range in itertools.product(AutoresetMode, ACTION_RANGES):
-        batch = vector(spec, lanes, action_range=action_range, autoreset_mode=mode.value)
+        batch = vector(document, lanes, action_range=action_range, autoreset_mode=mode.value)
         singles: Any = SyncVectorEnv(
-            [functools.partial(single, spec, action_range=action_range)] * lanes,
+            [functools.partial(single, document, action_range=action_range)] * lanes,
             autoreset_mode=mode,
         )
         rng = np.random.default_rng(seed)
         where = f"autoreset mode {mode.value}, {action_range}"
         expect_same(f"{where}: reset", batch.reset(seed=seed), singles.reset(seed=seed))
-        for t in range(1, min(spec.horizon + 5, MAX_STEPS) + 1):
+        for t in range(1, steps + 1):
             action = next_action(batch, rng)
             step = batch.step(action)
             expect_same(f"{where}: step {t}", step, singles.step(action))
@@ -205,15 +231,16 @@ def check_vector(
                 expect_same(f"{where}: reset after step {t}", first, second)
 
 
-def check_env_spec(task: SpecLike) -> None:
-    """`gymnasium.make` recreates the task from its `EnvSpec` as JSON."""
-    spec = load_spec(task)
+def check_env_spec(task: SpecLike | StreamLike) -> None:
+    """`gymnasium.make` recreates the task or stream from its `EnvSpec` as JSON."""
+    expected = load_document(task)
     for action_range in ACTION_RANGES:
-        env = _recreated(env_spec(spec, action_range=action_range))
-        expect_equal("the digest after EnvSpec.to_json", env.unwrapped.sme_spec.digest, spec.digest)
+        env = _recreated(env_spec(expected, action_range=action_range))
+        digest = env.unwrapped.document.digest
+        expect_equal("the digest after EnvSpec.to_json", digest, expected.digest)
         again = _recreated(env.spec)
-        digest = again.unwrapped.sme_spec.digest
-        expect_equal("the digest after a second EnvSpec.to_json", digest, spec.digest)
+        digest = again.unwrapped.document.digest
+        expect_equal("the digest after a second EnvSpec.to_json", digest, expected.digest)
         expect_equal("the action space after EnvSpec.to_json", again.action_space, env.action_space)
         expect_equal("the id after EnvSpec.to_json", again.spec.id, env.spec.id)
 

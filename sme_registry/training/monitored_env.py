@@ -14,10 +14,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sme_registry.envs import SMEEnv
+from sme_registry.envs import SMEEnv, SMEStreamEnv
 from sme_registry.envs.types import Observation
 from sme_registry.sb3 import LanesVecEnv, SMETeamVecEnv
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 
 
 class MonitoredTeamVecEnv(SMETeamVecEnv):
@@ -57,7 +57,7 @@ class MonitoredTeamVecEnv(SMETeamVecEnv):
 
 
 class MonitoredVecEnv(LanesVecEnv):
-    """One environment as an SB3 `VecEnv`, with its steps counted.
+    """One environment of a task or a stream as an SB3 `VecEnv`, with its steps counted.
 
     The same numbers, bit for bit, as `SMEVecEnv` with one environment, without the overhead of a
     batch, which counts compared with PPO's 0.5 ms a step.
@@ -70,14 +70,20 @@ class MonitoredVecEnv(LanesVecEnv):
         that it raises ends the training.
     """
 
-    def __init__(self, spec: SMESpec, *, action_range: Literal["unit", "symmetric"]) -> None:
-        self._env = SMEEnv(spec, action_range=action_range)
+    def __init__(
+        self, document: SMESpec | StreamSpec, *, action_range: Literal["unit", "symmetric"]
+    ) -> None:
+        self._env: SMEEnv
+        if isinstance(document, StreamSpec):
+            self._env = SMEStreamEnv(document, action_range=action_range)
+        else:
+            self._env = SMEEnv(document, action_range=action_range)
         super().__init__([self._env])
         self.steps, self.regret, self.seconds = 0, 0.0, 0.0
         self.after_step: Callable[[int], None] = lambda steps: None
 
     def reset(self) -> Observation:
-        """Begin an episode with the seed and options set before; observations `[1, S + 2]`."""
+        """Begin an episode with the seed and options set before; observations `[1, …]`."""
         observation, info = self._env.reset(seed=self._seeds[0], options=self._options[0] or None)
         self.reset_infos = [info]
         self._clear_reset_arguments()

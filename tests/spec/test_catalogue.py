@@ -17,6 +17,7 @@ from sme_registry.spec import (
     EvaluationProtocol,
     ProtocolFile,
     SMESpec,
+    StreamFile,
     StudyFile,
     StudyPlan,
     Suite,
@@ -214,6 +215,12 @@ def test_names_come_in_natural_order_and_can_be_used_by_every_registry():
 
 
 def test_names_by_content_are_read_without_validation_but_are_right():
-    assert list(catalogue.released()) == [
-        (file.versioned_name, file.spec.content_name, file.spec.team is not None) for file in ENVS
+    tasks = [
+        ("team" if file.spec.team else "spec", file.versioned_name, file.spec.content_name)
+        for file in ENVS
     ]
+    streams = [
+        ("stream", file.versioned_name, file.stream.content_name)
+        for file in catalogue.entries(StreamFile)
+    ]
+    assert list(catalogue.released()) == tasks + streams

@@ -18,6 +18,7 @@ from sme_registry.errors import (
     ResourceLimitError,
     SMEError,
     SpecError,
+    StreamError,
     UnknownNameError,
 )
 from sme_registry.spec import SMESpec, StreamFile, StreamSpec, catalogue
@@ -171,7 +172,7 @@ def test_a_stream_is_saved_whole_and_loaded_by_path_name_and_content(tmp_path):
         assert sme_registry.load(name) == released
     with pytest.raises(UnknownNameError, match="Did you mean 'Switch5-v1'"):
         sme_registry.load("Swich5")
-    with pytest.raises(UnknownNameError, match="no spec"):
+    with pytest.raises(StreamError, match="is a stream"):
         sme_registry.load("Switch5", SMESpec)
 
 

@@ -7,20 +7,30 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from sme_registry import SMESpec
+from sme_registry import SMESpec, StreamSpec
 
 pytest.importorskip("stable_baselines3")
 
 SPEC = SMESpec(state_dim=3, action_dim=2, k=2, D=0.01, horizon=3)
 
 
+STREAM = StreamSpec(
+    phases=[{"spec": SPEC, "steps": 40}, {"spec": SPEC.derive(seed=1, k=1), "steps": 40}],
+    switch="step",
+    observes_phase=True,
+)
+
+
+@pytest.mark.parametrize("document", [SPEC, STREAM], ids=["task", "stream"])
 @pytest.mark.parametrize("action_range", ["unit", "symmetric"])
-def test_steps_equal_those_of_a_batch_of_one(action_range: Literal["unit", "symmetric"]) -> None:
+def test_steps_equal_those_of_a_batch_of_one(
+    action_range: Literal["unit", "symmetric"], document: SMESpec | StreamSpec
+) -> None:
     from sme_registry.sb3 import SMEVecEnv
     from sme_registry.training.monitored_env import MonitoredVecEnv
 
-    batch: Any = SMEVecEnv(SPEC, 1, action_range=action_range)
-    monitored: Any = MonitoredVecEnv(SPEC, action_range=action_range)
+    batch: Any = SMEVecEnv(document, 1, action_range=action_range)
+    monitored: Any = MonitoredVecEnv(document, action_range=action_range)
     assert monitored.action_space == batch.action_space
     assert monitored.observation_space == batch.observation_space
     for env in (batch, monitored):

@@ -1,0 +1,162 @@
+"""Streams keep every promise of the conformance kit; ids and EnvSpecs name them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import sme_registry
+from sme_registry import SMESpec, StreamSpec, testing
+from sme_registry.envs import SMEStreamEnv, SMEStreamVectorEnv
+from sme_registry.errors import (
+    NameTakenError,
+    StreamError,
+    UnexpectedKeywordError,
+    UnknownNameError,
+)
+from sme_registry.spec import StreamFile, catalogue
+from sme_registry.testing import ConformanceError
+from tests.conformance.test_identity import fresh_python
+
+NAMES = catalogue.names(StreamFile)
+SPEC = {"state_dim": 3, "action_dim": 2, "horizon": 9, "D": 0.3, "complexity": 2}
+SHORT = StreamSpec.from_dict(
+    {
+        "phases": [
+            {"spec": SPEC | {"k": 4}, "steps": 20},
+            {"spec": SPEC | {"k": 2}, "steps": 15, "drift": {"rotation": 1.5, "increments": 3}},
+        ],
+        "cycles": 2,
+    }
+)
+
+
+def short(**fields: Any) -> StreamSpec:
+    return StreamSpec.from_dict({**SHORT.to_dict(), **fields})
+
+
+@pytest.mark.parametrize("observes_phase", [False, True])
+@pytest.mark.parametrize("switch", ["episode", "step"])
+def test_streams_pass_the_conformance_kit(switch: str, observes_phase: bool) -> None:
+    testing.check_stream(short(switch=switch, observes_phase=observes_phase))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stream_of_the_catalogue_has_its_ids(name: str) -> None:
+    stream = sme_registry.load(name, StreamSpec)
+    ids = [name, f"Stream{name}", catalogue.symmetric_name(name), f"{stream.content_name}-v1"]
+    for env_id in (f"SME/{each}" for each in ids):
+        env = gymnasium.make(env_id)
+        assert env.unwrapped.stream == stream
+        assert env.spec.id == env_id
+        assert env.spec.max_episode_steps == stream.horizon
+        assert env.action_space.low[0] == (-1.0 if "Symmetric" in env_id else 0.0)
+        again = gymnasium.make(EnvSpec.from_json(env.spec.to_json()))
+        assert again.unwrapped.stream == stream
+        assert again.spec.id == env_id
+    check_env(gymnasium.make(f"SME/{name}").unwrapped, skip_render_check=name != "Switch5-v1")
+    testing.check_env_spec(name)
+
+
+def test_names_make_single_environments_and_native_batches() -> None:
+    for name in ("Switch5", "SME/Switch5-v1", "sme_registry:SME/StreamSwitch5-v1"):
+        env, batch = sme_registry.make(name), sme_registry.make_vec(name, 2)
+        assert isinstance(env.unwrapped, SMEStreamEnv)
+        assert isinstance(batch.unwrapped, SMEStreamVectorEnv)
+        assert env.spec.id == batch.spec.id == f"SME/{name.split('/')[-1].removesuffix('-v1')}-v1"
+    batch = gymnasium.make_vec("SME/Switch5Symmetric-v1", num_envs=2, autoreset_mode="SameStep")
+    assert batch.single_action_space.low[0] == -1.0
+    assert str(batch) == "SMEStreamVectorEnv(SME/Switch5-v1, num_envs=2)"
+    assert repr(env.unwrapped) == "SMEStreamEnv(SME/Switch5-v1)"
+
+
+def test_a_module_and_an_id_make_a_stream_in_a_fresh_process() -> None:
+    digest = fresh_python(
+        "import gymnasium\n"
+        "env = gymnasium.make('sme_registry:SME/Switch5-v1')\n"
+        "print(env.unwrapped.stream.digest, end='')"
+    )
+    assert digest == sme_registry.load("Switch5", StreamSpec).digest
+
+
+def test_a_stream_of_ones_own_goes_by_content_or_by_a_registered_name() -> None:
+    env = sme_registry.make(SHORT, action_range="symmetric")
+    assert env.spec.id == f"SME/{SHORT.content_name}-v1"
+    assert sme_registry.env_spec(SHORT).kwargs == {"stream": SHORT.to_dict()}
+    assert sme_registry.register(SHORT, "Short") == "SME/Short-v1"
+    assert sme_registry.register(SHORT, "Short-v1") == "SME/Short-v1"  # again
+    for env_id in ("SME/Short-v1", "SME/ShortSymmetric-v1"):
+        assert gymnasium.make(env_id).unwrapped.stream == SHORT
+    assert sme_registry.make_vec("Short", 2).spec.id == "SME/Short-v1"
+    with pytest.raises(NameTakenError, match="stands for another stream"):
+        sme_registry.register(short(cycles=3), "Short")
+    with pytest.raises(NameTakenError, match="stands for another stream"):
+        sme_registry.register(SMESpec(), "Switch5")
+    with pytest.raises(NameTakenError, match="stands for another spec"):
+        sme_registry.register(SHORT, "Default")
+    with pytest.raises(UnexpectedKeywordError, match="'k' for a stream"):
+        sme_registry.env_spec(SHORT, k=3)
+    with pytest.raises(UnknownNameError, match="Did you mean 'Switch5-v1'"):
+        sme_registry.make("Swicth5")
+
+
+@pytest.mark.parametrize("name", ["Switch5", "SME/StreamSwitch5-v1", SHORT, SHORT.to_dict()])
+def test_a_stream_where_one_task_is_needed_is_a_typed_error(name: Any) -> None:
+    with pytest.raises(StreamError, match=r"is a stream.*phases\[0\]\.spec"):
+        sme_registry.evaluate("optimal", name)
+    with pytest.raises(StreamError):
+        sme_registry.make_parallel(name)
+
+
+class _Forgets(SMEStreamEnv):
+    """Restarts the life at each reset."""
+
+    def _begin_life(self, seed: int | None) -> dict[str, Any]:
+        return super()._begin_life(0)
+
+
+class _Lags(SMEStreamEnv):
+    """Tells the phase of the observation, rather than that of the action."""
+
+    def step(self, action: Any) -> Any:
+        *returned, info = super().step(action)
+        return *returned, {**info, "phase": self._phase}
+
+
+class _Swaps(SMEStreamVectorEnv):
+    """Switches one lane too late."""
+
+    def reset(self, **arguments: Any) -> Any:
+        returned = super().reset(**arguments)
+        self._batch._next_switch[1] += int(self._batch._next_switch[1] < SHORT.steps)
+        return returned
+
+
+@pytest.mark.parametrize(
+    ("switch", "faulty", "words"),
+    [
+        ("episode", {"single": _Forgets}, "lifetime"),
+        ("step", {"single": _Lags}, "phase"),
+        ("step", {"vector": _Swaps}, "SameStep|NextStep"),
+    ],
+)
+def test_the_kit_detects_faults_of_streams(switch: str, faulty: Any, words: str) -> None:
+    with pytest.raises(ConformanceError, match=words):
+        testing.check_stream(short(switch=switch, observes_phase=True), **faulty)
+
+
+def test_the_optimum_of_each_phase_has_no_regret_over_a_whole_life() -> None:
+    env: Any = SMEStreamEnv(SHORT)
+    env.reset(seed=0)
+    for _ in range(SHORT.steps):
+        action = env.task.optimal_action(env.state).astype(np.float32)
+        *_, truncated, info = env.step(action)
+        assert info["regret"] == pytest.approx(0.0, abs=1e-6)
+        if truncated:
+            env.reset()
+    assert info["lifetime"] == SHORT.steps

@@ -1,0 +1,296 @@
+"""Streams: lives across phases, single and batched, what infos say, what is refused."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from sme_registry import StreamSpec
+from sme_registry.envs import SMEEnv, SMEStreamEnv, SMEStreamVectorEnv, SMEVectorEnv
+from sme_registry.errors import ActionError, EpisodeError, UnexpectedKeywordError
+from sme_registry.testing.comparing import expect_same
+from sme_registry.testing.episodes import as_action, mixed_actions, next_action
+
+SPEC = {"state_dim": 4, "action_dim": 2, "horizon": 12, "complexity": 2}
+MODES = [mode.value for mode in AutoresetMode]
+HALF = np.full(2, 0.5, np.float32)
+
+
+def stream(switch: str = "episode", D: float = 0.35, **fields: Any) -> StreamSpec:
+    """Two rounds of three phases: k falls and rises, and the second phase drifts."""
+    specs = [SPEC | {"D": D, "k": k, "seed": seed} for seed, k in enumerate((7, 2, 5))]
+    drift = {"rotation": 2.0, "increments": 3}
+    phases = [
+        {"spec": specs[0], "steps": 37},
+        {"spec": specs[1], "steps": 24, "drift": drift},
+        {"spec": specs[2], "steps": 30},
+    ]
+    return StreamSpec.from_dict({"phases": phases, "cycles": 2, "switch": switch, **fields})
+
+
+def phases_seen(env: Any, steps: int, action: Any = HALF) -> list[tuple[int, int]]:
+    """(lifetime, phase) of every step; episodes follow each other."""
+    seen = []
+    for _ in range(steps):
+        _, _, terminated, truncated, info = env.step(action)
+        seen.append((int(info["lifetime"]), int(info["phase"])))
+        if terminated or truncated:
+            env.reset()
+    return seen
+
+
+def both_reset(batch: Any, singles: Any, mask: Any, seed: Any = None) -> list[Any]:
+    """What resets of some lanes return; Gymnasium removes the mask from the options."""
+    envs = batch, singles
+    return [env.reset(seed=seed, options={"reset_mask": mask.copy()}) for env in envs]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("switch", ["episode", "step"])
+def test_a_batch_of_lives_equals_its_singles_in_every_bit(switch: str, mode: str) -> None:
+    for fields in ({"observes_phase": True}, {}):
+        spec = stream(switch, **fields)
+        batch: Any = SMEStreamVectorEnv(spec, 5, autoreset_mode=mode)
+        makers = [functools.partial(SMEStreamEnv, spec)] * 5
+        singles: Any = SyncVectorEnv(makers, autoreset_mode=AutoresetMode(mode))
+        rng = np.random.default_rng(0)
+        apart = 0
+        for seed in (3, None):  # the second reset continues the lives
+            expect_same("reset", batch.reset(seed=seed), singles.reset(seed=seed))
+            for t in range(150):
+                tasks = batch.get_attr("task")
+                apart += len(set(map(id, tasks))) > 1
+                optimal = [
+                    task.optimal_action(s) for task, s in zip(tasks, batch.state, strict=True)
+                ]
+                share = rng.uniform(0.0, 0.6, (5, 1))
+                action = ((1 - share) * optimal + share * rng.random((5, 2))).astype(np.float32)
+                step = batch.step(action)
+                expect_same(f"step {t}", step, singles.step(action))
+                assert batch.observation_space.contains(step[0])
+                ended = step[2] | step[3]
+                if mode == "Disabled" and ended.any():
+                    expect_same("reset", *both_reset(batch, singles, ended))
+                if seed is not None and t in (20, 45):  # a new life in one lane
+                    one = np.arange(5) == t // 20
+                    expect_same("new life", *both_reset(batch, singles, one, [9] * 5))
+        assert step[4]["lifetime"].min() > spec.steps
+        assert apart > 10  # lanes that were in different pieces at once
+
+
+def test_a_phase_is_left_at_the_next_reset() -> None:
+    env = SMEStreamEnv(stream(D=0.0))
+    env.reset(seed=0)
+    seen = phases_seen(env, 240)
+    # Episodes of 12 steps: 37 is passed in the fourth, and so on; after 182 the last phase goes on.
+    starts = {0: 0, 48: 1, 72: 2, 96: 0, 132: 1, 156: 2}
+    assert [lifetime for lifetime, _ in seen] == list(range(1, 241))
+    phase = 0
+    for lifetime, got in seen:
+        phase = starts.get(lifetime - 1, phase)
+        assert got == phase
+
+
+def test_a_phase_is_left_at_once() -> None:
+    spec = stream("step", D=0.0)
+    env = SMEStreamEnv(spec)
+    env.reset(seed=0)
+    expected = [(i + 1, spec.pieces[spec.piece_at(i)].phase) for i in range(240)]
+    assert phases_seen(env, 240) == expected
+
+
+def test_state_and_what_is_to_be_paid_carry_over_a_switch_within_an_episode() -> None:
+    specs = SPEC | {"k": 12}, SPEC | {"k": 2, "seed": 1}
+    phases = [{"spec": spec, "steps": 9} for spec in specs]
+    env = SMEStreamEnv(StreamSpec(phases=phases, switch="step", observes_phase=True))
+    env.reset(seed=0)
+    for t in range(1, 13):
+        task, s = env.task, env.state
+        action = task.optimal_action(s).astype(np.float32)
+        observation, reward, _, truncated, info = env.step(action)
+        np.testing.assert_array_equal(env.state, task.transition(s, action))
+        assert info["phase"] == (t > 9)
+        if t < 10:
+            k = 12 if t < 9 else 2  # at step 9 the observation is already of the second phase
+            assert reward == 0.0
+            assert observation[5] == np.float32(min(info["accumulated_reward"] / k, 1.0))
+            assert observation[6:].tolist() == [float(t < 9), float(t >= 9)]
+    # 9 rewards of the first phase were paid at step 10 of the second, where 10 mod 2 = 0.
+    assert reward == pytest.approx(2.0, abs=1e-6)
+    assert truncated
+    assert observation[5] == 0.0
+
+
+def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one() -> None:
+    env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
+    assert env.reset(seed=0)[1]["lifetime"] == 0
+    phases_seen(env, 50, env.task.optimal_action(env.state))
+    _, info = env.reset()
+    assert (info["lifetime"], info["phase"]) == (50, 1)
+    assert np.isnan(info["regret"])
+    _, info = env.reset(seed=0)
+    assert (info["lifetime"], info["phase"]) == (0, 0)
+    batch.reset(seed=0)
+    for _ in range(8):
+        batch.step(np.full((2, 2), 0.5, np.float32))
+    _, infos = batch.reset(seed=[None, 4])
+    assert infos["lifetime"][0] > 0
+    assert infos["lifetime"][1] == 0
+
+
+def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life() -> None:
+    env = SMEStreamEnv(stream("step", D=0.0))
+    env.reset(seed=0)
+    for lifetime in range(1, 41):  # beyond the switch at 37
+        with pytest.raises(ActionError):
+            env.step(np.array([np.nan, 0.5], np.float32))
+        with pytest.raises(ActionError):
+            env.step(np.zeros(3, np.float32))
+        _, _, _, truncated, info = env.step(HALF)
+        assert info["lifetime"] == lifetime
+        if truncated:
+            with pytest.raises(EpisodeError):
+                env.step(HALF)
+            env.reset()
+    batch = SMEStreamVectorEnv(stream(D=0.0), 2)
+    batch.reset(seed=0)
+    lifetimes = [batch.step(np.full((2, 2), 0.5))[4]["lifetime"][0] for _ in range(14)]
+    assert lifetimes == [*range(1, 13), 12, 13]
+
+
+def test_lanes_in_different_pieces_refuse_an_action_together() -> None:
+    batch = SMEStreamVectorEnv(stream("step"), 4, autoreset_mode="SameStep")
+    batch.reset(seed=0)
+    rng = np.random.default_rng(0)
+    while len(set(batch.get_attr("task"))) == 1:
+        batch.step(next_action(batch, rng))
+        batch.reset(seed=[5, None, None, None], options={"reset_mask": np.arange(4) == 0})
+    before, twin = batch.state, copy.deepcopy(batch)
+    for lane in range(4):
+        bad = np.full((4, 2), 0.5, np.float32)
+        bad[lane] = np.inf
+        with pytest.raises(ActionError, match="NaN or infinite"):
+            batch.step(bad)
+        np.testing.assert_array_equal(batch.state, before)
+    action = next_action(batch, rng)
+    expect_same("the step after it", batch.step(action), twin.step(action))
+    with pytest.raises(EpisodeError, match=r"different pieces.*get_attr\('task'\)"):
+        _ = twin.task
+
+
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+def test_copies_taken_in_mid_life_go_on_exactly(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if backend == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", backend)
+    spec = stream("step", observes_phase=True)
+    rng = np.random.default_rng(0)
+    for env in (SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 3, autoreset_mode="SameStep")):
+        env.reset(seed=0)
+        for _ in range(6):
+            twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+            for _ in range(25):
+                action = next_action(env, rng)
+                step = env.step(action)
+                for twin in twins:
+                    expect_same("a copy", twin.step(action), step)
+                if isinstance(env, SMEStreamEnv) and (step[2] or step[3]):
+                    resets = [each.reset() for each in (env, *twins)]
+                    expect_same("a copy's reset", resets[1:], [resets[0]] * 2)
+
+
+def test_both_back_ends_live_the_same_life(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    spec, envs = stream("step", D=0.0, observes_phase=True), []
+    for backend in ("numba", "numpy"):
+        monkeypatch.setenv("SME_BACKEND", backend)
+        envs += [SMEStreamVectorEnv(spec, 3), SMEStreamEnv(spec)]
+        envs[-2].reset(seed=0)
+        envs[-1].reset(seed=0)
+    for t in range(1, 80):
+        fast, one, plain, other = (
+            env.step(np.full(env.action_space.shape, 0.4, np.float32)) for env in envs
+        )
+        np.testing.assert_allclose(fast[0], plain[0], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-7)
+        expect_same("life", [fast[4][k] for k in ("phase", "lifetime")],
+                    [plain[4][k] for k in ("phase", "lifetime")])  # fmt: skip
+        if t % 12 == 0:
+            envs[1].reset()
+            envs[3].reset()
+
+
+def test_a_stream_of_one_phase_has_the_numbers_of_its_task() -> None:
+    spec = SPEC | {"k": 5, "D": 0.2}
+    one = StreamSpec(phases=[{"spec": spec, "steps": 10}])
+    pairs = [(SMEEnv(spec), SMEStreamEnv(one)), (SMEVectorEnv(spec, 3), SMEStreamVectorEnv(one, 3))]
+    for plain, env in pairs:
+        rng = np.random.default_rng(0)
+        assert env.observation_space == plain.observation_space
+        np.testing.assert_array_equal(env.reset(seed=0)[0], plain.reset(seed=0)[0])
+        for _ in range(60):
+            unit = mixed_actions(plain.task.optimal_action(plain.state), rng)
+            got, expected = env.step(as_action(env, unit)), plain.step(as_action(plain, unit))
+            expect_same("step", got[:4], expected[:4])
+            expect_same("info", {key: got[4][key] for key in expected[4]}, expected[4])
+            if isinstance(env, SMEStreamEnv) and (got[2] or got[3]):
+                expect_same("reset", env.reset()[0], plain.reset()[0])
+
+
+def test_long_streams_are_looked_ahead_in_parts() -> None:
+    phases = [{"spec": SPEC, "steps": 700}, {"spec": SPEC | {"seed": 1}, "steps": 100}]
+    env = SMEStreamEnv(StreamSpec(phases=phases, switch="step"))
+    env.reset(seed=0)
+    assert phases_seen(env, 900) == [(i + 1, int(i >= 700)) for i in range(900)]
+
+
+def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing() -> None:
+    spec = stream("step", D=0.0, observes_phase=True)
+    for make in (SMEStreamEnv, functools.partial(SMEStreamVectorEnv, num_envs=2)):
+        env, clean = make(spec), make(spec)
+        env.reset(seed=0)
+        clean.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.4, np.float32)
+        for _ in range(90):
+            step, expected = env.step(action), clean.step(action)
+            expect_same("step", step, expected)
+            for array in (step[0], *step[4].values()):
+                if isinstance(array, np.ndarray) and array.ndim:
+                    array[...] = 1
+            if isinstance(env, SMEStreamEnv) and expected[3]:
+                expect_same("reset", env.reset(), clean.reset())
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -> None:
+    with pytest.raises(UnexpectedKeywordError, match=r"'complexity' for a stream.*spec\.derive"):
+        make("SME/Switch5-v1", complexity=10)
+    with pytest.raises(UnexpectedKeywordError, match=r"Did you mean 'action_range'"):
+        make("SME/Switch5-v1", action_rnge="unit")
+
+
+def test_frames_show_the_task_in_force() -> None:
+    pytest.importorskip("pygame")
+    phases = [{"spec": SPEC | {"k": k}, "steps": 3} for k in (2, 3)]
+    spec = StreamSpec(phases=phases, switch="step")
+    env = SMEStreamEnv(spec, render_mode="rgb_array")
+    batch = SMEStreamVectorEnv(spec, 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    batch.reset(seed=0)
+    tops = []
+    for _ in range(4):
+        env.step(HALF)
+        frames = [env.render(), batch.step(np.stack([HALF, HALF])) and batch.render()[0]]
+        np.testing.assert_array_equal(*frames)
+        tops.append(bytes(frames[0][:40]))
+    assert tops[0] == tops[1] != tops[2] == tops[3]
+    env.close()
