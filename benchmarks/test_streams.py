@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -22,34 +23,41 @@ def two_phases(complexity: int, steps: int, **fields: Any) -> StreamSpec:
     return StreamSpec(phases=phases, cycles=10**6, **fields)
 
 
+def stepping_of(made: Any, *, batched: bool) -> Callable[[int], None]:
+    """Steps of a single environment, or of a batch of it."""
+    if batched:
+        return batch_stepping(sme_registry.make_vec(made, BATCH), ACTIONS)
+    return stepping(sme_registry.make(made))
+
+
+@pytest.mark.parametrize("batched", [False, True], ids=["single", "batch"])
 @pytest.mark.parametrize("complexity", [1, 3])
 @pytest.mark.parametrize("switch", ["episode", "step"])
-def test_step_of_a_stream(compare: Any, switch: str, complexity: int) -> None:
+def test_step_of_a_stream(compare: Any, switch: str, complexity: int, batched: bool) -> None:
     stream, spec = two_phases(complexity, 10**9, switch=switch), SMESpec(complexity=complexity)
-    single, alone = (stepping(sme_registry.make(each)) for each in (stream, spec))
-    batch, batch_alone = (
-        batch_stepping(sme_registry.make_vec(each, BATCH), ACTIONS) for each in (stream, spec)
+    ours, alone = (stepping_of(each, batched=batched) for each in (stream, spec))
+    units = 100 if batched else 5000
+    compare(
+        f"stream, {switch}, L = {complexity}{', batch' if batched else ''}",
+        "step",
+        ours,
+        units,
+        {"its phase alone": (alone, units, 1 / 1.15)},
+        clock=time.thread_time,
     )
-    title, peer = f"stream, complexity {complexity}, switch={switch}", "its phase alone"
-    compare(f"{title}, single", "step", single, 5000, {peer: (alone, 5000, 1 / 1.15)})
-    compare(f"{title}, batch", "batch", batch, 200, {peer: (batch_alone, 200, 1 / 1.15)})
 
 
+@pytest.mark.parametrize("batched", [False, True], ids=["single", "batch"])
 @pytest.mark.parametrize("complexity", [1, 3])
-def test_switch(compare: Any, complexity: int) -> None:
+def test_switch(compare: Any, complexity: int, batched: bool) -> None:
     """Each step of these streams is followed by a switch."""
-    stream = two_phases(complexity, 1, switch="step")
-    env = gymnasium.make("SME/Default-v1", complexity=complexity)
-    hundred, batch = stepping(env), sme_registry.make_vec(stream, BATCH)
-    batch_hundred = batch_stepping(
-        sme_registry.make_vec("SME/Default-v1", BATCH, complexity=complexity), ACTIONS
+    stream, spec = two_phases(complexity, 1, switch="step"), SMESpec(complexity=complexity)
+    ours, alone = (stepping_of(each, batched=batched) for each in (stream, spec))
+    compare(
+        f"step and switch, L = {complexity}{', batch' if batched else ''}",
+        "switch",
+        ours,
+        50 if batched else 500,
+        {"100 steps alone": (lambda times: alone(100 * times), 1 if batched else 20, 1)},
+        clock=time.thread_time,
     )
-    title, peer = f"step and switch, complexity {complexity}", "100 steps of its phase alone"
-    compare(
-        f"{title}, single", "switch", stepping(sme_registry.make(stream)), 500,
-        {peer: (lambda times: hundred(100 * times), 20, 1)},
-    )  # fmt: skip
-    compare(
-        f"{title}, batch", "switch", batch_stepping(batch, ACTIONS), 100,
-        {peer: (lambda times: batch_hundred(100 * times), 1, 1)},
-    )  # fmt: skip
