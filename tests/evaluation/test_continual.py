@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import sme_registry
 from sme_registry import SMESpec, evaluate, materialize
 from sme_registry.errors import (
     DigestMismatchError,
@@ -245,6 +246,34 @@ def test_dynamic_regret_by_visit_is_that_of_the_task_in_force(life):
     assert sum(by_visit) == pytest.approx(regrets.sum())
     if stream.switch == "episode":
         np.testing.assert_allclose(by_visit, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("switch", ["episode", "step"])
+def test_the_log_of_an_environment_gives_the_regret_of_each_visit(switch):
+    specs = [SPEC.derive(seed=i, D=0.1) for i in range(3)]
+    stream = stream_of(*specs, cycles=2, steps=33, switch=switch)
+    env = sme_registry.make(stream)
+    rows, episodes, length = [], [], 0
+    env.reset(seed=0)
+    for _ in range(stream.steps + 20):
+        *_, terminated, truncated, info = env.step(np.full(2, 0.5, np.float32))
+        rows.append((info["lifetime"], info["regret"], info["phase"]))
+        length += 1
+        if terminated or truncated:
+            episodes.append((info["lifetime"], np.mean([r[1] for r in rows[-length:]]), length))
+            length = 0
+            env.reset()
+    lifetime, regret, phase = zip(*rows, strict=True)
+    log = dynamic_regret(stream, lifetime, regret, phase=phase)
+    assert log.steps == stream.steps + 20
+    assert log.dynamic_regret == pytest.approx(sum(regret))
+    visits = np.cumsum(np.diff(phase, prepend=phase[0]) != 0)
+    found = [visit.dynamic_regret for visit in log.visits]
+    np.testing.assert_allclose(found, np.bincount(visits, regret))
+    assert len({length for *_, length in episodes}) > 1
+    if switch == "episode":
+        of_episodes = dynamic_regret(stream, *zip(*episodes, strict=True)).visits
+        np.testing.assert_allclose([v.dynamic_regret for v in of_episodes][:-1], found[:-1])
 
 
 def test_an_episode_in_two_visits_is_divided_in_proportion():
