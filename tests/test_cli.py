@@ -806,3 +806,19 @@ def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> N
     _, stderr = process.communicate(timeout=60)
     assert stderr == ""
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", "Switch5"),
+        ("evaluate", "optimal", "Switch5"),
+        ("dataset", "make", "Switch5"),
+        ("study", "new", "plan.json", "-t", "Switch5", "-a", "PPO"),
+        ("diagnose", "optimal", "--task", "Switch5"),
+        ("new", "mine.json", "--from", "Switch5"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_command_on_one_task_refuses_a_stream(command: tuple[str, ...]) -> None:
+    assert "'Switch5': is a stream, and this needs a single task" in refused(*command)

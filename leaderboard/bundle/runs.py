@@ -219,7 +219,7 @@ def _table(path: Path, suite: SuiteFile) -> list[SubmittedRun]:
             )
         try:
             spec = instances.get(row.spec) or load(
-                path.parent / row.spec if row.spec.endswith(".json") else row.spec
+                path.parent / row.spec if row.spec.endswith(".json") else row.spec, SMESpec
             )
         except SMEError as error:
             raise SpecError(f"{source}: {error}") from None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from sme_registry import load
+from sme_registry import SMESpec, load
 from sme_registry.cli.arguments import (
     ActionRange,
     DatasetsFolder,
@@ -101,7 +101,7 @@ def make(
     """
     from sme_registry.datasets import make_dataset
 
-    spec = load(task).derive(**changes(set_))
+    spec = load(task, SMESpec).derive(**changes(set_))
     with Progress("collecting", transitions, unit="transitions", console=err()) as progress:
         dataset = make_dataset(
             spec,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sme_registry import load
+from sme_registry import SMESpec, load
 from sme_registry.cli.arguments import ActionRange, Force, Json, Out, SpecChanges, changes
 from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
@@ -158,7 +158,7 @@ def _subject(
     if cell is not None and task is not None:
         raise OptionError("--cell: names a cell of a study, --task a policy's task. Give one.")
     if task is not None:
-        spec = load(task).derive(**changes(set_))
+        spec = load(task, SMESpec).derive(**changes(set_))
         name = run if os.sep not in run else None
         return diagnosis.load_policy(run, spec, action_range=action_range, name=name, log=log)
     if cell is not None:

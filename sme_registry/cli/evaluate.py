@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sme_registry import load
+from sme_registry import SMESpec, load
 from sme_registry.cli.arguments import (
     ActionRange,
     Force,
@@ -82,7 +82,7 @@ def evaluate(
     """
     from sme_registry import evaluation
 
-    spec = load(task).derive(**changes(set_))
+    spec = load(task, SMESpec).derive(**changes(set_))
     resolved = evaluation.resolve_protocol(protocol)
     target = None if out_folder is None else out_folder / "evaluation.json"
     if target is not None:

@@ -134,7 +134,7 @@ def new(
     import sme_registry
 
     check_document_path(path, force=force)
-    start = SMESpec() if base is None else load(base)
+    start = SMESpec() if base is None else load(base, SMESpec)
     if team is not None and agents is not None:
         raise OptionError("--agents: --team already lists the agents. Give one or the other.")
     if channels_each is not None and agents is None:

@@ -75,7 +75,7 @@ class ClassOptions:
         if self.suite is not None:
             classes += find_file(SuiteFile, self.suite).suite.classes
         for task in tasks:
-            spec = load(task)
+            spec = load(task, SMESpec)
             classes += sweep(spec, axes, name=_title(spec), instances=instances)
         return tuple(classes)
 

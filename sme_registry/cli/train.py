@@ -183,7 +183,7 @@ def train(
     refuse_without_suite(context)
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
-    spec = load(task).derive(**overrides)
+    spec = load(task, SMESpec).derive(**overrides)
     algorithm = training.full_name(algorithm or training.default_algorithm(spec), agents)
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:

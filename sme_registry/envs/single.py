@@ -109,8 +109,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._buffer,
             self._rows.pop,
             *self._values,
-            self._phase,
-            self._lifetimes,
+            None if self._lifetimes is None else (self._phase, self._lifetimes),
         )
 
     def _refill(self) -> None:
@@ -200,7 +199,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         # Written for speed: each look-up and branch here costs one percent of a step.
         (
             plain_dtype, step_float32, buffer, next_rows,
-            similarity, step_reward, regret, accumulated_reward, phase, lifetimes,
+            similarity, step_reward, regret, accumulated_reward, life,
         ) = self._fast_step  # fmt: skip
         try:
             optimal, observation = next_rows()
@@ -216,7 +215,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         else:
             action = self._checked(action)
             reward, end = self._step_float64(buffer, action, optimal, observation)
-        if lifetimes is None:
+        if life is None:
             info = {
                 "optimal_action": optimal,
                 "similarity": similarity[()],
@@ -225,6 +224,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
                 "accumulated_reward": accumulated_reward[()],
             }
         else:  # written out: a dictionary that grows to seven keys costs twice as much
+            phase, lifetimes = life
             info = {
                 "optimal_action": optimal,
                 "similarity": similarity[()],
