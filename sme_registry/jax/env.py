@@ -181,7 +181,11 @@ def _reset_lanes_where(
 
 
 def observe(state: EnvState, params: TaskParams) -> jax.Array:
-    """The observation (s, t/T, r_cum/k), `[S + 2]` float32; s and t/T with the bits of NumPy's."""
+    """The observation (s, t/T, r_cum/k, phase), `[S + 2 + P]` float32.
+
+    s and t/T have the bits of NumPy's. P = 0 except in streams with `observes_phase`. r_cum/k is at
+    most 1, also where r_cum was carried over from a task of a larger k.
+    """
     if isinstance(state.s, Pair):
         s, real = pairs.to_float32(state.s), jnp.float32
     else:
@@ -191,7 +195,8 @@ def observe(state: EnvState, params: TaskParams) -> jax.Array:
     t = state.t.astype(real)
     time = t / jnp.maximum(t, params.horizon.astype(real))
     accumulated = state.accumulated_reward.astype(real) / params.k.astype(real)
-    return jnp.concatenate([s, jnp.stack([time, accumulated]).astype(jnp.float32)])
+    rest = jnp.stack([time, jnp.minimum(accumulated, 1.0)]).astype(jnp.float32)
+    return jnp.concatenate([s, rest, params.phase])
 
 
 def to_unit(action: jax.Array, symmetric: bool, dtype: Any = jnp.float64) -> jax.Array:

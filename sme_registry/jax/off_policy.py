@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sme_registry.jax import replay
-from sme_registry.jax.env import EnvState, reset, step, to_unit
+from sme_registry.jax.env import EnvState, observe, reset, step, to_unit
 from sme_registry.jax.networks import Weights
 from sme_registry.jax.program import PIECE, Array, Program, StepLog
 from sme_registry.jax.replay import Transitions
@@ -34,7 +34,7 @@ class OffPolicyState(NamedTuple):
       learner: weights and optimisers.
       buffer: `[capacity, lanes, row]`; see `replay`.
       episode: the environments.
-      observation: `[lanes, S + 2]`, the present one.
+      observation: `[lanes, O]`, the present one.
       keys: one for each lane; those of a step follow from it and the step's number.
       updated: the number of steps before the last update; a scalar.
     """
@@ -78,7 +78,7 @@ class OffPolicyProgram(Program):
 
         Args:
           weights: of the lane.
-          observation: `[S + 2]`.
+          observation: `[O]`.
           noise: `[A]` standard normal.
           mask: `[A]` which action channels exist.
         """
@@ -121,9 +121,9 @@ class OffPolicyProgram(Program):
         pieces: list[StepLog] = []
         end = self._whole(limit)
         while self.steps < end or not pieces:
-            size = min(PIECE, max(0, end - self.steps))
+            size = min(PIECE, max(0, self.lives.until(self.steps, end) - self.steps))
             log = self._loop(self.steps, self.steps + size, acts=True)
-            self.steps += size
+            self._go_on(size)
             pieces.append(StepLog(*(np.asarray(each)[:size] for each in log)))
         return StepLog(*map(np.concatenate, zip(*pieces, strict=True)))
 
@@ -136,6 +136,14 @@ class OffPolicyProgram(Program):
         arrays = super().save()
         name = f".{self.buffer}"
         return arrays | {name: arrays[name][: self.steps]}
+
+    def _go_on(self, steps: int) -> None:
+        """Count steps; where they end on other tasks, observe them."""
+        before = self.params
+        self.steps += steps
+        if self.params is not before:
+            phase = self.lives.phase_after(self.steps)
+            self.state = _switched(self.state, self.params, phase, self.steps - 1)
 
     def _loop(self, begin: int, end: int, acts: bool) -> StepLog:
         log: StepLog
@@ -209,6 +217,17 @@ def _steps(
     begun = state, StepLog(real, real, real, flag, flag)
     ended: tuple[OffPolicyState, StepLog] = jax.lax.fori_loop(begin, end, body, begun)
     return ended
+
+
+@functools.partial(jax.jit, donate_argnames=("state",))
+def _switched(
+    state: OffPolicyState, params: TaskParams, phase: jax.Array, row: jax.Array
+) -> OffPolicyState:
+    """The state after a switch to other tasks, which also changes s' of the last row."""
+    observation = jax.vmap(observe)(state.episode, params)
+    begins = state.episode.t == 0
+    buffer = replay.rewrite_next(state.buffer, row, observation, begins, phase)
+    return state._replace(observation=observation, buffer=buffer)
 
 
 def _updated(

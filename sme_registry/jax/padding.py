@@ -1,6 +1,7 @@
 """Weights of a lane in networks of a wider observation or action: exact padding, and its removal.
 
-A padded observation is `[s padded to S_pad, t/T, r_cum/k]`, a padded action `[a padded to A_pad]`.
+A padded observation is `[s padded to S_pad, t/T, r_cum/k, phase]`, a padded action
+`[a padded to A_pad]`.
 Weights of what is padded are 0.
 """
 
@@ -20,15 +21,22 @@ InitialWeights = Callable[[np.random.Generator, int, int], HostWeights]
 
 
 class Dimensions(NamedTuple):
-    """S state channels and A action channels, of a task or of the program that it is padded to."""
+    """S state channels and A action channels, of a task or of the program that it is padded to.
+
+    Attributes:
+      state_dim: S.
+      action_dim: A.
+      phases: P, of a stream that has `observes_phase`, else 0.
+    """
 
     state_dim: int
     action_dim: int
+    phases: int = 0
 
     @property
     def observation_dim(self) -> int:
-        """S + 2."""
-        return self.state_dim + 2
+        """S + 2 + P."""
+        return self.state_dim + 2 + self.phases
 
 
 class Padding:

@@ -169,30 +169,35 @@ def collect(
     episode: EnvState,
     noise: jax.Array,
     fresh: EnvState,
+    begin: int | jax.Array,
+    end: int | jax.Array,
     *,
     symmetric: bool,
     separable: bool,
 ) -> tuple[EnvState, Steps, StepLog]:
-    """The steps of a rollout.
+    """The steps `begin` … `end` − 1 of a rollout of n.
 
     Args:
       settings: the hyperparameters.
       weights: the policy's.
       params: one task.
-      episode: the environment before the first step.
+      episode: the environment before step `begin`.
       noise: `[A, n]` standard normal.
       fresh: `[n]` the environment after each step if an episode ends there.
+      begin: the first step, from 0.
+      end: after the last one, at most n.
       symmetric: whether actions are in [−1, 1] instead of [0, 1].
       separable: whether k = 1 and D = 0, so that no reward changes an observation or ends an
         episode. The oracle is then asked once for all steps.
 
     Returns:
-      The environment after the last step, the steps, and their log, `[n]`.
+      The environment after the last step, the steps, and their log, `[n]`; those that were not to
+      be taken are arbitrary.
     """
     sigma = jnp.exp(weights["log_std"])
+    n = noise.shape[1]
 
-    def one(episode: EnvState, drawn: tuple[jax.Array, EnvState]) -> tuple[EnvState, Any]:
-        noise, fresh = drawn
+    def one(episode: EnvState, noise: jax.Array, fresh: EnvState) -> tuple[EnvState, Any]:
         observation = observe(episode, params)
         action = mean(settings, weights, observation) + sigma * noise
         a = to_unit(action, symmetric)
@@ -205,7 +210,15 @@ def collect(
         after = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
         return after, (taken, judged)
 
-    episode, (taken, judged) = jax.lax.scan(one, episode, (noise.T, fresh))
+    def body(i: jax.Array, carry: tuple[EnvState, Any]) -> tuple[EnvState, Any]:
+        episode, rows = carry
+        episode, row = one(episode, noise.T[i], _at(fresh, i))
+        return episode, jax.tree.map(lambda all, own: all.at[i].set(own), rows, row)
+
+    shapes = jax.eval_shape(one, episode, noise[:, 0], _at(fresh, 0))[1]
+    rows = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), shapes)
+    # No scan, whose length is fixed: parts of rollouts are of any length.
+    episode, (taken, judged) = jax.lax.fori_loop(begin, end, body, (episode, rows))
     observation, action, truncated, last_observation = taken
     if separable:
         similarity, step_reward = oracle.judge(params, *judged)
@@ -215,6 +228,11 @@ def collect(
     reward = reward.astype(jnp.float32)
     steps = Steps(observation, action, reward, terminated, truncated, last_observation)
     return episode, steps, log
+
+
+def _at(states: EnvState, i: int | jax.Array) -> EnvState:
+    row: EnvState = jax.tree.map(lambda x: x[i], states)
+    return row
 
 
 def rollout(
@@ -379,23 +397,39 @@ class PPOProgram(Program):
         logs = [StepLog(none, none, none, none > 0, none > 0)]
         while self.steps < limit:
             self.finish()
+            logs += self._collected()
+        return StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+
+    def _collected(self) -> list[StepLog]:
+        """Take the steps of a rollout: all at once, or in parts of which each is on its tasks."""
+        logs, first = [], self.steps
+        last = first + self.rollout
+        while self.steps < last:
+            params, begin = self.params, self.steps - first
+            self.steps = self.lives.until(self.steps, last)
+            part = slice(begin, self.steps - first)
             self.state, log = _collect(
                 self.settings,
                 self.symmetric,
-                self.separable and self.params.inner is not None,
-                self.params,
+                self.separable and params.inner is not None,
+                params,
                 self.state,
+                self.lives.phase_after(self.steps),
+                part.start,
+                part.stop,
             )
-            self.steps += self.rollout
-            logs.append(log)
-        return StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+            whole = part.stop - part.start == self.rollout
+            logs.append(log if whole else StepLog(*(np.asarray(x)[part] for x in log)))
+        return logs
 
     def finish(self) -> None:
         """Learn from the last rollout, unless that is done."""
         settings = self.settings
         updates = self.steps // settings.batch_size * settings.n_epochs
         if self.state.optimiser.updates[0] < updates:
-            self.state = _learn(settings, self.params, self.state)
+            params: Any = self.params._asdict() | {"inner": None, "output": None}
+            # Without layers, so that it is compiled once for all tasks of a stream.
+            self.state = _learn(settings, TaskParams(**params), self.state)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -413,22 +447,46 @@ def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array)
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _collect(
-    settings: PPO, symmetric: bool, separable: bool, params: TaskParams, state: State
+    settings: PPO,
+    symmetric: bool,
+    separable: bool,
+    params: TaskParams,
+    state: State,
+    phase: jax.Array,
+    begin: jax.Array,
+    end: jax.Array,
 ) -> tuple[State, StepLog]:
-    """A rollout of all lanes, and its log `[n, lanes]`."""
+    """A part of a rollout of all lanes, and its log in the rows of `[n, lanes]`.
 
-    def lane(params: TaskParams, state: State) -> tuple[State, StepLog]:
+    Each part draws the random numbers of the whole rollout, and uses its own. `phase` `[lanes, P]`
+    is that of the observation after its last step.
+    """
+
+    def lane(params: TaskParams, state: State, phase: jax.Array) -> tuple[State, StepLog]:
         key, of_noise, of_starts = jax.random.split(state.key, 3)
         n, A = settings.n_steps, params.W.shape[0]
         noise = jax.random.normal(of_noise, (A, n), jnp.float32)
         _, fresh = jax.vmap(reset, (0, None))(jax.random.split(of_starts, n), params)
         episode, steps, log = collect(
-            settings, state.weights, params, state.episode, noise, fresh,
+            settings, state.weights, params, state.episode, noise, fresh, begin, end,
             symmetric=symmetric, separable=separable,
         )  # fmt: skip
+        last = steps.last_observation
+        last = last.at[end - 1, last.shape[-1] - len(phase) :].set(phase)
+        here = (jnp.arange(n) >= begin) & (jnp.arange(n) < end)
+        steps = _chosen(here, steps._replace(last_observation=last), state.steps)
+        key = jnp.where(end == n, key, state.key)
         return state._replace(key=key, episode=episode, steps=steps), log
 
-    return jax.vmap(lane, out_axes=(0, 1))(params, state)
+    return jax.vmap(lane, out_axes=(0, 1))(params, state, phase)
+
+
+def _chosen(rows: jax.Array, new: Steps, old: Steps) -> Steps:
+    """The new steps where `rows` `[n]`, the old ones elsewhere."""
+    chosen: Steps = jax.tree.map(
+        lambda x, y: jnp.where(rows.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, old
+    )
+    return chosen
 
 
 @functools.partial(jax.jit, static_argnums=0)

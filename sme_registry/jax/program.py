@@ -1,9 +1,9 @@
 """`Program`: the lanes of one algorithm, which learn and are evaluated in compiled code.
 
-A lane is one run: a task, a seed, weights. All lanes of a program have the same algorithm,
-hyperparameters, budget and padded shapes, and take the same number of steps; their tasks, seeds and
-reward settings (k, T, r_min, D) differ. A lane's bits depend on the number of lanes and on no other
-lane, so results record that number.
+A lane is one run: a task or a stream of tasks, a seed, weights. All lanes of a program have the
+same algorithm, hyperparameters, budget and padded shapes, and take the same number of steps; their
+tasks, seeds and reward settings (k, T, r_min, D) differ. A lane's bits depend on the number of
+lanes and on no other lane, so results record that number.
 
 A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and the pure functions
 `initial_weights` and `act`; all else is here.
@@ -26,11 +26,11 @@ from sme_registry.errors import OptionError, ResourceLimitError
 from sme_registry.jax import oracle
 from sme_registry.jax.device import find_device, memory_of
 from sme_registry.jax.env import EnvState, observe, start, step_env, to_unit
+from sme_registry.jax.lives import Lane, Lives
 from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.padding import Dimensions, Padding
-from sme_registry.jax.task import Shape, TaskParams, task_params
+from sme_registry.jax.task import Shape, TaskParams
 from sme_registry.jax.transition import States, next_state
-from sme_registry.spec import SMESpec
 
 Array = npt.NDArray[Any]
 
@@ -91,9 +91,9 @@ class Program(ABC):
       budget: steps that each lane is to take.
       symmetric: whether actions are in [−1, 1] instead of [0, 1].
       lanes: their number, with copies.
-      params: the lanes' tasks, padded; leading axis `lanes`.
+      lives: the lanes' tasks, by the steps that they have taken.
       separable: whether rewards change no observation and end no episode (k = 1 and D = 0 in all
-        lanes), so that the oracle can be asked later, for many steps at once.
+        tasks), so that the oracle can be asked later, for many steps at once.
       state: all that changes.
       steps: environment steps that each lane has taken.
     """
@@ -109,7 +109,7 @@ class Program(ABC):
     def __init__(
         self,
         settings: Any,
-        specs: Sequence[SMESpec],
+        specs: Sequence[Lane],
         seeds: Sequence[int],
         *,
         steps: int,
@@ -123,7 +123,7 @@ class Program(ABC):
 
         Args:
           settings: the hyperparameters.
-          specs: the task of each lane.
+          specs: the task or the stream of each lane; streams that switch at the same steps.
           seeds: of each lane, in [0, 2**32): of its weights, its starts and its noise.
           steps: that each lane is to take.
           action_range: of the policies' actions, "symmetric" or "unit".
@@ -133,8 +133,10 @@ class Program(ABC):
           at_once: programs that are to share what the device has of memory.
 
         Raises:
-          SpecError: a task is not one that JAX has; see `task_params`.
-          OptionError: there is no such device.
+          SpecError: a task is not one that JAX has, see `task_params`; or a stream, see
+            `lives.check_switches`.
+          OptionError: there is no such device; or tasks beside streams, or streams that switch at
+            different steps.
           ResourceLimitError: its memory is too small; says how many lanes fit.
         """
         self.settings, self.specs, self.budget = settings, tuple(specs), steps
@@ -143,18 +145,22 @@ class Program(ABC):
         copies = self.lanes - len(specs)
         specs = [*specs, *[specs[0]] * copies]
         seeds = [*seeds, *[seeds[0]] * copies]
-        self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
         self.device = find_device(device)
-        self.params: TaskParams = jax.device_put(task_params(specs, shape=shape), self.device)
+        self.lives, self.steps = Lives(specs, shape, self.device), 0
+        self.separable = self.lives.separable
         A, S = self.params.W.shape[-2:]
         self._initial_weights = functools.partial(self.initial_weights, settings)
-        self._padding = Padding(self._initial_weights, Dimensions(S, A))
+        self._padding = Padding(self._initial_weights, Dimensions(S, A, self.lives.phases))
         weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
         stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
         self._refuse_without_room(jax.eval_shape(self.initial_state, stacked, keys), at_once)
         self.state = self.initial_state(*jax.device_put((stacked, keys), self.device))
-        self.steps = 0
+
+    @property
+    def params(self) -> TaskParams:
+        """The lanes' tasks of the next step, padded; leading axis `lanes`."""
+        return self.lives.at(self.steps)
 
     @staticmethod
     @abstractmethod
@@ -192,15 +198,20 @@ class Program(ABC):
     def finish(self) -> None:
         """Make the update that follows the last step."""
 
-    def evaluate(self, states: Array) -> Evaluation:
-        """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights."""
+    def evaluate(self, states: Array, lifetime: int | None = None) -> Evaluation:
+        """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights.
+
+        Args:
+          states: initial states, padded.
+          lifetime: of a stream, the steps after which its tasks are those to run; None for now.
+        """
         sums = _episodes(
             type(self).act,
             self.settings,
             self.symmetric,
             self.separable,
             self.state.weights,
-            self.params,
+            self.lives.at(self.steps if lifetime is None else lifetime),
             jax.device_put(np.asarray(states, np.float64), self.device),
         )
         return Evaluation(*(np.asarray(each) for each in sums))
@@ -208,7 +219,7 @@ class Program(ABC):
     def weights(self, lane: int) -> dict[str, Array]:
         """A lane's weights without padding, by SB3's names, as NumPy arrays."""
         padded = {name: np.asarray(weight[lane]) for name, weight in self.state.weights.items()}
-        return self._padding.remove(padded, _dimensions(self.specs[lane]))
+        return self._padding.remove(padded, self._dimensions(self.specs[lane]))
 
     def failed(self) -> Array:
         """`[lanes]`, whether a lane's weights are not finite; such lanes go on without effect."""
@@ -259,8 +270,11 @@ class Program(ABC):
                 f"{'fewer lanes, ' if fit else ''}{'fewer programs, ' if sharing else ''}{advice}."
             )
 
-    def _new_weights(self, spec: SMESpec, seed: int) -> HostWeights:
-        own, rng = _dimensions(spec), np.random.default_rng(seed)
+    def _dimensions(self, lane: Lane) -> Dimensions:
+        return Dimensions(lane.state_dim, lane.action_dim, self.lives.phases)
+
+    def _new_weights(self, lane: Lane, seed: int) -> HostWeights:
+        own, rng = self._dimensions(lane), np.random.default_rng(seed)
         return self._padding.add(
             self._initial_weights(rng, own.observation_dim, own.action_dim), own
         )
@@ -302,17 +316,13 @@ def policy(
 ) -> Callable[[Array], Array]:
     """The deterministic policy of a lane's weights, without padding.
 
-    It maps observations `[B, S + 2]` float32 to actions `[B, A]` in the action range, or beyond it.
+    It maps observations `[B, O]` float32 to actions `[B, A]` in the action range, or beyond it.
     """
 
     def act(observations: Array) -> Array:
         return np.asarray(_actions(kind.act, settings, symmetric, dict(weights), observations))
 
     return act
-
-
-def _dimensions(spec: SMESpec) -> Dimensions:
-    return Dimensions(spec.state_dim, spec.action_dim)
 
 
 @functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))

@@ -20,9 +20,9 @@ class Transitions(NamedTuple):
     """Transitions, in any batch shape.
 
     Attributes:
-      observation: `[..., S + 2]`.
+      observation: `[..., O]`.
       action: `[..., A]` in [−1, 1]; 0 in padded channels.
-      next_observation: `[..., S + 2]`; at an episode's end its last one, not the next one's first.
+      next_observation: `[..., O]`; at an episode's end its last one, not the next one's first.
       reward: `[...]` R, the payout.
       done: `[...]` 1.0 where the episode terminated, 0.0 where it goes on or was truncated.
     """
@@ -48,6 +48,24 @@ def write(
     new = jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
     row = row % buffer.shape[0]
     return buffer.at[row].set(jnp.where(writes, new, buffer[row]))
+
+
+def rewrite_next(
+    buffer: jax.Array, row: jax.Array, following: jax.Array, ended: jax.Array, phase: jax.Array
+) -> jax.Array:
+    """Store s' of a row again, as it is observed after a switch to other tasks.
+
+    Args:
+      buffer: the buffer.
+      row: modulo the capacity.
+      following: `[lanes, O]` the present observation, which is s' where the episode goes on.
+      ended: `[lanes]` whether the episode ended there; s' is then as it was, except for the phase.
+      phase: `[lanes, P]` the phase's one-hot, with which an observation ends.
+    """
+    row, end = row % buffer.shape[0], buffer.shape[-1] - 2
+    begin = end - following.shape[-1]
+    last = jnp.concatenate([buffer[row, :, begin : end - phase.shape[-1]], phase], axis=-1)
+    return buffer.at[row, :, begin:end].set(jnp.where(ended[:, None], last, following))
 
 
 def sample_rows(

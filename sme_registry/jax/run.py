@@ -7,7 +7,8 @@ run(program, due=[50_000, 100_000], start_states=..., on_log=..., on_evaluation=
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby, islice
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, integer_in
+from sme_registry.jax.lives import Lane
 from sme_registry.jax.ppo import PPO, PPOProgram
 from sme_registry.jax.program import PIECE, Array, Evaluation, Program, StepLog, policy
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
-from sme_registry.spec import ACTION_RANGES, SMESpec
+from sme_registry.spec import ACTION_RANGES
 from sme_registry.spec.study import JAX
 
 ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
@@ -97,7 +99,7 @@ def settings_of(
 
 def new_program(
     uses: str,
-    specs: Sequence[SMESpec],
+    specs: Sequence[Lane],
     seeds: Sequence[int],
     *,
     hyperparameters: Mapping[str, Any] | None = None,
@@ -113,8 +115,10 @@ def new_program(
     Raises:
       UnknownNameError: no such algorithm.
       OptionError: see `settings_of`; there is no task or no such device; or there is another number
-        of seeds than of tasks, or fewer lanes; or another argument is outside its range.
-      SpecError: a task is not one that JAX has, such as a team's.
+        of seeds than of tasks, or fewer lanes; or streams that switch at different steps; or
+        another argument is outside its range.
+      SpecError: a task is not one that JAX has, such as a team's; or a stream, one that leaves a
+        phase in mid-episode with switch="episode".
       ResourceLimitError: the device's memory is too small; says how many lanes fit.
     """
     integer_in("len(specs)", len(specs), 1)
@@ -160,6 +164,7 @@ def run(
     start_states: Callable[[int], Sequence[Array]] | None = None,
     on_log: Callable[[StepLog], Any],
     on_evaluation: Callable[[int, int, Evaluation], Any] | None = None,
+    on_visit: Callable[[int, list[dict[str, Array]]], Any] | None = None,
     after_piece: Callable[[], Any] = lambda: None,
     piece: int = PIECE,
 ) -> None:
@@ -167,7 +172,12 @@ def run(
 
     Evaluations are those of a study's cell: the k-th one has the weights of step `due[k]`, before
     an update that follows it; the last one waits for the end and the last update. Those whose
-    weights are the same, as in PPO's rollouts, run together.
+    weights are the same, as in PPO's rollouts, run together. In a stream they are of the task on
+    which that step was taken.
+
+    The policy at the end of a visit of a stream's phase has learned from all that it collected in
+    it: with TD3 and SAC up to the update that follows the last step, with PPO up to that of the
+    last rollout that was over by then.
 
     Args:
       program: whose state is saved only in `after_piece`, or before.
@@ -176,38 +186,72 @@ def run(
         no copy; equally many in all lanes.
       on_log: called with the steps after each piece.
       on_evaluation: called with k, the step, and the evaluation of all lanes.
+      on_visit: called with the index of a visit in the life, and the weights of each lane that is
+        no copy, at the end of each visit of a phase; after the evaluations that are due there.
       after_piece: called after each piece and its evaluations, when the state may be saved.
       piece: most steps between two calls; on-policy programs finish their rollout.
     """
-    during = list(due[:-1])
-    together = _most_at_once(during, program.rollout)
+    steps = list(due[:-1])
+    together = _most_at_once(steps, program.rollout)
 
-    def evaluate(indices: Sequence[int], steps: Sequence[int]) -> None:
-        if not indices or start_states is None or on_evaluation is None:
-            return
-        # Always as many episodes: another number would be compiled again.
-        groups = [start_states(index) for index in indices]
-        groups += groups[-1:] * (together - len(groups))
-        evaluation = program.evaluate(_stacked(program, groups))
-        for i, (index, step) in enumerate(zip(indices, steps, strict=True)):
-            n = evaluation.length.shape[1] // len(groups)
-            on_evaluation(index, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in evaluation)))
+    def evaluate(due: Sequence[tuple[int, int]]) -> None:
+        if start_states is not None and on_evaluation is not None:
+            for k, step, done in _evaluated(program, due, start_states, together):
+                on_evaluation(k, step, done)
 
     def evaluate_due(after: int) -> None:
-        indices = [k for k, step in enumerate(during) if after < step <= program.steps]
-        evaluate(indices, [during[k] for k in indices])
+        evaluate([(k, step) for k, step in enumerate(steps) if after < step <= program.steps])
 
     if program.steps == 0:
         evaluate_due(after=-1)
     while program.steps < program.budget:
         before = program.steps
-        upcoming = [step for step in during if step > before]
-        on_log(program.advance(min([before + piece, program.budget, *upcoming[:1]])))
+        visits = program.lives.visit_ends(before) if on_visit is not None else iter(())
+        ends = [end for _, end in islice(visits, 1)]
+        upcoming = [step for step in steps if step > before]
+        on_log(program.advance(min([before + piece, program.budget, *upcoming[:1], *ends])))
         evaluate_due(after=before)
+        if on_visit is not None:
+            _end_visits(program, before, on_visit)
         after_piece()
     if program.budget:
         program.finish()
-    evaluate(range(len(during), len(due)), [program.steps])
+    evaluate([(k, program.steps) for k in range(len(steps), len(due))])
+
+
+def _evaluated(
+    program: Program,
+    due: Sequence[tuple[int, int]],
+    start_states: Callable[[int], Sequence[Array]],
+    together: int,
+) -> Iterator[tuple[int, int, Evaluation]]:
+    """The evaluations of these indices and steps with the present weights, tasks by tasks."""
+    for _, group in groupby(due, lambda one: id(program.lives.at(_lifetime(one[1])))):
+        same = list(group)
+        # Always as many episodes: another number would be compiled again.
+        states = [start_states(k) for k, _ in same]
+        states += states[-1:] * (together - len(same))
+        done = program.evaluate(_stacked(program, states), _lifetime(same[0][1]))
+        n = done.length.shape[1] // len(states)
+        for i, (k, step) in enumerate(same):
+            yield k, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in done))
+
+
+def _end_visits(
+    program: Program, after: int, on_visit: Callable[[int, list[dict[str, Array]]], Any]
+) -> None:
+    """End the visits whose last step is later than `after`, and done."""
+    for visit, end in program.lives.visit_ends(after):
+        if end > program.steps:
+            return
+        if end == program.steps:
+            program.finish()
+        on_visit(visit, [program.weights(lane) for lane in range(len(program.specs))])
+
+
+def _lifetime(step: int) -> int:
+    """The lifetime at which a step was taken; of step 0, the one at which the first will be."""
+    return max(step - 1, 0)
 
 
 def _most_at_once(due: Sequence[int], rollout: int) -> int:

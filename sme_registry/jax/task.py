@@ -107,6 +107,8 @@ class TaskParams(NamedTuple):
       b: `[S]` transition offset, float64; for states as pairs, a pair.
       inner: the optimal policy's inner layers; None where L = 1.
       output: its last layer, of the dtype of the oracle.
+      phase: `[P]` float32, the one-hot with which observations end in a stream that has
+        `observes_phase`; elsewhere P = 0.
     """
 
     state_dim: jax.Array
@@ -119,6 +121,7 @@ class TaskParams(NamedTuple):
     b: jax.Array | Pair
     inner: InnerLayers | None
     output: Layer
+    phase: jax.Array
 
     @property
     def max_steps_in_episode(self) -> jax.Array:
@@ -163,21 +166,34 @@ def task_params(
         dtype or kind of states.
       UnknownNameError, ResourceLimitError, FingerprintMismatchError: see `load_task`.
     """
+    single = isinstance(specs, SMESpec | dict | str | os.PathLike)
+    listed: Any = [specs] if single else specs
+    lanes = _lanes([load_task(spec) for spec in listed], shape, dtype, states)
+    return cast(TaskParams, jax.tree.map(jnp.asarray, lanes[0])) if single else _stacked(lanes)
+
+
+def stacked_params(tasks: Sequence[Task], shape: Shape | None = None) -> TaskParams:
+    """Drawn tasks, one for each lane, in float64; see `task_params`."""
+    return _stacked(_lanes(tasks, shape, np.float64, "float64"))
+
+
+def _lanes(tasks: Sequence[Task], shape: Shape | None, dtype: Any, states: str) -> list[TaskParams]:
+    """Tasks padded to one shape, with NumPy's arrays in place of JAX's."""
     as_pairs = choice("states", states, ("float64", "pairs")) == "pairs"
     dtype = np.dtype(dtype)
     if dtype not in (np.float64, np.float32):
         raise OptionError(f"dtype={dtype.name}: must be float64 or float32.")
-    single = isinstance(specs, SMESpec | dict | str | os.PathLike)
-    listed: Any = [specs] if single else specs
-    tasks = [load_task(spec) for spec in listed]
     for task in tasks:
         check_supported(task.spec)
     smallest = Shape.covering(Shape.of(task.spec) for task in tasks)
     shape = smallest if shape is None else _checked_shape(shape)
     _check_covered(smallest, shape)
-    lanes = [_padded(task, shape, dtype, as_pairs) for task in tasks]
-    params = lanes[0] if single else jax.tree.map(lambda *parts: np.stack(parts), *lanes)
-    return cast(TaskParams, jax.tree.map(jnp.asarray, params))
+    return [_padded(task, shape, dtype, as_pairs) for task in tasks]
+
+
+def _stacked(lanes: Sequence[TaskParams]) -> TaskParams:
+    stacked = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *lanes)
+    return cast(TaskParams, stacked)
 
 
 def check_supported(spec: SMESpec) -> None:
@@ -230,6 +246,7 @@ def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> T
         "b": pairs.from_float64(b) if as_pairs else b,
         "inner": _inner_layers(inner, shape, dtype) if inner else None,
         "output": _layer(output, (A, H if L > 1 else S), dtype),
+        "phase": np.zeros(0, np.float32),
     }
     return TaskParams(**fields)
 

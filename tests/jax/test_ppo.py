@@ -206,7 +206,7 @@ def test_collected_steps_are_those_of_the_environment(
     collect = jax.jit(
         functools.partial(ppo.collect, SETTINGS, symmetric=symmetric, separable=separable)
     )
-    episode, steps, log = collect(weights, params, begin, noise, after)
+    episode, steps, log = collect(weights, params, begin, noise, after, 0, n)
 
     env = make(spec, action_range=action_range)
     observation, _ = env.reset(options={"state": starts[0]})

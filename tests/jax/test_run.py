@@ -13,6 +13,7 @@ from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.jax.program import Evaluation, Program, StepLog
 from sme_registry.jax.run import new_program, run
+from sme_registry.spec import StreamSpec
 
 SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=1))
 
@@ -24,9 +25,10 @@ class Nothing(NamedTuple):
 class Scripted(Program):
     """Takes no steps but counts them, and records the order of its calls."""
 
-    def __init__(self, budget: int, rollout: int = 1) -> None:
-        super().__init__((), SPECS, (0, 1), steps=budget, lanes=3)
+    def __init__(self, budget: int, rollout: int = 1, lanes: Any = SPECS) -> None:
+        super().__init__((), lanes, (0, 1), steps=budget, lanes=3)
         self.rollout, self.events, self.updates = rollout, list[Any](), 0
+        self.lifetimes = list[Any]()
 
     @staticmethod
     def initial_weights(settings: Any, rng: Any, observation_dim: int, action_dim: int) -> Any:
@@ -47,12 +49,13 @@ class Scripted(Program):
         return StepLog(*[np.zeros((self.steps - before, self.lanes))] * 5)
 
     def finish(self) -> None:
-        self.updates += 1
+        self.updates = self.steps // self.rollout
         self.events.append("finish")
 
-    def evaluate(self, states: Any) -> Evaluation:
+    def evaluate(self, states: Any, lifetime: int | None = None) -> Evaluation:
         """The sum of each initial state as the return."""
         self.events.append(("evaluate", states.shape))
+        self.lifetimes.append(lifetime)
         return Evaluation(*[states.sum(axis=-1)] * 4)
 
 
@@ -118,6 +121,49 @@ def test_the_state_may_be_saved_after_each_piece_and_its_evaluations() -> None:
     assert saved == [
         ("steps", 3), 3, ("steps", 2), one, 5, ("steps", 3), 8, ("steps", 2), 10, "finish", one,
     ]  # fmt: skip
+
+
+def stream(seed: int) -> StreamSpec:
+    tasks = [SMESpec(state_dim=2 - seed, horizon=1, seed=i, k=1 + i) for i in (seed, 2)]
+    return StreamSpec(phases=[{"spec": spec, "steps": 5} for spec in tasks], cycles=2)
+
+
+def test_evaluations_are_of_the_task_on_which_their_step_was_taken() -> None:
+    program = Scripted(budget=20, rollout=8, lanes=[stream(0), stream(1)])
+    rows = scripted_run(program, [0, 1, 5, 6, 7, 20])
+    assert [row[1] for row in rows] == [0, 1, 5, 6, 7, 24]
+    assert program.lifetimes == [0, 0, 5, 23]
+    assert [program.lives.at(lifetime).k[0] for lifetime in (4, 5, 9, 10, 23)] == [1, 3, 3, 1, 3]
+
+
+@pytest.mark.parametrize(
+    ("rollout", "updates"),
+    [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 2])],
+)
+def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(
+    rollout: int, updates: list[int]
+) -> None:
+    program = Scripted(budget=20, rollout=rollout, lanes=[stream(0), stream(1)])
+    ended: list[Any] = []
+    due = [5, 20]
+
+    def on_visit(visit: int, weights: list[dict[str, Any]]) -> None:
+        assert [each["bias"].shape for each in weights] == [(1,), (1,)]
+        ended.append((visit, program.updates))
+
+    rows = scripted_run(program, due, on_visit=on_visit)
+    assert ended == [*enumerate(updates)]
+    assert rows[0][2] == 4 // rollout  # before the update that ends the visit
+    plain = Scripted(budget=20, rollout=rollout)
+    scripted_run(plain, due, on_visit=on_visit)
+    assert len(ended) == 4
+
+
+def test_a_restored_run_goes_on_after_the_visits_that_have_ended() -> None:
+    program, ended = Scripted(budget=20, lanes=[stream(0), stream(1)]), list[int]()
+    program.steps = 10
+    scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
+    assert ended == [2, 3]
 
 
 @pytest.mark.parametrize(

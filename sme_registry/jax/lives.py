@@ -1,0 +1,169 @@
+"""`Lives`: which tasks the lanes of a program are on, after how many steps.
+
+A lane lives through a stream (METHOD, section 7), or is on one task for ever. All lanes of a
+program switch at the same steps, and what a program keeps of its lanes does not depend on their
+tasks, so a switch only passes other `TaskParams` to the same compiled code. Phases of one layer
+beside phases of several are compiled once each.
+
+A switch happens at once. With `switch="episode"` that is right where every episode ends at the
+switch, which `Lives` checks.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+from typing import Any
+
+import jax
+import numpy as np
+
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.jax.task import Shape, TaskParams, stacked_params
+from sme_registry.spec import SMESpec, StreamSpec
+from sme_registry.task import Task, load_task, materialize_stream
+
+Lane = SMESpec | StreamSpec
+"""What a lane lives through: one task, or a stream of them."""
+
+
+class Lives:
+    """The tasks of all lanes, by the steps that each lane has taken: its lifetime.
+
+    Args:
+      lanes: the task or the stream of each.
+      shape: to which tasks are padded; None for their maxima. Its layers are those of tasks of
+        several layers.
+      device: of the params.
+
+    Attributes:
+      separable: whether rewards change no observation and end no episode: k = 1 and D = 0 in all
+        tasks.
+      phases: P, of which the agent observes the one-hot; 0 where it does not.
+
+    Raises:
+      OptionError: tasks beside streams, streams that switch at different steps, or see
+        `task_params`.
+      SpecError: see `check_switches` and `task_params`.
+      ResourceLimitError: the tasks do not fit in memory.
+    """
+
+    def __init__(self, lanes: Sequence[Lane], shape: Shape | None, device: Any) -> None:
+        _check_alike(lanes)
+        first = lanes[0]
+        self._stream = first if isinstance(first, StreamSpec) else None
+        if self._stream is not None:
+            check_switches(self._stream)
+        self._ends = [*accumulate(phase.steps for phase in self._phases)]
+        self.phases = len(self._ends) if self._stream and self._stream.observes_phase else 0
+        drawn = {lane: _tasks(lane) for lane in lanes}
+        pieces = [*zip(*(drawn[lane] for lane in lanes), strict=True)]
+        specs = {task.spec for tasks in pieces for task in tasks}
+        self.separable = all(spec.k == 1 and spec.D == 0 for spec in specs)
+        shapes = _shapes(pieces, shape)
+        stacked = {
+            tasks: jax.device_put(stacked_params(tasks, shapes[_is_deep(tasks)]), device)
+            for tasks in dict.fromkeys(pieces)
+        }
+        self._params = [self._in_phase(i, stacked[tasks]) for i, tasks in enumerate(pieces)]
+
+    def at(self, lifetime: int) -> TaskParams:
+        """The tasks on which the next step is taken."""
+        return self._params[self._stream.piece_at(lifetime) if self._stream else 0]
+
+    def until(self, lifetime: int, limit: int) -> int:
+        """The step before which these tasks are left, at most `limit`."""
+        switch = self._stream.next_switch(lifetime) if self._stream else None
+        return limit if switch is None else min(limit, switch)
+
+    def phase_after(self, lifetime: int) -> jax.Array:
+        """The one-hot `[lanes, P]` in the last observation of an episode that ends there."""
+        at_once = self._stream is not None and self._stream.switch == "step"
+        return self.at(lifetime if at_once else lifetime - 1).phase
+
+    def visit_ends(self, after: int) -> Iterator[tuple[int, int]]:
+        """Visits of phases that end later than a step: the index of each in the life, and its end.
+
+        Visit v is of phase v mod P, in cycle v div P.
+        """
+        if self._stream is None:
+            return
+        P, length = len(self._ends), self._stream.cycle_steps
+        first = after // length * P + bisect_right(self._ends, after % length)
+        for visit in range(first, P * self._stream.cycles):
+            yield visit, visit // P * length + self._ends[visit % P]
+
+    @property
+    def _phases(self) -> Sequence[Any]:
+        return self._stream.phases if self._stream else ()
+
+    def _in_phase(self, piece: int, params: TaskParams) -> TaskParams:
+        if self._stream is None or not self.phases:
+            return params
+        shown = np.zeros((len(params.W), self.phases), np.float32)
+        shown[:, self._stream.pieces[piece].phase] = 1.0
+        return params._replace(phase=jax.device_put(shown, params.W.device))
+
+
+def check_switches(stream: StreamSpec) -> None:
+    """Raise SpecError unless every episode ends where a phase is left, or phases switch at once."""
+    if stream.switch == "step" or stream.next_switch(0) is None:
+        return
+    otherwise = 'Use an algorithm of Stable-Baselines3, such as PPO, or choose switch="step".'
+    for index, phase in enumerate(stream.phases):
+        if phase.spec.D > 0:
+            raise SpecError(
+                f"phases.{index}.spec: D={phase.spec.D}: must be 0, since agents in JAX leave a "
+                f"phase where all lanes end an episode. {otherwise}"
+            )
+    starts = [(piece.phase, piece.start) for piece in stream.pieces]
+    for index, step in [*starts, (len(stream.phases) - 1, stream.cycle_steps)]:
+        if step % stream.horizon:
+            raise SpecError(
+                f"phases.{index}: begins or ends a task at step {step:,} of the cycle: must be a "
+                f"multiple of horizon={stream.horizon}, since agents in JAX leave a phase where "
+                f"all lanes end an episode. {otherwise}"
+            )
+
+
+def _check_alike(lanes: Sequence[Lane]) -> None:
+    """Raise OptionError unless all lanes switch at the same steps, in the same way."""
+    first, *others = map(_switches, lanes)
+    for index, other in enumerate(others, 1):
+        if other != first:
+            raise OptionError(
+                f"specs[{index}]: must switch at the same steps as specs[0]: streams of equal "
+                "steps, drift.increments, cycles, switch and observes_phase, or tasks alone. Make "
+                "two programs."
+            )
+
+
+def _switches(lane: Lane) -> Any:
+    """What streams of one program have in common; None for a task."""
+    if isinstance(lane, SMESpec):
+        return None
+    starts = [(piece.phase, piece.start) for piece in lane.pieces]
+    return starts, lane.cycle_steps, lane.cycles, lane.switch, lane.observes_phase
+
+
+def _tasks(lane: Lane) -> tuple[Task, ...]:
+    return materialize_stream(lane) if isinstance(lane, StreamSpec) else (load_task(lane),)
+
+
+def _is_deep(tasks: Sequence[Task]) -> bool:
+    return tasks[0].spec.complexity > 1
+
+
+def _shapes(pieces: Sequence[Sequence[Task]], shape: Shape | None) -> dict[bool, Shape | None]:
+    """To which tasks of several layers (True) and of one layer (False) are padded."""
+    if len(pieces) == 1:
+        return {_is_deep(pieces[0]): shape}
+    if shape is not None:
+        return {True: shape, False: shape._replace(complexity=1, hidden_width=0)}
+    return {
+        deep: Shape.covering(
+            Shape.of(task.spec) for tasks in pieces if _is_deep(tasks) is deep for task in tasks
+        )
+        for deep in {_is_deep(tasks) for tasks in pieces}
+    }

@@ -1,0 +1,258 @@
+"""Agents live through streams: each step is under the task in force, and nothing else changes."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+pytest.importorskip("jax")
+
+import jax
+import jax.numpy as jnp
+
+from sme_registry import SMESpec
+from sme_registry.errors import OptionError, SpecError
+from sme_registry.jax import replay
+from sme_registry.jax.env import observe as observe_in_jax
+from sme_registry.jax.lives import Lives
+from sme_registry.jax.ppo import PPO, PPOProgram
+from sme_registry.jax.program import StepLog
+from sme_registry.jax.task import Shape
+from sme_registry.jax.td3 import TD3, TD3Program
+from sme_registry.spec import StreamSpec
+from sme_registry.task import materialize_stream, observe, step
+
+BASE = SMESpec(state_dim=3, action_dim=2, horizon=13, k=5, D=0.02, seed=1)
+OTHERS = (
+    BASE.derive(seed=2, k=1, r_min=0.4),
+    BASE.derive(seed=3, k=3, D=0.0),
+)
+DRIFT = {"rotation": 1.0, "increments": 2}
+BUDGET = 64
+
+
+def stream_of(*phases: tuple[SMESpec, int], drift: Any = None, **fields: Any) -> StreamSpec:
+    """A stream; the drift is of its last phase."""
+    listed: list[dict[str, Any]] = [{"spec": spec, "steps": steps} for spec, steps in phases]
+    if drift:
+        listed[-1]["drift"] = drift
+    return StreamSpec(phases=listed, **fields)
+
+
+# Switches where an episode is truncated (13), and within one and from k = 20 to k = 1 (25); within
+# rollouts, and at the end of the first one (32).
+SUDDEN = stream_of(
+    (OTHERS[1], 13), (BASE.derive(D=0.0, k=20), 12), (OTHERS[0], 7), drift=DRIFT,
+    cycles=2, switch="step", observes_phase=True,
+)  # fmt: skip
+CURRICULUM = stream_of(
+    *[
+        (SMESpec(state_dim=3, action_dim=2, horizon=7, complexity=L, hidden_width=4), 14)
+        for L in (1, 2, 3)
+    ],
+    observes_phase=True,
+)
+
+ALGORITHMS: dict[str, tuple[Any, Any]] = {
+    "TD3": (TD3Program, TD3(learning_starts=6, batch_size=8, net_arch=(8,))),
+    "PPO": (PPOProgram, PPO(n_steps=32, batch_size=16, n_epochs=2, net_arch=(8,))),
+}
+
+
+def program(algorithm: str, *lanes: Any, budget: int = BUDGET) -> Any:
+    kind, settings = ALGORITHMS[algorithm]
+    return kind(settings, lanes, range(len(lanes)), steps=budget)
+
+
+class Life(NamedTuple):
+    """What an agent met, `[steps, lanes, …]`."""
+
+    observation: npt.NDArray[np.float32]
+    action: npt.NDArray[np.float32]
+    next_observation: npt.NDArray[np.float32]
+    reward: npt.NDArray[np.float32]
+    log: StepLog
+
+
+def lived(algorithm: str, *lanes: Any) -> Life:
+    """A whole life."""
+    agents = program(algorithm, *lanes)
+    if algorithm == "TD3":
+        log = agents.advance(BUDGET)
+        rows = jnp.arange(BUDGET)[None].repeat(len(lanes), axis=0)
+        stored = replay.read(agents.state.buffer, rows, agents.state.observation.shape[-1])
+        met = [np.asarray(x).swapaxes(0, 1) for x in stored]
+        return Life(*met[:4], log)
+    parts = []
+    for end in (32, 64):
+        log = agents.advance(end)
+        steps = agents.state.steps
+        met = (steps.observation, steps.action, steps.last_observation, steps.reward)
+        parts.append([*(np.asarray(x).swapaxes(0, 1) for x in met), log])
+    *columns, logs = zip(*parts, strict=True)
+    log = StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+    return Life(*map(np.concatenate, columns), log)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("stream", [SUDDEN, CURRICULUM], ids=["sudden", "curriculum"])
+def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(
+    algorithm: str, stream: StreamSpec
+) -> None:
+    """From its observation on; also what is observed at a switch, and where an episode ends."""
+    life = lived(algorithm, stream, stream)
+    tasks, at_once = materialize_stream(stream), stream.switch == "step"
+    one_hot = np.eye(len(stream.phases), dtype=np.float32)
+    for lane in range(2):
+        t, waiting, most = np.zeros(1, np.int64), np.zeros((1, 1)), 0.0
+        for n in range(BUDGET):
+            piece, following = stream.piece_at(n), stream.piece_at(n + 1)
+            task, s = tasks[piece], life.observation[n, lane, :3].astype(float)[None]
+            seen = observe(task.spec, s, t, waiting)[0]
+            most = max(most, seen[4])
+            phase = one_hot[stream.pieces[piece].phase]
+            np.testing.assert_allclose(
+                life.observation[n, lane], [*seen[:4], min(seen[4], 1.0), *phase], atol=1e-6
+            )
+            action = (life.action[n, lane].clip(-1, 1).astype(float)[None] + 1) / 2
+            one = step(task, s, t, waiting, action)
+            t, waiting = t + 1, one.accumulated_reward
+            ends = one.terminated[0], one.truncated[0]
+            assert ends == (life.log.terminated[n, lane], life.log.truncated[n, lane])
+            rewards = life.log.reward[n, lane], life.reward[n, lane]
+            assert rewards == pytest.approx([one.reward[0, 0]] * 2, abs=1e-5)
+            regret = life.log.regret[n, lane], 1 - life.log.similarity[n, lane]
+            expected = 1 - one.step_reward[0, 0], 1 - one.similarity[0, 0]
+            assert regret == pytest.approx(expected, abs=1e-5)
+            last, goes_on = following if at_once else piece, not any(ends)
+            if ends[1] or (goes_on and algorithm == "TD3"):  # others are no target of an update
+                seen = observe(tasks[last].spec, one.state, t, waiting)[0]
+                phase = one_hot[stream.pieces[last].phase]
+                np.testing.assert_allclose(
+                    life.next_observation[n, lane],
+                    [*seen[:4], min(seen[4], 1.0), *phase], atol=1e-6,
+                )  # fmt: skip
+            if not goes_on:
+                t, waiting = np.zeros(1, np.int64), np.zeros((1, 1))
+        if at_once:
+            assert most > 1.0
+            assert life.log.terminated[:, lane].any()
+            ends = life.log.truncated[[12, 24], lane]
+            assert ends.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_stream_of_equal_tasks_is_that_task(algorithm: str) -> None:
+    """To the bit, though a task that differs in a field without effect is another task."""
+    twin = BASE.derive(hidden_width=32)
+    stream = stream_of((BASE, 9), (twin, 13), cycles=2, switch="step")
+    one, other = program(algorithm, stream), program(algorithm, BASE)
+    assert len({id(one.lives.at(lifetime)) for lifetime in range(22)}) == 2
+    for end in (20, BUDGET):
+        np.testing.assert_array_equal(one.advance(end).regret, other.advance(end).regret)
+        one.finish()
+        other.finish()
+        np.testing.assert_equal(one.save(), other.save())
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_life_is_that_of_its_first_task_until_the_first_switch(algorithm: str) -> None:
+    stream = stream_of((BASE, 9), (OTHERS[0], 50), switch="step")
+    log, plain = program(algorithm, stream).advance(32), program(algorithm, BASE).advance(32)
+    for one, other in zip(log, plain, strict=True):
+        np.testing.assert_array_equal(one[:9], other[:9])
+    assert (log.similarity[9:] != plain.similarity[9:]).all()
+
+
+def test_ppo_bootstraps_from_what_is_observed_after_a_switch() -> None:
+    """At the end of a rollout, r_cum/k of the next task; all else in the rollout is the same."""
+    base = BASE.derive(D=0.0, k=50, horizon=100)
+    after, weights = (base, base.derive(k=100)), []
+    for spec in after:
+        agents = program("PPO", stream_of((base, 32), (spec, 32), switch="step"))
+        agents.advance(32)
+        assert agents.state.episode.accumulated_reward[0] > 0
+        shown = jax.vmap(observe_in_jax)(agents.state.episode, agents.params)
+        agents.finish()
+        weights.append(agents.weights(0)["value_net.weight"])
+        agents.advance(64)
+        np.testing.assert_array_equal(agents.state.steps.observation[:, 0], shown)
+    assert (weights[0] != weights[1]).any()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("saved_at", [32, 40])
+def test_a_restored_life_goes_on_with_the_same_bits(algorithm: str, saved_at: int) -> None:
+    """Also where it was saved at a switch."""
+    one, other = program(algorithm, SUDDEN, SUDDEN), program(algorithm, SUDDEN, SUDDEN)
+    one.advance(saved_at)
+    other.restore({name: array.copy() for name, array in one.save().items()})
+    for mine, theirs in zip(one.advance(BUDGET), other.advance(BUDGET), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    one.finish()
+    other.finish()
+    np.testing.assert_equal(one.save(), other.save())
+
+
+def test_tasks_of_one_layer_and_of_several_are_padded_apart() -> None:
+    def lives(shape: Shape | None = None) -> Lives:
+        return Lives([CURRICULUM, CURRICULUM], shape, jax.devices()[0])
+
+    shallow, *deep = (lives().at(lifetime) for lifetime in (0, 14, 28))
+    assert shallow.inner is None
+    assert [params.inner.stacked.W.shape for params in deep] == [(2, 1, 4, 4)] * 2
+    padded = lives(Shape(5, 4, 6, 8))
+    assert padded.at(0).output.W.shape == (2, 4, 5)
+    assert padded.at(14).inner.stacked.W.shape == (2, 4, 8, 8)
+    assert padded.at(13) is padded.at(0)
+    assert padded.separable
+    assert not cached_lives(SUDDEN).separable
+
+
+@cache
+def cached_lives(*lanes: Any) -> Lives:
+    return Lives(lanes, None, jax.devices()[0])
+
+
+def test_visits_end_where_their_phases_do() -> None:
+    ends = [13, 25, 32, 45, 57, 64]
+    lives = cached_lives(SUDDEN)
+    assert [*lives.visit_ends(0)] == [*enumerate(ends)]
+    for visit, (begin, end) in enumerate(pairwise([0, *ends])):
+        assert next(lives.visit_ends(begin)) == next(lives.visit_ends(end - 1)) == (visit, end)
+    assert [*lives.visit_ends(64)] == [*cached_lives(BASE).visit_ends(0)] == []
+
+
+def test_lanes_may_be_on_other_tasks_but_switch_together() -> None:
+    other = stream_of((OTHERS[0], 9), (BASE, 13), switch="step")
+    same = stream_of((BASE, 9), (OTHERS[1], 13), switch="step")
+    assert cached_lives(other, same).at(12).k.tolist() == [5, 3]
+    for lane in (
+        BASE,
+        stream_of((BASE, 9), (OTHERS[1], 14), switch="step"),
+        stream_of((BASE, 9), (OTHERS[1], 13), switch="step", cycles=2),
+        stream_of((BASE, 9), (OTHERS[1], 13), switch="step", observes_phase=True),
+        stream_of((BASE, 9), (OTHERS[1], 13), switch="step", drift=DRIFT),
+    ):
+        with pytest.raises(OptionError, match=r"^specs\[1\]: must switch at the same steps as sp"):
+            cached_lives(same, lane)
+
+
+def test_a_phase_that_would_be_left_within_an_episode_is_refused_by_its_index() -> None:
+    steady = BASE.derive(D=0.0)
+    for phases, message in (
+        ([(steady, 13), (BASE, 13)], r"^phases\.1\.spec: D=0\.02: must be 0, since agents in JAX"),
+        (
+            [(steady, 13), (steady, 14), (steady, 12)],
+            r"^phases\.2: .* step 27 .* of horizon=13, since",
+        ),
+        ([(steady, 13), (steady, 14)], r"^phases\.1: .* step 27 of the cycle: must be a multiple"),
+    ):
+        with pytest.raises(SpecError, match=message):
+            cached_lives(stream_of(*phases, cycles=2))
+    cached_lives(stream_of((BASE, 8)))  # for ever
