@@ -1,4 +1,4 @@
-"""Training steps of PPO in JAX, beside SB3; and of tasks of unequal rewards, beside equal tasks."""
+"""Training steps of PPO in JAX: beside SB3, of tasks of unequal rewards, and of streams."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import pytest
 
 from benchmarks.test_training import learner
 from sme_registry import SMESpec
+from sme_registry.spec import StreamSpec
+from sme_registry.task import load_stream
 from sme_registry.training.algorithms import one_thread
 
 pytest.importorskip("jax")
@@ -27,7 +29,7 @@ SETTINGS = [
 TARGET = {1: 18.0, 10: 25.0}  # of an agent, among so many
 
 
-def training(specs: Sequence[SMESpec]) -> Callable[[int], None]:
+def training(specs: Sequence[SMESpec | StreamSpec]) -> Callable[[int], None]:
     """Steps of agents, and their updates; the number is that of all agents together."""
     from sme_registry.jax.run import new_program
 
@@ -65,5 +67,17 @@ def test_training_steps_of_all_rewards(compare: Any) -> None:
     compare(
         f"PPO in JAX, {n} settings of k, r_min and D", "step", training(SETTINGS), n * ROLLOUT,
         {f"{n} agents of one setting": (training(SETTINGS[:1] * n), n * ROLLOUT, 1 / 1.1)},
+        clock=time.process_time,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["Switch5", "Drift"])
+def test_training_steps_in_a_stream(compare: Any, name: str) -> None:
+    """Whose switches lie 20,000 steps apart, or 1,000: within almost every rollout, then."""
+    stream = StreamSpec(phases=load_stream(f"SME/{name}-v1").phases, cycles=1000)
+    steps = 10 * ROLLOUT
+    compare(
+        f"PPO in JAX, a life in {name}", "step", training([stream]), steps,
+        {"its first phase": (training([stream.phases[0].spec]), steps, 1 / 1.15)},
         clock=time.process_time,
     )  # fmt: skip

@@ -20,6 +20,7 @@ Every module below imports JAX, which nothing outside this folder does. Importin
     replay      their buffer
     critics     their twin critics and targets
     ranges      of hyperparameters, as types
+    lives       which tasks the lanes of a program are on: one, or a stream's
     padding     weights of a lane in networks of wider observations and actions
     program     what all programs have: lanes, evaluation, saving, lanes that failed
     run         a program from its start to its end, evaluated where a study's cell is
