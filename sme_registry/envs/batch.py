@@ -108,6 +108,13 @@ def _references(arrays: _Arrays) -> list[int]:
 _ALONE = _references(_Results(1, 1, 1, 1)._allocate())
 
 
+def refuse_large_batch(lanes: int, lane_bytes: int) -> None:
+    """Raise ResourceLimitError where lanes of so many bytes each would not fit in memory."""
+    refuse_above_limit(
+        lanes * lane_bytes, f"num_envs={lanes}: a batch this large", "Use fewer lanes."
+    )
+
+
 class InitialStates:
     """The initial states of a batch: uniform in the cube, drawn in advance, a generator per lane.
 
@@ -158,11 +165,7 @@ class Batch:
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
         self._shape = (lanes, A)
-        refuse_above_limit(
-            lanes * 8 * (5 * S + 6 * A + 20 * n + 48),
-            f"num_envs={lanes}: a batch this large",
-            "Use fewer lanes.",
-        )
+        refuse_large_batch(lanes, 8 * (5 * S + 6 * A + 20 * n + 48))
         self.task, self.lanes = task, lanes
         self.initial_states = InitialStates(lanes, S)
         # Channel by channel, [S, B] and [n, B], as the compiled step reads them.

@@ -13,7 +13,7 @@ import numpy as np
 from sme_registry.compiled import engine
 from sme_registry.compiled.engine import StepMany
 from sme_registry.envs import infos
-from sme_registry.envs.batch import Batch, BatchStep
+from sme_registry.envs.batch import Batch, BatchStep, refuse_large_batch
 from sme_registry.envs.stream_tasks import StreamTasks
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.spec import StreamSpec
@@ -34,6 +34,7 @@ class StreamBatch(Batch):
     """
 
     def __init__(self, tasks: StreamTasks, lanes: int) -> None:
+        refuse_large_batch(lanes, 40 + 20 * tasks.stream.observation_dim)
         self.tasks = tasks
         self._piece, self._lifetime = np.zeros(lanes, np.int64), np.zeros(lanes, np.int64)
         self._next_switch = np.zeros(lanes, np.int64)  # at the first `begin` every lane switches

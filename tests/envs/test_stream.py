@@ -14,7 +14,12 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from sme_registry import StreamSpec
 from sme_registry.envs import SMEEnv, SMEStreamEnv, SMEStreamVectorEnv, SMEVectorEnv
-from sme_registry.errors import ActionError, EpisodeError, UnexpectedKeywordError
+from sme_registry.errors import (
+    ActionError,
+    EpisodeError,
+    ResourceLimitError,
+    UnexpectedKeywordError,
+)
 from sme_registry.testing.comparing import expect_same
 from sme_registry.testing.episodes import as_action, mixed_actions, next_action
 
@@ -276,6 +281,11 @@ def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -
         make("SME/Switch5-v1", complexity=10)
     with pytest.raises(UnexpectedKeywordError, match=r"Did you mean 'action_range'"):
         make("SME/Switch5-v1", action_rnge="unit")
+
+
+def test_a_batch_that_does_not_fit_in_memory_is_refused() -> None:
+    with pytest.raises(ResourceLimitError, match="fewer lanes"):
+        SMEStreamVectorEnv(stream(), 2**40)
 
 
 def test_frames_show_the_task_in_force() -> None:
