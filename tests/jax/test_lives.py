@@ -114,11 +114,9 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(
             piece, following = stream.piece_at(n), stream.piece_at(n + 1)
             task, s = tasks[piece], life.observation[n, lane, :3].astype(float)[None]
             seen = observe(task.spec, s, t, waiting)[0]
-            most = max(most, seen[4])
+            most = max(most, waiting[0, 0] / task.spec.k)
             phase = one_hot[stream.pieces[piece].phase]
-            np.testing.assert_allclose(
-                life.observation[n, lane], [*seen[:4], min(seen[4], 1.0), *phase], atol=1e-6
-            )
+            np.testing.assert_allclose(life.observation[n, lane], [*seen, *phase], atol=1e-6)
             action = (life.action[n, lane].clip(-1, 1).astype(float)[None] + 1) / 2
             one = step(task, s, t, waiting, action)
             t, waiting = t + 1, one.accumulated_reward
@@ -135,7 +133,7 @@ def test_every_step_of_a_life_is_that_of_numpy_under_the_task_in_force(
                 phase = one_hot[stream.pieces[last].phase]
                 np.testing.assert_allclose(
                     life.next_observation[n, lane],
-                    [*seen[:4], min(seen[4], 1.0), *phase], atol=1e-6,
+                    [*seen, *phase], atol=1e-6,
                 )  # fmt: skip
             if not goes_on:
                 t, waiting = np.zeros(1, np.int64), np.zeros((1, 1))
