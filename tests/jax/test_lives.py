@@ -209,7 +209,8 @@ def test_tasks_of_one_layer_and_of_several_are_padded_apart() -> None:
     assert padded.at(14).inner.stacked.W.shape == (2, 4, 8, 8)
     assert padded.at(13) is padded.at(0)
     assert padded.separable
-    assert not cached_lives(SUDDEN).separable
+    sparse_later = stream_of((BASE.derive(k=1, D=0.0), 9), (BASE, 9), switch="step")
+    assert not cached_lives(sparse_later).separable
 
 
 @cache
