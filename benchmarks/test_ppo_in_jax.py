@@ -73,7 +73,10 @@ def test_training_steps_of_all_rewards(compare: Any) -> None:
 
 @pytest.mark.parametrize("name", ["Switch5", "Drift"])
 def test_training_steps_in_a_stream(compare: Any, name: str) -> None:
-    """Whose switches lie 20,000 steps apart, or 1,000: within almost every rollout, then."""
+    """Whose switches are 20,000 steps apart; or 1,000, so that each rollout has parts.
+
+    Each part is judged, and draws its random numbers, as a whole rollout does.
+    """
     stream = StreamSpec(phases=load_stream(f"SME/{name}-v1").phases, cycles=1000)
     steps = 10 * ROLLOUT
     compare(
