@@ -75,7 +75,7 @@ def test_training_steps_of_all_rewards(compare: Any) -> None:
 def test_training_steps_in_a_stream(compare: Any, name: str) -> None:
     """Whose switches are 20,000 steps apart; or 1,000, so that each rollout has parts.
 
-    Each part is judged, and draws its random numbers, as a whole rollout does.
+    Each part draws the random numbers of the whole rollout.
     """
     stream = StreamSpec(phases=load_stream(f"SME/{name}-v1").phases, cycles=1000)
     steps = 10 * ROLLOUT

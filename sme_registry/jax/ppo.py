@@ -42,6 +42,7 @@ from sme_registry.jax.ranges import Count, Flag, Positive, Share, Weight, Widths
 from sme_registry.jax.task import TaskParams
 
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
+_JUDGED_AT_ONCE = 256  # steps of a rollout
 _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
 _NO_KEY: Any = None  # `step_env` draws nothing
 
@@ -221,13 +222,41 @@ def collect(
     episode, (taken, judged) = jax.lax.fori_loop(begin, end, body, (episode, rows))
     observation, action, truncated, last_observation = taken
     if separable:
-        similarity, step_reward = oracle.judge(params, *judged)
+        similarity, step_reward = _judged(params, judged, begin, end)
         judged = similarity, step_reward, step_reward, jnp.zeros_like(truncated)
     similarity, step_reward, reward, terminated = judged
     log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated)
     reward = reward.astype(jnp.float32)
     steps = Steps(observation, action, reward, terminated, truncated, last_observation)
     return episode, steps, log
+
+
+def _judged(
+    params: TaskParams,
+    rows: tuple[jax.Array, jax.Array],
+    begin: int | jax.Array,
+    end: int | jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """r̃ and r `[n]` of states and actions `[n, …]` from `begin` to before `end`.
+
+    In blocks, so that a short part of a rollout costs little; outside them values are arbitrary.
+    """
+    n = len(rows[0])
+    size = min(n, _JUDGED_AT_ONCE)
+
+    def body(i: jax.Array, judged: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        first = jnp.minimum(i * size, n - size)
+        s, a = (jax.lax.dynamic_slice_in_dim(x, first, size) for x in rows)
+        block = oracle.judge(params, s, a)
+        both = zip(judged, block, strict=True)
+        similarity, reward = (jax.lax.dynamic_update_slice_in_dim(x, y, first, 0) for x, y in both)
+        return similarity, reward
+
+    zeros = jnp.zeros(n, params.r_min.dtype)
+    judged: tuple[jax.Array, jax.Array] = jax.lax.fori_loop(
+        begin // size, -(-end // size), body, (zeros, zeros)
+    )
+    return judged
 
 
 def _at(states: EnvState, i: int | jax.Array) -> EnvState:
