@@ -201,7 +201,7 @@ def save(
     """
     from sme_registry.spec import EnvFile, StreamFile, as_spec, as_stream
     from sme_registry.spec.resolve import names_stream
-    from sme_registry.task import materialize, materialize_stream
+    from sme_registry.task import materialize, materialize_together
     from sme_registry.task.fingerprint import fingerprint_of
 
     fields: dict[str, Any] = {
@@ -211,8 +211,8 @@ def save(
     }
     if names_stream(spec):
         stream = as_stream(cast("StreamSpec", spec))
-        tasks = dict(zip((p.spec for p in stream.pieces), materialize_stream(stream), strict=True))
-        prints = [fingerprint_of(tasks[phase.spec]).to_dict() for phase in stream.phases]
+        tasks = materialize_together(stream, [phase.spec for phase in stream.phases])
+        prints = [fingerprint_of(task).to_dict() for task in tasks]
         document = {"stream": stream.to_dict(), "digest": stream.digest, "fingerprints": prints}
         StreamFile.from_dict(fields | document, str(path)).write(path)
         return Path(path)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sme_registry.errors import DigestMismatchError, SpecError
 from sme_registry.io import read_json, to_json, write_atomically
@@ -132,6 +132,15 @@ class StreamFile(Envelope):
 
     stream: StreamSpec
     fingerprints: Annotated[tuple[Fingerprint, ...], Field(strict=False, max_length=1000)]
+
+    @model_validator(mode="after")
+    def _every_phase_has_one(self) -> Self:
+        if len(self.fingerprints) != len(self.stream.phases):
+            raise ValueError(
+                f"fingerprints: has {len(self.fingerprints)} of them: must be one for each of the "
+                f"{len(self.stream.phases)} phases. Take the file again from its source."
+            )
+        return self
 
 
 class SuiteFile(Envelope):

@@ -278,6 +278,5 @@ def _pieces_of(phase: Phase) -> list[tuple[SMESpec, int]]:
     n, begin = phase.drift.increments, phase.spec.rotation
     move = phase.drift.rotation - begin
     return [
-        (phase.spec.derive(rotation=(begin + move * i / n) % FULL_TURN), phase.steps * i // n)
-        for i in range(n)
+        (phase.spec.derive(rotation=begin + move * i / n), phase.steps * i // n) for i in range(n)
     ]

@@ -7,6 +7,7 @@ from sme_registry.task.loading import (
     load_task,
     materialize,
     materialize_stream,
+    materialize_together,
 )
 from sme_registry.task.step import Step, observe, step
 from sme_registry.task.task import Task
@@ -20,6 +21,7 @@ __all__ = [
     "load_task",
     "materialize",
     "materialize_stream",
+    "materialize_together",
     "observe",
     "step",
 ]

@@ -8,6 +8,7 @@ alone has no published numbers, so `materialize(spec)` checks only a fingerprint
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 from sme_registry.errors import FingerprintMismatchError
@@ -94,20 +95,31 @@ def materialize_stream(
       ResourceLimitError: all phases together would not fit in memory.
       FingerprintMismatchError: a phase's numbers differ from the published ones; it is named.
     """
-    specs = dict.fromkeys(piece.spec for piece in stream.pieces)
-    held = sum(map(memory.parameter_bytes, specs))
-    memory.refuse_above_limit(
-        held + max(map(memory.peak_bytes, specs)),
-        f"A stream of {len(stream.phases)} phases with {len(specs)} different tasks",
-        "Use fewer phases or increments, or smaller tasks.",
-    )
-    tasks = {spec: materialize(spec) for spec in specs}
+    tasks = materialize_together(stream, [piece.spec for piece in stream.pieces])
+    drawn = {task.spec: task for task in tasks}
     for index, (phase, published) in enumerate(zip(stream.phases, fingerprints, strict=False)):
         try:
-            check_fingerprint(published, tasks[phase.spec])
+            check_fingerprint(published, drawn[phase.spec])
         except FingerprintMismatchError as error:
             raise FingerprintMismatchError(f"phases.{index}: {error}") from None
-    return tuple(tasks[piece.spec] for piece in stream.pieces)
+    return tasks
+
+
+def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[Task, ...]:
+    """Draw the tasks of some specs of a stream; equal specs share one.
+
+    Raises:
+      ResourceLimitError: together they would not fit in memory.
+    """
+    different = dict.fromkeys(specs)
+    held = sum(map(memory.parameter_bytes, different))
+    memory.refuse_above_limit(
+        held + max(map(memory.peak_bytes, different)),
+        f"A stream of {len(stream.phases)} phases with {len(different)} different tasks",
+        "Use fewer phases or increments, or smaller tasks.",
+    )
+    drawn = {spec: materialize(spec) for spec in different}
+    return tuple(drawn[spec] for spec in specs)
 
 
 def load_stream(stream: StreamLike) -> StreamSpec:

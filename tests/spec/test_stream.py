@@ -187,6 +187,7 @@ def test_a_changed_file_is_refused_with_the_phase_that_differs(tmp_path):
             FingerprintMismatchError,
             "phases.1: fingerprint.optimal_action",
         ),
+        (("fingerprints", file["fingerprints"][:1]), SpecError, "one for each of the 2 phases"),
     ]:
         changed = copy.deepcopy(file)
         *place, name, value = change

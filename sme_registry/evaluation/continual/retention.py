@@ -23,8 +23,8 @@ from sme_registry.errors import PolicyError
 from sme_registry.evaluation.evaluate import Progress, same_draw
 from sme_registry.evaluation.policies import Policy
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, observations
-from sme_registry.spec import EvaluationProtocol, Phase, SMESpec, StreamSpec
-from sme_registry.task import materialize_stream
+from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
+from sme_registry.task import materialize_together
 from sme_registry.task.draw import Array
 
 
@@ -70,8 +70,7 @@ def measure(
       ResourceLimitError: the tasks would not fit in memory together.
     """
     specs = final_specs(stream)
-    settled = [Phase(spec=spec, steps=1) for spec in specs]
-    tasks = materialize_stream(StreamSpec(phases=tuple(settled)))
+    tasks = materialize_together(stream, specs)
     keys = [same_draw(spec) for spec in specs]
     oracles = {key: engine(task) for key, task in zip(keys, tasks, strict=True)}
     N, P, K = len(subjects), len(specs), len(protocol.edges)
