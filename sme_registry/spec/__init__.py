@@ -30,7 +30,7 @@ from sme_registry.spec.sme_spec import (
 )
 from sme_registry.spec.stream import Drift, Phase, Piece, StreamLike, StreamSpec, as_stream
 from sme_registry.spec.study import Cell, PlannedCell, StudyAlgorithm, StudyPlan
-from sme_registry.spec.suite import Suite, SuiteClass
+from sme_registry.spec.suite import StreamClass, Suite, SuiteClass
 
 __all__ = [
     "ACTION_RANGES",
@@ -54,6 +54,7 @@ __all__ = [
     "SMESpec",
     "SchemaVersion",
     "SpecLike",
+    "StreamClass",
     "StreamFile",
     "StreamLike",
     "StreamSpec",

@@ -23,10 +23,11 @@ from sme_registry.spec.document import (
     SchemaVersion,
     StrictModel,
 )
-from sme_registry.spec.sme_spec import FULL_TURN, SMESpec
+from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
 from sme_registry.spec.validation_errors import short_repr
 
 MAX_PIECES = 10_000  # of one cycle
+BETWEEN_DRAWS = 10**6  # of the seeds of a stream, so that its draws have no task in common
 _SHARED = ("state_dim", "action_dim", "horizon")
 
 
@@ -241,6 +242,22 @@ class StreamSpec(NamedDocument):
         """The lifetime at which the piece in force is over; None in the last piece of the life."""
         return self.schedule.next_switch(lifetime)
 
+    def draw(self, number: int) -> StreamSpec:
+        """The same stream with other tasks: number · 10⁶ is added to the seed of every phase.
+
+        Phases with equal seeds have equal seeds in each draw, so what relates them is kept.
+
+        Args:
+          number: of the draw, at least 0; 0 is the stream itself.
+        """
+        if number == 0:
+            return self
+        phases = [
+            Phase(spec=spec.derive(seed=_moved(spec.seed, number)), steps=steps, drift=drift)
+            for spec, steps, drift in ((one.spec, one.steps, one.drift) for one in self.phases)
+        ]
+        return StreamSpec.from_dict({**self.to_dict(), "phases": [one.to_dict() for one in phases]})
+
 
 StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]
 """A stream: itself, its fields, an id, a digest, or the path of its file."""
@@ -257,6 +274,11 @@ def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
     if isinstance(value, dict):
         return StreamSpec.from_dict(value)
     raise SpecError(f"{short_repr(value)}: must be a StreamSpec or a mapping of its fields.")
+
+
+def _moved(seed: int | str, number: int) -> int | str:
+    moved = (int(str(seed), 0) + number * BETWEEN_DRAWS) % 2**256
+    return moved if moved < MAX_SEED else hex(moved)
 
 
 @lru_cache(maxsize=32)

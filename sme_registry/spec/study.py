@@ -3,11 +3,15 @@
 A plan holds everything that its results depend on, so a colleague can run a study from one file.
 Its cells are its runs: cell i of an algorithm and a class trains with seed i on instance i of the
 class (modulo the number of instances); in the paper, too, a seed determines both.
+
+On a stream an algorithm lives once, and for each phase a fresh agent trains on that phase alone,
+with which its plasticity is compared.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, JsonValue, model_validator
 
@@ -21,12 +25,14 @@ from sme_registry.spec.document import (
 )
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
-from sme_registry.spec.suite import SuiteClass
+from sme_registry.spec.stream import Phase, StreamSpec
+from sme_registry.spec.suite import Classes, StreamClasses, refuse_no_class
 
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 
 OFFLINE = "offline:"  # the beginning of a `uses` that learns from data
+REFERENCE = "reference:"  # of one that learns nothing
 INDEPENDENT = "independent:"  # of one with a model for each agent of a team
 JAX = "jax:"  # of one that runs with its environment in a program of JAX
 
@@ -56,6 +62,15 @@ def _check_task(uses: str, setting: Setting, field: str) -> None:
         )
 
 
+def _check_stream(uses: str, field: str) -> None:
+    """Raise ValueError, which Pydantic reports, if an algorithm cannot live in a stream."""
+    if uses.startswith((OFFLINE, INDEPENDENT, REFERENCE)):
+        raise ValueError(
+            f"{field}={uses!r}: cannot live in a stream. Use an algorithm that learns online, such "
+            "as PPO. Every stream's report has reference agents."
+        )
+
+
 class StudyAlgorithm(StrictModel):
     """An algorithm of a study.
 
@@ -82,10 +97,20 @@ class Cell(Document):
 
     Neither the plan nor its names are part of a cell, so a plan may be renamed, cut or extended,
     and its results stay valid.
+
+    Attributes:
+      spec: the task; of a life in a stream that of its first phase.
+      stream: the stream; None for a single task.
+      uses: the algorithm; this and the other fields are those of the plan.
+      seed: of training.
+      steps: environment steps; of a life those of the stream.
     """
+
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("stream",)
 
     schema_version: SchemaVersion = 1
     spec: SMESpec
+    stream: StreamSpec | None = None
     uses: str
     hyperparameters: dict[str, JsonValue]
     action_range: ActionRange
@@ -98,15 +123,36 @@ class Cell(Document):
     @model_validator(mode="after")
     def _task_suits_the_algorithm(self) -> Self:
         _check_task(self.uses, self.spec, "uses")
+        if self.stream is None:
+            return self
+        _check_stream(self.uses, "uses")
+        if self.spec != self.stream.phases[0].spec or self.steps != self.stream.steps:
+            raise ValueError(
+                "stream: its first phase and its steps must be the cell's spec and steps."
+            )
         return self
+
+    @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the agent lives in: the stream, or the task."""
+        return self.stream or self.spec
 
 
 class PlannedCell(StrictModel):
-    """A cell and its place in the plan."""
+    """A cell and its place in the plan.
+
+    Attributes:
+      class_name: of the class of tasks or streams.
+      algorithm: its name in the plan.
+      run: its number, from 0.
+      phase: of a fresh agent, the index of the stream's phase on which alone it trains.
+      cell: the cell. Different places may have the same one, such as fresh agents of two streams.
+    """
 
     class_name: Name
     algorithm: str
     run: Integer
+    phase: Integer | None = None
     cell: Cell
 
 
@@ -115,16 +161,21 @@ class StudyPlan(Document):
 
     Attributes:
       classes: kinds of tasks; the others are compared with the first.
+      streams: kinds of streams.
       algorithms: those run on each class.
       seeds: runs of each algorithm on each class.
-      steps: environment steps of a run.
+      steps: environment steps of a run; a life has the steps of its stream, and a fresh agent those
+        of its phase.
       evaluations: evenly spaced over training, the last at its end; 0 for none.
       evaluation_episodes: in each of them.
       protocol: of the evaluation within and out of distribution at the end.
     """
 
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)
+
     schema_version: SchemaVersion = 1
-    classes: Annotated[tuple[SuiteClass, ...], Field(min_length=1, max_length=1000, strict=False)]
+    classes: Classes = ()
+    streams: StreamClasses = ()
     algorithms: Annotated[
         tuple[StudyAlgorithm, ...], Field(min_length=1, max_length=100, strict=False)
     ]
@@ -136,35 +187,65 @@ class StudyPlan(Document):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> Self:
-        refuse_repeated_names("classes", self.classes)
+        refuse_no_class(self.classes, self.streams)
         refuse_repeated_names("algorithms", self.algorithms)
         for i, algorithm in enumerate(self.algorithms):
             for member in self.classes:
                 _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
+            if self.streams:
+                _check_stream(algorithm.uses, f"algorithms.{i}.uses")
         return self
 
     @property
     def cells(self) -> tuple[PlannedCell, ...]:
         """Every run: seeds outermost, so that a study that is cut short has whole comparisons."""
-        instances = {member.name: member.instances for member in self.classes}
+        members: list[tuple[str, tuple[SMESpec | StreamSpec, ...]]] = [
+            *((member.name, member.instances) for member in self.classes),
+            *((member.name, member.instances) for member in self.streams),
+        ]
         return tuple(
-            PlannedCell(
-                class_name=member.name,
-                algorithm=algorithm.name,
-                run=run,
-                cell=Cell(
-                    spec=instances[member.name][run % len(instances[member.name])],
-                    uses=algorithm.uses,
-                    hyperparameters=algorithm.hyperparameters,
-                    action_range=algorithm.action_range,
-                    seed=run,
-                    steps=self.steps if algorithm.steps is None else algorithm.steps,
-                    evaluations=self.evaluations,
-                    evaluation_episodes=self.evaluation_episodes,
-                    protocol=self.protocol,
-                ),
-            )
+            planned
             for run in range(self.seeds)
-            for member in self.classes
+            for name, instances in members
             for algorithm in self.algorithms
+            for planned in self._runs(name, instances[run % len(instances)], algorithm, run)
         )
+
+    def _runs(
+        self, class_name: str, document: SMESpec | StreamSpec, algorithm: StudyAlgorithm, run: int
+    ) -> Iterator[PlannedCell]:
+        """A run on a task; a life in a stream, and a fresh agent for each of its phases."""
+
+        def planned(
+            document: SMESpec | StreamSpec, steps: int, evaluations: int, phase: int | None = None
+        ) -> PlannedCell:
+            stream = document if isinstance(document, StreamSpec) else None
+            cell = Cell(
+                spec=document.phases[0].spec if isinstance(document, StreamSpec) else document,
+                stream=stream,
+                uses=algorithm.uses,
+                hyperparameters=algorithm.hyperparameters,
+                action_range=algorithm.action_range,
+                seed=run,
+                steps=steps,
+                evaluations=evaluations,
+                evaluation_episodes=self.evaluation_episodes,
+                protocol=self.protocol,
+            )
+            return PlannedCell(
+                class_name=class_name, algorithm=algorithm.name, run=run, phase=phase, cell=cell
+            )
+
+        if isinstance(document, SMESpec):
+            steps = self.steps if algorithm.steps is None else algorithm.steps
+            yield planned(document, steps, self.evaluations)
+            return
+        yield planned(document, document.steps, self.evaluations)
+        visits = document.cycles * len(document.phases)
+        for index, phase in enumerate(document.phases):
+            yield planned(_alone(phase), phase.steps, self.evaluations // visits, index)
+
+
+def _alone(phase: Phase) -> SMESpec | StreamSpec:
+    """A phase by itself: its task, or the stream that drifts as it does."""
+    return phase.spec if phase.drift is None else StreamSpec(phases=(phase,))

@@ -1,21 +1,26 @@
 """`Suite`: a list of classes; a class is one setting with its instances (seeds).
 
-So a method is evaluated on a kind of task, not on one draw of it.
+So a method is evaluated on a kind of task, not on one draw of it. A class of streams is one stream
+with its draws.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+import os
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from sme_registry.errors import SpecError, UnknownNameError
 from sme_registry.spec.document import (
     Document,
+    Integer,
     Name,
     SchemaVersion,
     refuse_repeated_names,
 )
 from sme_registry.spec.sme_spec import Seed, Setting, SMESpec
+from sme_registry.spec.stream import StreamSpec
 from sme_registry.spec.validation_errors import short_repr
 
 
@@ -41,18 +46,78 @@ class SuiteClass(Document):
         return tuple(SMESpec.from_dict({**fields, "seed": seed}) for seed in self.seeds)
 
 
-class Suite(Document):
-    """Classes of tasks under different names."""
+class StreamClass(Document):
+    """One kind of stream, and its instances.
 
-    schema_version: SchemaVersion = 1
-    classes: Annotated[tuple[SuiteClass, ...], Field(min_length=1, max_length=1000, strict=False)]
+    Attributes:
+      name: of the class.
+      stream: the stream. A name, id, digest or path of one is read as what it stands for.
+      draws: the numbers of its instances; see `StreamSpec.draw`.
+    """
+
+    name: Name
+    stream: StreamSpec
+    draws: Annotated[
+        tuple[Annotated[Integer, Field(ge=0, lt=2**32)], ...],
+        Field(min_length=1, max_length=10_000, strict=False),
+    ] = (0,)
+
+    @field_validator("stream", mode="before")
+    @classmethod
+    def _name_to_stream(cls, value: Any) -> Any:
+        if not isinstance(value, str | os.PathLike):
+            return value
+        from sme_registry.spec.resolve import resolve_stream
+
+        try:
+            return resolve_stream(value).stream.named("")
+        except (UnknownNameError, SpecError) as error:
+            raise ValueError(str(error)) from None
 
     @model_validator(mode="after")
-    def _names_differ(self) -> Self:
-        refuse_repeated_names("classes", self.classes)
+    def _draws_differ(self) -> Self:
+        if len(set(self.draws)) != len(self.draws):
+            raise ValueError(
+                f"draws={short_repr(list(self.draws))}: must be distinct. Remove repeats."
+            )
+        return self
+
+    @property
+    def instances(self) -> tuple[StreamSpec, ...]:
+        """The streams of this class, in the order of its draws."""
+        return tuple(self.stream.draw(number) for number in self.draws)
+
+
+Classes = Annotated[tuple[SuiteClass, ...], Field(max_length=1000, strict=False)]
+StreamClasses = Annotated[tuple[StreamClass, ...], Field(max_length=1000, strict=False)]
+
+
+class Suite(Document):
+    """Classes of tasks, of streams, or of both, under different names."""
+
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)
+
+    schema_version: SchemaVersion = 1
+    classes: Classes = ()
+    streams: StreamClasses = ()
+
+    @model_validator(mode="after")
+    def _can_be_told_apart(self) -> Self:
+        refuse_no_class(self.classes, self.streams)
         return self
 
     @property
     def instances(self) -> tuple[SMESpec, ...]:
-        """Every spec of the suite, class by class."""
+        """Every spec of the suite, class by class; its streams are not among them."""
         return tuple(spec for member in self.classes for spec in member.instances)
+
+
+def refuse_no_class(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
+    """Raise ValueError, which Pydantic reports, without a class, or where names are equal."""
+    if not classes and not streams:
+        raise ValueError(
+            "classes: must have at least 1 entry, unless there are streams. Add a class, or a "
+            "stream."
+        )
+    refuse_repeated_names("classes", classes)
+    refuse_repeated_names("streams", (*classes, *streams))

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, JsonValue
 
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
-from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.spec.document import Integer, Real, StrictModel
 from sme_registry.spec.study import INDEPENDENT, in_jax
 
@@ -43,8 +43,10 @@ class RunRecord(StrictModel):
     schema_version: Literal[1] = 1
     status: Literal["running", "finished", "failed"]  # "running" also after a kill
     failure: str = ""  # why it failed
-    spec: SMESpec
+    spec: SMESpec  # the task; of a life in a stream that of its first phase
     spec_digest: str
+    stream: StreamSpec | None = None
+    stream_digest: str = ""
     task: str = ""  # what the task's file calls it
     algorithm: str
     # Those that differ from the algorithm's defaults. `sme train` sets some for several
@@ -86,6 +88,11 @@ class RunRecord(StrictModel):
         write_atomically(folder / RECORD, to_json(self.to_dict()))
 
     @property
+    def document(self) -> SMESpec | StreamSpec:
+        """What the agent lives in: the stream, or the task."""
+        return self.stream or self.spec
+
+    @property
     def model_name(self) -> str:
         """Name of the trained model in the run's folder: a file, or the folder of its models."""
         return MODELS if self.independent else MODEL
@@ -106,7 +113,15 @@ class RunRecord(StrictModel):
                 f"steps={self.steps:,}: must be at least {previous.steps_done:,}, the steps that "
                 f"the run in {folder} has done. Choose more, or keep {previous.steps:,}."
             )
-        fields = ("spec_digest", "algorithm", "seed", "action_range", "num_envs", "independent")
+        fields = (
+            "spec_digest",
+            "stream_digest",
+            "algorithm",
+            "seed",
+            "action_range",
+            "num_envs",
+            "independent",
+        )
         pairs = {field: (getattr(previous, field), getattr(self, field)) for field in fields}
         for name, value in self.hyperparameters.items():
             before = previous.hyperparameters.get(name, "the algorithm's default")

@@ -476,7 +476,7 @@ class TestEdited:
             ("[]", "must be an object"),
             ('{"plan": []}', "must be an object"),
             ('{"classes": [}', "edited.json"),
-            ('{"seeds": 3}', "classes: missing"),
+            ('{"seeds": 3}', "algorithms: missing"),
         ],
     )
     def test_what_is_no_plan_is_refused(self, text: str, words: str) -> None:

@@ -15,10 +15,8 @@ from typing import Any
 
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.evaluation.references import POLICIES
-from sme_registry.spec.study import INDEPENDENT
+from sme_registry.spec.study import INDEPENDENT, REFERENCE
 from sme_registry.training import algorithms
-
-REFERENCE = "reference:"
 
 
 def reference_name(uses: str) -> str | None:

@@ -21,8 +21,8 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
-from sme_registry.spec.study import in_jax
-from sme_registry.studies.engine.algorithms import REFERENCE, independent_name
+from sme_registry.spec.study import REFERENCE, in_jax
+from sme_registry.studies.engine.algorithms import independent_name
 from sme_registry.studies.engine.result import CellResult
 
 # Seconds of one training step with default hyperparameters: on a fast core, and the slowest

@@ -12,8 +12,7 @@ from fnmatch import fnmatchcase
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
-from sme_registry.spec.study import JAX, OFFLINE
-from sme_registry.studies.engine.algorithms import REFERENCE
+from sme_registry.spec.study import JAX, OFFLINE, REFERENCE
 from sme_registry.training.algorithms import AGENTS
 
 _LONGEST_NAME = 64

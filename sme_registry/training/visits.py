@@ -1,0 +1,42 @@
+"""`VisitEnds`: when a learner's policy is the one at the end of a visit of a stream's phase.
+
+That policy has learned from all that the learner collected in the visit: with TD3 and SAC up to the
+update that follows its last step, with PPO up to that of the last rollout that was over by then. So
+it is the policy at the first step of the next visit, before any update that follows that step, or
+at the end of training. `jax.run.run` has the same rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sme_registry.evaluation.continual.dynamic_regret import visit_ends
+from sme_registry.spec import StreamSpec
+
+
+class VisitEnds:
+    """Calls a function at the end of each visit, while steps are counted.
+
+    Args:
+      stream: the stream, in which there is one life.
+      on_visit: called with the index of the visit in the life.
+      steps: already taken, of a run that is resumed; the visits that ended before are over. One
+        that ends at them is called for.
+    """
+
+    def __init__(
+        self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0
+    ) -> None:
+        visits = stream.cycles * len(stream.phases)
+        ends = enumerate(visit_ends(stream, visits).tolist())
+        self._upcoming = [(visit, end) for visit, end in ends if end >= steps]
+        self._on_visit = on_visit
+
+    def after_step(self, steps: int) -> None:
+        """Count a step; `steps` are all that were taken, and the learner has not learned since."""
+        while self._upcoming and self._upcoming[0][1] < steps:
+            self._on_visit(self._upcoming.pop(0)[0])
+
+    def finish(self, steps: int) -> None:
+        """End the visits that are over when training ends, after its last update."""
+        self.after_step(steps + 1)
