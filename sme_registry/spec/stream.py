@@ -206,9 +206,14 @@ class StreamSpec(NamedDocument):
         return self.phases[0].spec.horizon
 
     @property
+    def observed_phases(self) -> int:
+        """P, of whose one-hot an observation ends with; 0 where the agent does not observe it."""
+        return len(self.phases) if self.observes_phase else 0
+
+    @property
     def observation_dim(self) -> int:
         """S + 2, and one for each phase where the agent observes it."""
-        return self.state_dim + 2 + (len(self.phases) if self.observes_phase else 0)
+        return self.state_dim + 2 + self.observed_phases
 
     @property
     def cycle_steps(self) -> int:

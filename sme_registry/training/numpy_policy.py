@@ -22,35 +22,41 @@ from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.policies.perceptron import Layer, Perceptron
 from sme_registry.evaluation.policies.sb3 import torch_policy
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.task import streams
 
 _PROBES = 16
 _TOLERANCE = 1e-5  # of an action; another order of the same sums moves it by 1e-6
 
 
-def numpy_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> Policy:
+def numpy_policy(
+    model: Any, document: SMESpec | StreamSpec, *, action_range: str | None = None
+) -> Policy:
     """The deterministic policy of a model with its current weights.
 
     Args:
       model: a Stable-Baselines3 model, or anything else that `evaluate` accepts. Only the network
         of a model is copied, so later training does not change it; other policies are called
         directly.
-      spec: a single-agent task.
+      document: a single-agent task, or a stream.
       action_range: of the policy's actions; None takes the model's own action space.
 
     Returns:
-      A callable from observations `[B, S + 2]` to actions `[B, A]` in units of the unit range,
-      which the environment clips.
+      A callable from observations `[B, S + 2]` (of a stream that shows the phase, with its
+      one-hot) to actions `[B, A]` in units of the unit range, which the environment clips.
 
     Raises:
       SpecError: the task is a team's.
       PolicyError, OptionError: see `as_policy`.
     """
-    policy = as_policy(model, spec, action_range=action_range)
+    if isinstance(document, StreamSpec):
+        spec, observed = document.phases[0].spec, document.observed_phases
+    else:
+        spec, observed = document, 0
+    policy = as_policy(model, spec, action_range=action_range, observed_phases=observed)
     if not isinstance(policy, Policy):
         raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
-    return _fast(policy, model, spec.state_dim + 2)
+    return _fast(policy, model, spec.state_dim + 2 + observed)
 
 
 def numpy_team_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> TeamPolicy:

@@ -16,14 +16,14 @@ import numpy.typing as npt
 import torch
 
 from sme_registry.sb3 import SMEVecEnv
-from sme_registry.spec import ActionRange, SMESpec
+from sme_registry.spec import ActionRange, SMESpec, StreamSpec
 from sme_registry.spec.study import JAX
 from sme_registry.training.learners import new_learner
 
 
 def new_sb3_model(
     uses: str,
-    spec: SMESpec,
+    document: SMESpec | StreamSpec,
     *,
     seed: int,
     action_range: ActionRange,
@@ -37,7 +37,7 @@ def new_sb3_model(
 
     Args:
       uses: `jax:PPO`, `jax:TD3` or `jax:SAC`.
-      spec: the task.
+      document: the task or the stream in whose observations the model acts.
       seed: of the run.
       action_range: of the policy's actions.
       hyperparameters: of the run.
@@ -51,7 +51,7 @@ def new_sb3_model(
         settings["buffer_size"] = min(settings["buffer_size"], max(1, steps))
     return new_learner(
         uses.removeprefix(JAX),
-        SMEVecEnv(spec, 1, action_range=action_range),
+        SMEVecEnv(document, 1, action_range=action_range),
         seed=seed,
         steps=steps,
         hyperparameters=settings,

@@ -18,7 +18,7 @@ from rich.console import Console
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("jax")
 
-from sme_registry import SMESpec, evaluate
+from sme_registry import SMESpec, StreamSpec, evaluate
 from sme_registry.diagnosis.subject import load_run
 from sme_registry.errors import (
     MissingDependencyError,
@@ -137,6 +137,16 @@ def test_the_model_predicts_the_same_actions(name: str, action_range: Any, tmp_p
         np.testing.assert_allclose(predicted, expected, rtol=0, atol=1e-6)
     own = model.policy.state_dict()
     assert all(np.array_equal(own[name].numpy(), w) for name, w in weights.items() if name in own)
+
+
+def test_the_model_of_a_stream_has_the_inputs_of_its_phases() -> None:
+    phases = [{"spec": TINY, "steps": 20}, {"spec": TINY.derive(seed=1), "steps": 20}]
+    stream = StreamSpec(phases=phases, observes_phase=True)
+    run: Any = {"hyperparameters": NARROW, "steps": 40}
+    program = new_program("jax:SAC", [stream], [0], **run)
+    model = new_sb3_model("jax:SAC", stream, seed=0, action_range="symmetric", **run)
+    set_weights(model, program.weights(0), 0)
+    assert model.observation_space.shape == (4 + 2,)
 
 
 def interrupted(folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> None:

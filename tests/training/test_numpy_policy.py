@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from sme_registry import SMESpec
+from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import SpecError
 from sme_registry.evaluation import Perceptron
 from sme_registry.training.numpy_policy import numpy_policy
@@ -21,12 +21,16 @@ Range = Literal["unit", "symmetric"]
 
 
 def new_model(
-    algorithm: Any, action_range: Range = "symmetric", noise: float = 0.2, **kwargs: Any
+    algorithm: Any,
+    action_range: Range = "symmetric",
+    noise: float = 0.2,
+    document: Any = SPEC,
+    **kwargs: Any,
 ) -> Any:
     """An untrained model, its weights moved so far that some of its actions are clipped."""
     from sme_registry.sb3 import SMEVecEnv
 
-    env = SMEVecEnv(SPEC, action_range=action_range)
+    env = SMEVecEnv(document, action_range=action_range)
     if algorithm.__name__ in ("TD3", "DDPG", "SAC", "TQC"):
         kwargs["buffer_size"] = 1
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", **kwargs)
@@ -60,6 +64,18 @@ def test_the_copied_network_acts_as_predict_does(algorithm: str, action_range: R
     assert expected.std() > 0.1
     if algorithm in ("PPO", "A2C", "TRPO"):  # an unbounded mean, which SB3 clips
         assert np.mean((expected == 0.0) | (expected == 1.0)) > 0.05
+
+
+@pytest.mark.parametrize("observes_phase", [False, True])
+def test_a_policy_of_a_stream_observes_what_the_stream_shows(observes_phase: bool) -> None:
+    phases = [{"spec": SPEC, "steps": 20}, {"spec": SPEC.derive(seed=1), "steps": 20}]
+    stream = StreamSpec(phases=phases, observes_phase=observes_phase)
+    model = new_model(sb3.PPO, document=stream)
+    copied = numpy_policy(model, stream)
+    assert isinstance(copied.act, Perceptron)
+    observations = np.random.default_rng(1).random((20, 5 + 2 * observes_phase), dtype=np.float32)
+    expected = (model.predict(observations, deterministic=True)[0] + 1.0) / 2.0
+    np.testing.assert_allclose(np.clip(copied(observations), 0, 1), expected, rtol=0, atol=5e-6)
 
 
 def test_later_training_does_not_change_the_copy() -> None:

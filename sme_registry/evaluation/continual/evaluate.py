@@ -72,7 +72,6 @@ def evaluate_stream(
     )
     if fresh is not None:
         _refuse_other_count("fresh", fresh, P, "for each phase")
-    observed = P if stream.observes_phase else 0
     spec = stream.phases[0].spec
 
     def subject(policy: Any, phases: Sequence[int], where: str) -> Subject:
@@ -82,7 +81,7 @@ def evaluate_stream(
                 spec,
                 action_range=action_range,
                 algorithm=algorithm,
-                observed_phases=observed,
+                observed_phases=stream.observed_phases,
             )
         except (PolicyError, UnknownNameError) as error:
             raise type(error)(f"{where}: {error}") from error.__cause__
