@@ -355,6 +355,32 @@ def test_fresh_agents_are_one_for_each_phase():
         evaluate_stream([half] * 4, TWICE, PROTOCOL, fresh=[half])
 
 
+def test_fresh_agents_that_were_evaluated_by_themselves_give_the_same_plasticity():
+    drift = {"rotation": 2.0, "increments": 2}
+    drifting = {"spec": SPEC.derive(seed=1), "steps": 50, "drift": drift}
+    stream = StreamSpec(phases=[{"spec": SPEC, "steps": 50}, drifting], cycles=2)
+    life, alone = [network(v) for v in range(4)], [network(100), network(101)]
+    together = evaluate_stream(life, stream, PROTOCOL, fresh=alone)
+    of_drift = evaluate_stream(alone[1:], StreamSpec(phases=[drifting]), PROTOCOL)
+    fresh = [evaluate(alone[0], SPEC, PROTOCOL), of_drift]
+    without = evaluate_stream(life, stream, PROTOCOL)
+    later = without.with_fresh(fresh)
+    assert without.region().agent.plasticity_ratio == (None,) * 4
+    for region in ("WD", "OOD 2", "OOD"):
+        ours, theirs = later.region(region), together.region(region)
+        for metric in ("fresh_normalised_regret", "plasticity_ratio", "plasticity_difference"):
+            assert getattr(ours.agent, metric) == pytest.approx(getattr(theirs.agent, metric))
+        assert ours.agent.forgetting == theirs.agent.forgetting
+        assert ours.references == theirs.references
+    with pytest.raises(OptionError, match="fresh=1 reports: must be 2, one for each phase"):
+        without.with_fresh(fresh[:1])
+    with pytest.raises(OptionError, match=r"fresh\[0\]: is about .* the task of phase 0"):
+        without.with_fresh([of_drift, of_drift])
+    other = evaluate(alone[0], SPEC, PROTOCOL | {"states_per_region": 20})
+    with pytest.raises(OptionError, match=r"fresh\[0\]: .* and the protocol"):
+        without.with_fresh([other, of_drift])
+
+
 # Seeds
 
 

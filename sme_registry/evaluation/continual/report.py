@@ -6,16 +6,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.continual import metrics
 from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.regions import region_name
+from sme_registry.evaluation.report import EvaluationReport
 from sme_registry.evaluation.report_file import ReportFile, as_text
 from sme_registry.spec import (
     ActionRange,
@@ -82,6 +83,22 @@ class Retention(StrictModel):
     relearning: Real | None
     plasticity_ratio: _Optional
     plasticity_difference: _Optional
+
+    def with_fresh(self, fresh: Array) -> Self:
+        """The same with the plasticity against fresh agents.
+
+        Args:
+          fresh: `[P]` normalised regret on each phase of an agent trained on that phase alone.
+        """
+        M = np.array(self.normalised_regret)[..., None]
+        ratio, difference = metrics.plasticity(M, fresh[:, None])
+        return self.model_copy(
+            update={
+                "fresh_normalised_regret": tuple(fresh.tolist()),
+                "plasticity_ratio": _known(ratio[:, 0]),
+                "plasticity_difference": _known(difference[:, 0]),
+            }
+        )
 
     def final(self, metric: str) -> float | None:
         """A metric at the end of the life; the mean over visits of a plasticity."""
@@ -194,6 +211,25 @@ class StreamReport(ReportFile):
         """This report with the dynamic regret of the agent's training."""
         return self.model_copy(update={"dynamic_regret": regret})
 
+    def with_fresh(self, fresh: Sequence[EvaluationReport | StreamReport]) -> Self:
+        """This report with the plasticity, which fresh agents are needed for.
+
+        Args:
+          fresh: for each phase the report of an agent trained for as many steps on that phase
+            alone: on its task, or, where the phase drifts, on the stream of that phase.
+
+        Raises:
+          OptionError: not one report for each phase, of its task and of this protocol.
+        """
+        tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
+        alone = _fresh_regrets(fresh, tasks, self.protocol_digest)
+        of_each = [*self.regions, self.ood]
+        regions = [
+            region.model_copy(update={"agent": region.agent.with_fresh(alone[:, k])})
+            for k, region in enumerate(of_each)
+        ]
+        return self.model_copy(update={"regions": tuple(regions[:-1]), "ood": regions[-1]})
+
     def __repr__(self) -> str:
         final = self.regions[0].agent.average_performance[-1]
         return (
@@ -270,6 +306,35 @@ def _cells(row: Iterable[float]) -> list[str]:
     return [f"{value:.3f}" for value in row]
 
 
+def _fresh_regrets(
+    fresh: Sequence[EvaluationReport | StreamReport], tasks: Sequence[str], protocol_digest: str
+) -> Array:
+    """`[P, K + 1]` normalised regret of fresh agents, each on its phase's task, and the mean over
+    the shells.
+
+    Raises:
+      OptionError: see `StreamReport.with_fresh`.
+    """
+    if len(fresh) != len(tasks):
+        raise OptionError(f"fresh={len(fresh)} reports: must be {len(tasks)}, one for each phase.")
+    rows = []
+    for phase, (report, task) in enumerate(zip(fresh, tasks, strict=True)):
+        if isinstance(report, StreamReport):
+            own = [visit.spec_digest for visit in report.visits]
+            row = [region.agent.normalised_regret[0][0] for region in report.regions]
+        else:
+            own, row = [report.spec_digest], [each.normalised_regret for each in report.regions]
+        if own != [task] or report.protocol_digest != protocol_digest:
+            raise OptionError(
+                f"fresh[{phase}]: is about {report.title} and the protocol "
+                f"{report.protocol_digest[:19]}…: must be about the task of phase {phase}, "
+                f"{task[:19]}…, and the protocol {protocol_digest[:19]}…. Evaluate an agent that "
+                "was trained on that phase alone."
+            )
+        rows.append(row)
+    return _and_shells(np.array(rows))
+
+
 def stream_regions(
     protocol: EvaluationProtocol,
     agent: Array,
@@ -307,31 +372,31 @@ def stream_regions(
 
 def _retentions(M: Array, initial: Array | None, fresh: Array | None) -> list[Retention]:
     """The matrix and the metrics in each region, then of the mean over the shells."""
-    P = M.shape[1]
-    M = _and_shells(M)
-    none = np.full((P, M.shape[2]), np.nan)
-    before = none if initial is None else _and_shells(initial)
-    alone = none if fresh is None else _and_shells(fresh)
-    R = 1.0 - M
-    ratio, difference = metrics.plasticity(M, alone)
-    by_visit = {
+    V, P, K = M.shape
+    M, R = _and_shells(M), 1.0 - _and_shells(M)
+    before = np.full((P, K + 1), np.nan) if initial is None else _and_shells(initial)
+    computed = {
         "average_performance": metrics.average_performance(R),
         "backward_transfer": metrics.backward_transfer(R),
         "forgetting": metrics.forgetting(R),
-        "plasticity_ratio": ratio,
-        "plasticity_difference": difference,
         "forward_transfer": metrics.forward_transfer(R, 1.0 - before),
         "relearning": metrics.relearning(R),
     }
-    return [
+    unknown = (None,) * V
+    retentions = [
         Retention(
             normalised_regret=tuple(map(tuple, M[..., k].tolist())),
             initial_normalised_regret=None if initial is None else tuple(before[:, k].tolist()),
-            fresh_normalised_regret=None if fresh is None else tuple(alone[:, k].tolist()),
-            **{name: _known(values[..., k]) for name, values in by_visit.items()},
+            plasticity_ratio=unknown,
+            plasticity_difference=unknown,
+            **{name: _known(values[..., k]) for name, values in computed.items()},
         )
-        for k in range(M.shape[2])
+        for k in range(K + 1)
     ]
+    if fresh is None:
+        return retentions
+    alone = _and_shells(fresh)
+    return [each.with_fresh(alone[:, k]) for k, each in enumerate(retentions)]
 
 
 def _and_shells(values: Array) -> Array:

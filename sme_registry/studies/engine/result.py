@@ -6,17 +6,19 @@ STUDY/cells/<64 hex>.json     results, by the cell's digest; renamed into place 
 STUDY/failed/<64 hex>.json    cells that failed, with the error; a successful retry removes it
 STUDY/locks/<64 hex>          locked by the operating system while a cell runs
 STUDY/models/<64 hex>.zip     trained models, if they are kept
+STUDY/models/<64 hex>/        of a life in a stream: initial.zip, and visit-00.zip, … at the ends of
+                              its visits
 STUDY/states/<16 hex>.npz     states of programs of JAX that run, or were killed
 STUDY/report/                 what `sme study report` writes
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from sme_registry.evaluation import EvaluationReport
+from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel
 from sme_registry.spec.study import Cell
 
@@ -111,7 +113,10 @@ class CellResult(StrictModel):
       key: the cell's digest.
       cell: the complete cell.
       curve: its learning curve.
-      report: its evaluation in and out of distribution, with the references.
+      report: its evaluation in and out of distribution, with the references; None of a life in a
+        stream, whose JSON omits it.
+      stream_report: of a life in a stream what the agent retains, and its dynamic regret, still
+        without fresh agents, which are cells of their own. Any other JSON omits it.
       online_regret: mean regret over all training steps, in [0, 1]; null for references and
         offline learners.
       agents_online_regret: the same of each agent of a team, by name. A single agent's JSON omits
@@ -126,7 +131,8 @@ class CellResult(StrictModel):
     key: Digest
     cell: Cell
     curve: LearningCurve
-    report: EvaluationReport
+    report: EvaluationReport | None = None
+    stream_report: StreamReport | None = None
     online_regret: Real | None = None
     agents_online_regret: dict[str, Real] = Field(default_factory=dict)
     offline: OfflineResult | None = None
@@ -134,13 +140,32 @@ class CellResult(StrictModel):
     timing: Timing
     versions: dict[str, str]
 
+    @model_validator(mode="after")
+    def _has_the_report_of_its_kind(self) -> Self:
+        has = {"report": self.report, "stream_report": self.stream_report}
+        own = "report" if self.cell.stream is None else "stream_report"
+        if [name for name, report in has.items() if report is not None] != [own]:
+            raise ValueError(
+                f"{own}: must be the only report, since the cell is "
+                f"{'on one task' if own == 'report' else 'a life in a stream'}."
+            )
+        return self
+
+    @property
+    def any_report(self) -> EvaluationReport | StreamReport:
+        """The report that it has."""
+        report = self.report or self.stream_report
+        assert report is not None  # validated
+        return report
+
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return without_empty(handler(self), "agents_online_regret", "program")
+        young = ("agents_online_regret", "program", "report", "stream_report")
+        return without_empty(handler(self), *young)
 
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""
-        return self.report._repr_html_()
+        return self.any_report._repr_html_()
 
 
 class CellFailure(StrictModel):

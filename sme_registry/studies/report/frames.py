@@ -61,6 +61,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport
 from sme_registry.spec import PlannedCell, StudyFile, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
@@ -139,10 +140,14 @@ def plan_file(ledger: Ledger) -> StudyFile:
 def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFrames:
     """The frames of a plan's runs, from results by the digests of their cells."""
     planned = [(cell, results.get(cell.cell.digest)) for cell in ordered(plan)]
-    finished = [(cell, result) for cell, result in planned if result is not None]
-    rows = [row for cell, result in finished for row in _result_rows(cell, result)]
-    evaluations = [row for cell, result in finished for row in _curve_rows(cell, result)]
-    agents = list(dict.fromkeys(name for _, result in finished for name in result.report.agents))
+    finished = [
+        (cell, result, result.report)
+        for cell, result in planned
+        if result is not None and result.report is not None and cell.phase is None
+    ]
+    rows = [row for each in finished for row in _result_rows(*each)]
+    evaluations = [row for cell, result, _ in finished for row in _curve_rows(cell, result)]
+    agents = list(dict.fromkeys(name for *_, report in finished for name in report.agents))
     by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
     regrets = " ".join(f" regret/{name}" for name in agents)
     return StudyFrames(
@@ -159,7 +164,8 @@ def runs(results: pd.DataFrame) -> pd.DataFrame:
 
 def ordered(plan: StudyPlan) -> list[PlannedCell]:
     """The plan's cells by class, then algorithm, then run; the plan itself has runs outermost."""
-    classes = {member.name: i for i, member in enumerate(plan.classes)}
+    names = [*(each.name for each in plan.classes), *(each.name for each in plan.streams)]
+    classes = {name: i for i, name in enumerate(names)}
     algorithms = {algorithm.name: i for i, algorithm in enumerate(plan.algorithms)}
     return sorted(plan.cells, key=lambda c: (classes[c.class_name], algorithms[c.algorithm], c.run))
 
@@ -180,14 +186,16 @@ def window(evaluations: int) -> int:
     return min(_LONGEST_WINDOW, max(1, evaluations // 10))
 
 
-def _result_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
-    run = _place(cell) | _run_columns(result)
-    references = result.report.references
-    for index, region in enumerate(result.report.regions):
+def _result_rows(
+    cell: PlannedCell, result: CellResult, report: EvaluationReport
+) -> Iterator[dict[str, Any]]:
+    run = _place(cell) | _run_columns(result, report)
+    references = report.references
+    for index, region in enumerate(report.regions):
         regrets = {c: references[name][index].normalised_regret for c, name in _REFERENCES.items()}
         agents = {
             f"normalised_regret/{name}": agent.regions[index].normalised_regret
-            for name, agent in result.report.agents.items()
+            for name, agent in report.agents.items()
         }
         yield {
             **run,
@@ -215,9 +223,9 @@ def _place(cell: PlannedCell) -> dict[str, Any]:
     return {name: getattr(cell, name) for name in RUN}
 
 
-def _run_columns(result: CellResult) -> dict[str, Any]:
+def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]:
     """The columns of `_RUN`; those of offline runs only where there are any."""
-    cell, report, offline = result.cell, result.report, result.offline
+    cell, offline = result.cell, result.offline
     columns = {
         **{
             name: value
