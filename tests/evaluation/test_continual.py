@@ -286,6 +286,40 @@ def test_an_episode_in_two_visits_is_divided_in_proportion():
     assert [visit.dynamic_regret for visit in whole.visits] == [8.0]
 
 
+def test_learning_transfer_is_the_forward_transfer_of_continual_world():
+    # Wołczyk et al. 2021, section 4: (AUC − AUC_b) / (1 − AUC_b), AUC the mean of performance.
+    performance, alone = np.array([0.4, 0.5, 0.9, 0.1]), np.array([0.4, 0.8])
+    expected = [0.0, (0.5 - 0.8) / 0.2, (0.9 - 0.4) / 0.6, (0.1 - 0.8) / 0.2]
+    log = dynamic_regret(TWICE, [50, 100, 150, 200], 1.0 - performance, 50)
+    assert log.learning_transfer is log.visits[0].learning_transfer is None
+    log = log.with_fresh(TWICE, 1.0 - alone)
+    assert [visit.learning_transfer for visit in log.visits] == pytest.approx(expected)
+    assert log.learning_transfer == pytest.approx(np.mean(expected))
+    assert log.fresh_online_regret == pytest.approx((0.6, 0.2))
+
+
+def test_learning_transfer_is_none_where_nothing_can_be_compared():
+    # Visit 1 is not over, and visit 0 lacks the end of an episode only.
+    log = dynamic_regret(TWICE, [45, 60], [0.5, 0.5], [45, 10]).with_fresh(TWICE, [0.5, 0.5])
+    assert [visit.learning_transfer for visit in log.visits] == [0.0, None]
+    assert log.learning_transfer == 0.0
+    optimal = dynamic_regret(TWICE, [50], [0.5], 50).with_fresh(TWICE, [0.0, 0.5])
+    assert optimal.learning_transfer is optimal.visits[0].learning_transfer is None
+
+
+@pytest.mark.parametrize(
+    ("online", "message"),
+    [
+        ([0.5], "fresh online_regret=.*must be 2 numbers"),
+        ([0.5, 1.5], r"fresh online_regret=\[0.5, 1.5\]: must be in \[0, 1\]"),
+        ([0.5, float("nan")], "fresh online_regret: has NaN"),
+    ],
+)
+def test_invalid_regret_of_fresh_agents_is_refused(online, message):
+    with pytest.raises(OptionError, match=message):
+        dynamic_regret(TWICE, [50], [0.5], 50).with_fresh(TWICE, online)
+
+
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
@@ -405,6 +439,15 @@ def test_the_seed_is_the_unit_of_intervals():
     estimates = across_seeds(logs)
     assert estimates["dynamic_regret"].value == pytest.approx(5 * 2 + 25)
     assert estimates["visit_dynamic_regret"].value == pytest.approx([10, 25])
+    assert "learning_transfer" not in estimates
+
+    logs = [
+        each.with_dynamic_regret(each.dynamic_regret.with_fresh(THREE, [0.5, 0.25, 1.0]))
+        for each in logs
+    ]
+    estimates = across_seeds(logs)
+    assert estimates["visit_learning_transfer"].value == pytest.approx([0.6, -1.0])
+    assert estimates["learning_transfer"].value == pytest.approx(-0.2)
 
 
 def test_only_runs_of_one_stream_are_combined():

@@ -10,12 +10,15 @@ in proportion to its steps, and only rows of single steps give exact sums by vis
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError
+from sme_registry.evaluation.continual import metrics
 from sme_registry.spec import Integer, Real, StreamLike, StreamSpec, TupleOf
 from sme_registry.spec.document import StrictModel
 from sme_registry.spec.resolve import resolve_stream
@@ -34,6 +37,8 @@ class VisitRegret(StrictModel):
       steps: environment steps counted.
       dynamic_regret: Σ regret over them; with switch="step" and episodes to a fraction of one.
       online_regret: its mean; None where no step was counted.
+      learning_transfer: how much less that is than the online regret of a fresh agent, as a share
+        of it, at most 1; None without fresh agents, and of a visit that is not over.
     """
 
     visit: Integer
@@ -41,6 +46,7 @@ class VisitRegret(StrictModel):
     steps: Integer
     dynamic_regret: Real
     online_regret: Real | None
+    learning_transfer: Real | None = None
 
 
 class DynamicRegret(StrictModel):
@@ -53,6 +59,8 @@ class DynamicRegret(StrictModel):
       visits: the same of each visit that was reached, in order.
       lifetime: environment steps at the points of the curve, at most 400.
       cumulative_regret: Σ regret until then.
+      fresh_online_regret: `[P]` of an agent that trained on that phase alone; None without them.
+      learning_transfer: the mean over visits; None where no visit has one.
     """
 
     steps: Integer
@@ -61,6 +69,44 @@ class DynamicRegret(StrictModel):
     visits: TupleOf[VisitRegret]
     lifetime: TupleOf[Integer]
     cumulative_regret: TupleOf[Real]
+    fresh_online_regret: TupleOf[Real] | None = None
+    learning_transfer: Real | None = None
+
+    def with_fresh(self, stream: StreamSpec, online_regret: Sequence[float]) -> Self:
+        """This regret with the learning transfer of its visits, against agents that start anew.
+
+        Args:
+          stream: the stream of this life.
+          online_regret: `[P]` mean regret over the training of an agent on each phase alone, for
+            as many steps as the phase has.
+
+        Raises:
+          OptionError: not one number in [0, 1] for each phase.
+        """
+        P = len(stream.phases)
+        fresh = _column("fresh online_regret", online_regret, P)
+        if not (fresh >= 0.0).all() or not (fresh <= 1.0).all():
+            raise OptionError(
+                f"fresh online_regret={fresh.tolist()}: must be in [0, 1]. Give the mean of 1 − r "
+                "over the training on each phase."
+            )
+        online = np.array(
+            [visit.online_regret if _is_over(stream, visit) else None for visit in self.visits],
+            dtype=np.float64,
+        )
+        transfer = metrics.learning_transfer(online, fresh)
+        known = transfer[~np.isnan(transfer)]
+        visits = [
+            visit.model_copy(update={"learning_transfer": None if math.isnan(gain) else gain})
+            for visit, gain in zip(self.visits, transfer.tolist(), strict=True)
+        ]
+        return self.model_copy(
+            update={
+                "visits": tuple(visits),
+                "fresh_online_regret": tuple(fresh.tolist()),
+                "learning_transfer": float(known.mean()) if known.size else None,
+            }
+        )
 
 
 def dynamic_regret(
@@ -124,6 +170,11 @@ def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
     ends = np.cumsum([phase.steps for phase in stream.phases])
     v = np.arange(visits)
     return np.asarray(v // len(ends) * stream.cycle_steps + ends[v % len(ends)])
+
+
+def _is_over(stream: StreamSpec, visit: VisitRegret) -> bool:
+    """Whether a visit's steps are those of its phase, but for an episode that is in no log."""
+    return visit.steps > stream.phases[visit.phase].steps - stream.horizon
 
 
 def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:

@@ -22,6 +22,12 @@ policy or with one phase, G with one cycle.
 
     plasticity ratio       M[v, φ(v)] / N[φ(v)]     above 1: it learned less than a fresh agent
     plasticity difference  M[v, φ(v)] − N[φ(v)]     N: of agents that train on one phase
+
+    learning transfer      (O[φ(v)] − o(v)) / O[φ(v)]      o, O: online regret of visits, and of N's
+
+Learning transfer is the forward transfer of Continual World (Wołczyk et al. 2021), (AUC − AUC_b) /
+(1 − AUC_b), where the area under the curve of training is the mean step reward over all of its
+steps, 1 − o, instead of a mean over evaluations.
 """
 
 from __future__ import annotations
@@ -103,6 +109,23 @@ def plasticity(M: Array, fresh: Array) -> tuple[Array, Array]:
     trained, alone = M[np.arange(V), phases], fresh[phases]
     ratio = np.divide(trained, alone, out=np.full_like(trained, np.nan), where=alone > 0.0)
     return ratio, trained - alone
+
+
+def learning_transfer(visits: Array, fresh: Array) -> Array:
+    """How much less regret a visit cost than a fresh agent's training, as a share of the latter.
+
+    1: the visit cost no regret; 0: it cost a fresh agent's; below 0: it cost more.
+
+    Args:
+      visits: `[V]` online regret of each visit, in [0, 1]; NaN where it is not known.
+      fresh: `[P]` online regret on each phase of an agent that trained for as many steps on that
+        phase alone.
+
+    Returns:
+      `[V]`, at most 1; NaN where `visits` is, and where a fresh agent has no regret.
+    """
+    alone = fresh[np.arange(len(visits)) % len(fresh)]
+    return np.divide(alone - visits, alone, out=np.full_like(visits, np.nan), where=alone > 0.0)
 
 
 def _over_earlier_phases(R: Array, change: Callable[[int, int], Array]) -> Array:

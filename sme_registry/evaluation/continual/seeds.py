@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import OptionError
+from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.continual.report import StreamReport
 from sme_registry.statistics import (
     DRAWS,
@@ -50,7 +51,7 @@ def across_seeds(
       From each name of `Retention` to values and intervals: `[V·P]` of the matrix, row by row,
       `[V]` of a metric by visit, `[1]` of any other; NaN where a run has no value, and in the ends
       of intervals of a single run. `dynamic_regret` `[1]` and `visit_dynamic_regret` `[V]` where
-      every report has them.
+      every report has them, and `learning_transfer` and `visit_learning_transfer` likewise.
 
     Raises:
       OptionError: no report, or reports of different streams or protocols.
@@ -64,13 +65,20 @@ def across_seeds(
     regrets = [report.dynamic_regret for report in reports]
     logs = [regret for regret in regrets if regret is not None]
     if len(logs) == len(reports):
-        runs["dynamic_regret"] = np.array([[log.dynamic_regret] for log in logs])
-        if len({len(log.visits) for log in logs}) == 1:
-            runs["visit_dynamic_regret"] = np.array(
-                [[visit.dynamic_regret for visit in log.visits] for log in logs]
-            )
+        runs |= _of_logs(logs, "dynamic_regret")
+        if all(log.fresh_online_regret for log in logs):
+            runs |= _of_logs(logs, "learning_transfer")
     digest = reports[0].stream_digest
     return {name: _estimate(values, digest, draws, statistic) for name, values in runs.items()}
+
+
+def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
+    """A number of lives, `[n, 1]`, and of their visits, `[n, V]`, where these are as many."""
+    found = {field: np.stack([_numbers(getattr(log, field)) for log in logs])}
+    by_visit = [[getattr(visit, field) for visit in log.visits] for log in logs]
+    if len({len(visits) for visits in by_visit}) == 1:
+        found[f"visit_{field}"] = np.stack([_numbers(visits) for visits in by_visit])
+    return found
 
 
 def same_stream(reports: Sequence[StreamReport]) -> None:
