@@ -406,6 +406,12 @@ def test_fresh_agents_that_were_evaluated_by_themselves_give_the_same_plasticity
             assert getattr(ours.agent, metric) == pytest.approx(getattr(theirs.agent, metric))
         assert ours.agent.forgetting == theirs.agent.forgetting
         assert ours.references == theirs.references
+    log = dynamic_regret(stream, [50, 100], [0.5, 0.5], 50)
+    logged = without.with_dynamic_regret(log).with_fresh(fresh, [1.0, 0.25])
+    assert logged.dynamic_regret.learning_transfer == pytest.approx((0.5 - 1.0) / 2)
+    assert logged.regions == later.regions
+    with pytest.raises(OptionError, match="online_regret: this report has no dynamic regret"):
+        without.with_fresh(fresh, [1.0, 0.25])
     with pytest.raises(OptionError, match="fresh=1 reports: must be 2, one for each phase"):
         without.with_fresh(fresh[:1])
     with pytest.raises(OptionError, match=r"fresh\[0\]: is about .* the task of phase 0"):

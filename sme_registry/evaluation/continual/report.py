@@ -211,15 +211,22 @@ class StreamReport(ReportFile):
         """This report with the dynamic regret of the agent's training."""
         return self.model_copy(update={"dynamic_regret": regret})
 
-    def with_fresh(self, fresh: Sequence[EvaluationReport | StreamReport]) -> Self:
+    def with_fresh(
+        self,
+        fresh: Sequence[EvaluationReport | StreamReport],
+        online_regret: Sequence[float] | None = None,
+    ) -> Self:
         """This report with the plasticity, which fresh agents are needed for.
 
         Args:
           fresh: for each phase the report of an agent trained for as many steps on that phase
             alone: on its task, or, where the phase drifts, on the stream of that phase.
+          online_regret: the mean regret over the training of each of them, for the learning
+            transfer of the visits; None adds none.
 
         Raises:
-          OptionError: not one report for each phase, of its task and of this protocol.
+          OptionError: not one report for each phase, of its task and of this protocol; or an
+            `online_regret` that is invalid, or that no dynamic regret can be compared with.
         """
         tasks = [visit.spec_digest for visit in self.visits[: len(self.stream.phases)]]
         alone = _fresh_regrets(fresh, tasks, self.protocol_digest)
@@ -228,7 +235,17 @@ class StreamReport(ReportFile):
             region.model_copy(update={"agent": region.agent.with_fresh(alone[:, k])})
             for k, region in enumerate(of_each)
         ]
-        return self.model_copy(update={"regions": tuple(regions[:-1]), "ood": regions[-1]})
+        own = self.dynamic_regret
+        if online_regret is not None:
+            if own is None:
+                raise OptionError(
+                    "online_regret: this report has no dynamic regret to compare with it. Add that "
+                    "before: report.with_dynamic_regret(…)."
+                )
+            own = own.with_fresh(self.stream, online_regret)
+        return self.model_copy(
+            update={"regions": tuple(regions[:-1]), "ood": regions[-1], "dynamic_regret": own}
+        )
 
     def __repr__(self) -> str:
         final = self.regions[0].agent.average_performance[-1]
