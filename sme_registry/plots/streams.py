@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
+from sme_registry.evaluation.continual.report import Visit
 from sme_registry.evaluation.continual.seeds import same_stream
 from sme_registry.plots.style import (
     COLOURS,
@@ -23,19 +25,22 @@ from sme_registry.plots.style import (
     look,
     name_bands,
 )
-from sme_registry.statistics import iqm
+from sme_registry.statistics import Statistic, iqm, median
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 Report = StreamReport | str | os.PathLike[str]
 Runs = Report | Sequence[Report]
 Methods = Runs | Mapping[str, Runs]
 
+MATRIX_SCALE = "normalised regret\n(0 = optimal, 1 = constant ½)"
 FILE = "stream.json"  # of a report, in the folder of a run
 _MOST_NUMBERS = 12  # of columns of a map whose cells show their values
+_SIZE = (6.2, 4.0)  # inches, of a figure of lines
 _POINTS = 400  # of a line; more would not be visible at this size
 
 
@@ -81,31 +86,12 @@ def retention_map(
         visited = [(row + 1, column) for row, column in visited]
     V, P = M.shape
     size = (max(3.6, 1.9 + 0.52 * min(P, 20)), max(2.8, 1.5 + 0.32 * min(V, 30)))
-    with canvas(ax, size, path) as (axes,):
-        top = max(1.0, float(M.max()))
-        image = axes.imshow(
-            M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
-        )
-        axes.grid(visible=False)
-        if P <= _MOST_NUMBERS:
-            for row, column in np.ndindex(V, P):
-                colour = "white" if M[row, column] > 0.5 * top else "black"
-                axes.text(
-                    column, row, f"{M[row, column]:.2f}", ha="center", va="center", fontsize=8,
-                    color=colour,
-                )  # fmt: skip
-        for row, column in visited:
-            _outline(axes, row, column)
-        _tick(axes.yaxis, labels)
-        _tick(axes.xaxis, [str(j) for j in range(P)])
+    with _panel(ax, size, path, _title(reports, title, f", {region}")) as axes:
+        image = draw_matrix(axes, M, visited, labels, max(1.0, float(M.max())))
         axes.set_xlabel("evaluated on the task of phase")
         axes.set_ylabel("policy at the end of")
-        bar = figure_of(axes).colorbar(
-            image, ax=axes, label="normalised regret\n(0 = optimal, 1 = constant ½)"
-        )
+        bar = figure_of(axes).colorbar(image, ax=axes, label=MATRIX_SCALE)
         bar.outline.set_visible(False)
-        if ax is None:
-            entitle(figure_of(axes), _title(reports, title, f", {region}"))
     return figure_of(axes)
 
 
@@ -141,29 +127,17 @@ def performance_curve(
         R = np.concatenate([1.0 - np.array(initial)[:, None], R], axis=1)
         x = np.concatenate([[-1.0], x])
     phases = np.array([visit.phase for visit in reports[0].visits])
-    P = R.shape[2]
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
-        for j in range(P):
-            style = look(j)
-            of_phase = R[..., j]
-            middle = iqm(of_phase)
-            if len(R) > 1 and len(COLOURS) >= P:
-                low, high = np.quantile(of_phase, [0.25, 0.75], axis=0)
-                draw_band(axes, x, low, high, style["color"])
-            axes.plot(
-                x, middle, **style, markersize=4.5, linewidth=1.6, markerfacecolor="white",
-                label=f"phase {j}",
-            )  # fmt: skip
+    with _panel(ax, _SIZE, path, _title(reports, title)) as axes:
+        lines = {f"phase {j}": (x, R[..., j]) for j in range(R.shape[2])}
+        hollow = {"markersize": 4.5, "linewidth": 1.6, "markerfacecolor": "white"}
+        _draw_lines(axes, lines, iqm, "IQM", **hollow)
+        for j, (_, values) in enumerate(lines.values()):
             own = np.isin(x, np.flatnonzero(phases == j))
-            axes.plot(x[own], middle[own], **style, markersize=6, linestyle="none")
+            axes.plot(x[own], iqm(values)[own], **look(j), markersize=6, linestyle="none")
         _reference(axes, 1.0, "optimal", "-")
         _reference(axes, 0.0, "constant ½", (0, (4, 4)))
-        if len(R) > 1 and len(COLOURS) >= P:
-            name_bands(axes, f"quartiles of {len(R)} seeds (line: IQM)")
-        _tick_visits(axes, reports[0], initial=x[0] < 0)
+        tick_visits(axes, reports[0].visits, initial=x[0] < 0)
         axes.set_ylabel(f"performance in {region}  (1 − normalised regret)")
-        if ax is None:
-            entitle(figure_of(axes), _title(reports, title))
     return figure_of(axes)
 
 
@@ -191,29 +165,16 @@ def dynamic_regret_curve(
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))
-    curves = {name: [_curve(report) for report in reports] for name, reports in methods.items()}
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
-        for index, (name, each) in enumerate(curves.items()):
-            end = min(x[-1] for x, _ in each)
-            x = np.linspace(0.0, end, _POINTS)
-            values = np.array([np.interp(x, *curve) for curve in each])
-            low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-            style = look(index)
-            if len(each) > 1:
-                draw_band(axes, x, low, high, style["color"])
-            label = _label(name, len(each))
-            axes.plot(x, middle, **style, linewidth=2, markersize=4.5, markevery=0.13, label=label)
-        if any(len(each) > 1 for each in curves.values()):
-            name_bands(axes, "quartiles of seeds (line: median)")
-        axes.set_xlim(0.0, max(x[-1] for each in curves.values() for x, _ in each))
+    with _panel(ax, _SIZE, path, _title(first, title, named=len(methods) == 1)) as axes:
+        lines = {_label(name, reports): _curves(reports) for name, reports in methods.items()}
+        _draw_lines(axes, lines, median, "median", linewidth=2, markersize=4.5, markevery=0.13)
+        axes.set_xlim(0.0, max(x[-1] for x, _ in lines.values()))
         axes.set_ylim(bottom=0.0)
-        _shade_visits(axes, first[0])
+        shade_visits(axes, first[0].visits)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         axes.set_xlabel("lifetime (environment steps)")
         axes.set_ylabel("dynamic regret  (Σ of 1 − r)")
-        if ax is None:
-            entitle(figure_of(axes), _title(first, title, named=len(methods) == 1))
     return figure_of(axes)
 
 
@@ -245,24 +206,118 @@ def plasticity_curve(
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))
-    with canvas(ax, (6.2, 4.0), path) as (axes,):
-        for index, (name, reports) in enumerate(methods.items()):
-            ratios = np.array([_ratios(report, region) for report in reports])
-            x, style = np.arange(ratios.shape[1]), look(index)
-            if len(ratios) > 1:
-                low, high = np.quantile(ratios, [0.25, 0.75], axis=0)
-                draw_band(axes, x, low, high, style["color"])
-            label = _label(name, len(ratios))
-            axes.plot(x, iqm(ratios), **style, linewidth=2, markersize=5, label=label)
-        if any(len(reports) > 1 for reports in methods.values()):
-            name_bands(axes, "quartiles of seeds (line: IQM)")
+    with _panel(ax, _SIZE, path, _title(first, title, named=len(methods) == 1)) as axes:
+        visits = np.arange(len(first[0].visits), dtype=float)
+        lines = {
+            _label(name, reports): (visits, np.array([_ratios(one, region) for one in reports]))
+            for name, reports in methods.items()
+        }
+        _draw_lines(axes, lines, iqm, "IQM", linewidth=2, markersize=5)
         _reference(axes, 1.0, "as a fresh agent", "-")
-        _tick_visits(axes, first[0])
+        tick_visits(axes, first[0].visits)
         axes.set_ylim(bottom=0.0)
         axes.set_ylabel(f"plasticity ratio in {region}\n(regret / fresh agent's, > 1: lost)")
-        if ax is None:
-            entitle(figure_of(axes), _title(first, title, named=len(methods) == 1))
     return figure_of(axes)
+
+
+def draw_matrix(
+    axes: Axes, M: Array, visited: Sequence[tuple[int, int]], labels: Sequence[str], top: float
+) -> AxesImage:
+    """Draw a retention matrix in axes, with the cells of visited phases outlined.
+
+    Args:
+      axes: the axes.
+      M: `[V, P]` normalised regret; the first row may be of the initial policy.
+      visited: row and column of each phase just visited.
+      labels: of the rows.
+      top: the regret at the dark end of the colours, at least that of every cell.
+
+    Returns:
+      The image, for a bar of colours.
+    """
+    image = axes.imshow(
+        M, vmin=0.0, vmax=top, cmap="viridis_r", aspect="auto", interpolation="nearest"
+    )
+    axes.grid(visible=False)
+    V, P = M.shape
+    if P <= _MOST_NUMBERS:
+        for row, column in np.ndindex(V, P):
+            colour = "white" if M[row, column] > 0.5 * top else "black"
+            axes.text(
+                column, row, f"{M[row, column]:.2f}", ha="center", va="center", fontsize=8,
+                color=colour,
+            )  # fmt: skip
+    for row, column in visited:
+        _outline(axes, row, column)
+    _tick(axes.yaxis, labels)
+    _tick(axes.xaxis, [str(j) for j in range(P)])
+    return image
+
+
+def tick_visits(axes: Axes, visits: Sequence[Visit], *, initial: bool = False) -> None:
+    """Label the x axis of visits, from 0, with their phases; the initial policy is at −1."""
+    every = -(-len(visits) // 15)
+    shown = visits[::every]
+    places, labels = [visit.visit for visit in shown], [str(visit.phase) for visit in shown]
+    if initial:
+        places, labels = [-1, *places], ["\ninitial", *labels]
+    axes.set_xticks(places, labels)
+    axes.set_xlabel("end of the visit of phase")
+
+
+def shade_visits(axes: Axes, visits: Sequence[Visit]) -> None:
+    """A band for every other visit along a lifetime, up to the x limit, and its phase above."""
+    begin, end = 0, axes.get_xlim()[1]
+    few = len(visits) <= 20
+    for visit in visits:
+        if begin >= end:
+            break
+        until = end if visit is visits[-1] else min(visit.lifetime, end)
+        if visit.visit % 2 == 0:
+            axes.axvspan(begin, until, color=GREY, alpha=0.1, linewidth=0, zorder=0)
+        if few:
+            axes.text(
+                (begin + until) / 2, 1.01, f"{visit.phase}", ha="center", va="bottom", fontsize=8,
+                color=GREY, transform=axes.get_xaxis_transform(),
+            )  # fmt: skip
+        begin = visit.lifetime
+    if few:
+        axes.text(
+            0.0, 1.01, "phase ", ha="right", va="bottom", fontsize=8, color=GREY,
+            transform=axes.transAxes,
+        )  # fmt: skip
+
+
+@contextmanager
+def _panel(
+    ax: Axes | None, size: tuple[float, float], path: str | os.PathLike[str] | None, title: str
+) -> Iterator[Axes]:
+    """The axes that a figure is drawn in: the caller's, or those of a new figure with a title."""
+    with canvas(ax, size, path) as (axes,):
+        yield axes
+        if ax is None:
+            entitle(figure_of(axes), title)
+
+
+def _draw_lines(
+    axes: Axes,
+    lines: Mapping[str, tuple[Array, Array]],
+    statistic: Statistic,
+    name: str,
+    **style: Any,
+) -> None:
+    """Lines by their labels, each a statistic of the `[n, X]` values of its seeds at `[X]` places.
+
+    Quartiles are bands, unless there are more lines than colours.
+    """
+    banded = len(lines) <= len(COLOURS) and any(len(values) > 1 for _, values in lines.values())
+    for index, (label, (x, values)) in enumerate(lines.items()):
+        if banded and len(values) > 1:
+            low, high = np.quantile(values, [0.25, 0.75], axis=0)
+            draw_band(axes, x, low, high, look(index)["color"])
+        axes.plot(x, statistic(values), **look(index), **style, label=label)
+    if banded:
+        name_bands(axes, f"quartiles of seeds (line: {name})")
 
 
 def _methods(given: Methods) -> dict[str, list[StreamReport]]:
@@ -296,6 +351,13 @@ def _report(given: Any) -> StreamReport:
     return StreamReport.read(path / FILE if path.is_dir() else path)
 
 
+def _curves(reports: Sequence[StreamReport]) -> tuple[Array, Array]:
+    """`[X]` lifetimes that all lives have reached, and the `[n, X]` regret until then."""
+    curves = [_curve(report) for report in reports]
+    x = np.linspace(0.0, min(lifetime[-1] for lifetime, _ in curves), _POINTS)
+    return x, np.array([np.interp(x, *curve) for curve in curves])
+
+
 def _curve(report: StreamReport) -> tuple[Array, Array]:
     regret = report.dynamic_regret
     if regret is None:
@@ -320,8 +382,8 @@ def _ratios(report: StreamReport, region: str) -> Array:
     return np.array(agent.plasticity_ratio, dtype=float)
 
 
-def _label(name: str, runs: int) -> str:
-    return literal(name) + (f" (n = {runs})" if runs > 1 else "")
+def _label(name: str, reports: Sequence[StreamReport]) -> str:
+    return literal(name) + (f" (n = {len(reports)})" if len(reports) > 1 else "")
 
 
 def _title(
@@ -351,37 +413,3 @@ def _tick(axis: Any, labels: Sequence[str]) -> None:
     every = -(-len(labels) // 20)
     axis.set_ticks(range(0, len(labels), every), labels[::every])
     axis.set_tick_params(length=0)
-
-
-def _tick_visits(axes: Axes, report: StreamReport, *, initial: bool = False) -> None:
-    visits = report.visits
-    every = -(-len(visits) // 15)
-    shown = visits[::every]
-    places, labels = [visit.visit for visit in shown], [str(visit.phase) for visit in shown]
-    if initial:
-        places, labels = [-1, *places], ["\ninitial", *labels]
-    axes.set_xticks(places, labels)
-    axes.set_xlabel("end of the visit of phase")
-
-
-def _shade_visits(axes: Axes, report: StreamReport) -> None:
-    """A band for every other visit, and the phase of each above."""
-    begin, end = 0, axes.get_xlim()[1]
-    few = len(report.visits) <= 20
-    for visit in report.visits:
-        if begin >= end:
-            break
-        until = end if visit is report.visits[-1] else min(visit.lifetime, end)
-        if visit.visit % 2 == 0:
-            axes.axvspan(begin, until, color=GREY, alpha=0.1, linewidth=0, zorder=0)
-        if few:
-            axes.text(
-                (begin + until) / 2, 1.01, f"{visit.phase}", ha="center", va="bottom", fontsize=8,
-                color=GREY, transform=axes.get_xaxis_transform(),
-            )  # fmt: skip
-        begin = visit.lifetime
-    if few:
-        axes.text(
-            0.0, 1.01, "phase ", ha="right", va="bottom", fontsize=8, color=GREY,
-            transform=axes.transAxes,
-        )  # fmt: skip

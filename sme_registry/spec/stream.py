@@ -255,10 +255,20 @@ class StreamSpec(NamedDocument):
         Args:
           number: of the draw, at least 0; 0 is the stream itself.
         """
-        if number == 0:
-            return self
+        return self if number == 0 else self._moved(number * BETWEEN_DRAWS)
+
+    @property
+    def family(self) -> StreamSpec:
+        """This stream with its first seed moved to 0, and all others as far: equal for all draws.
+
+        Runs of streams of one family can be compared as runs of one stream.
+        """
+        return self._moved(-int(str(self.phases[0].spec.seed), 0))
+
+    def _moved(self, by: int) -> StreamSpec:
+        """This stream with a number added to the seed of every phase."""
         phases = [
-            Phase(spec=spec.derive(seed=_moved(spec.seed, number)), steps=steps, drift=drift)
+            Phase(spec=spec.derive(seed=_moved(spec.seed, by)), steps=steps, drift=drift)
             for spec, steps, drift in ((one.spec, one.steps, one.drift) for one in self.phases)
         ]
         return StreamSpec.from_dict({**self.to_dict(), "phases": [one.to_dict() for one in phases]})
@@ -281,8 +291,8 @@ def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
     raise SpecError(f"{short_repr(value)}: must be a StreamSpec or a mapping of its fields.")
 
 
-def _moved(seed: int | str, number: int) -> int | str:
-    moved = (int(str(seed), 0) + number * BETWEEN_DRAWS) % 2**256
+def _moved(seed: int | str, by: int) -> int | str:
+    moved = (int(str(seed), 0) + by) % 2**256
     return moved if moved < MAX_SEED else hex(moved)
 
 

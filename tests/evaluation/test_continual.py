@@ -456,6 +456,13 @@ def test_the_seed_is_the_unit_of_intervals():
     assert estimates["learning_transfer"].value == pytest.approx(-0.2)
 
 
+def test_runs_of_one_stream_and_of_its_draws_are_combined():
+    drawn = evaluate_stream([half] * 3, THREE.draw(1), PROTOCOL)
+    assert across_seeds([report(), drawn])["forgetting"].value[-1] == pytest.approx(
+        report().region().agent.forgetting[-1] / 2
+    )
+
+
 def test_only_runs_of_one_stream_are_combined():
     other = evaluate_stream([half] * 4, TWICE, PROTOCOL)
     with pytest.raises(OptionError, match="2 different values of stream_digest"):

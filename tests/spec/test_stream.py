@@ -88,6 +88,17 @@ def test_the_piece_in_force_is_the_one_whose_steps_include_the_lifetime(spec, da
     assert switch == (boundaries[0] if boundaries else None)
 
 
+@given(streams(), st.integers(0, 5))
+def test_the_draws_of_a_stream_are_one_family(spec, number):
+    drawn = spec.draw(number)
+    assert drawn.family == spec.family
+    assert (drawn == spec) == (number == 0)
+    assert drawn.draw(1) == spec.draw(number + 1)
+    both = zip(spec.phases, drawn.phases, strict=True)
+    assert {other.spec.seed - one.spec.seed for one, other in both} == {number * 10**6}
+    assert stream(phase(9), phase(9, seed=2)).family != stream(phase(9), phase(9, seed=1)).family
+
+
 def test_a_drift_is_short_phases_in_equal_increments_of_the_angle():
     spec = stream(phase(10), phase(102, {"rotation": 2 * math.pi, "increments": 4}, rotation=1.0))
     one, *drifting = spec.pieces

@@ -42,7 +42,7 @@ def across_seeds(
     """The IQM over runs of every number of a region, with 95 % intervals.
 
     Args:
-      reports: of one agent on one stream, one for each seed of its training.
+      reports: of one agent on one stream or its draws, one for each seed of its training.
       region: `WD`, `OOD 1`, …, or `OOD` for the mean over the shells.
       draws: samples of the bootstrap.
       statistic: over runs.
@@ -82,15 +82,22 @@ def _of_logs(logs: Sequence[DynamicRegret], field: str) -> dict[str, Array]:
 
 
 def same_stream(reports: Sequence[StreamReport]) -> None:
-    """Raise OptionError unless there is a report, and all are of one stream and protocol."""
+    """Raise OptionError unless there is a report, and all are of one stream and protocol.
+
+    Draws of one stream count as that stream.
+    """
     if not reports:
         raise OptionError("reports: must be one or more stream reports. Give one for each seed.")
-    for field in ("stream_digest", "protocol_digest"):
-        found = {getattr(report, field) for report in reports}
-        if len(found) > 1:
+    streams = {report.stream_digest: report.stream for report in reports}
+    found = {
+        "stream_digest": {stream.family.digest for stream in streams.values()},
+        "protocol_digest": {report.protocol_digest for report in reports},
+    }
+    for field, values in found.items():
+        if len(values) > 1:
             raise OptionError(
-                f"reports: have {len(found)} different values of {field}. Runs of one stream, "
-                "evaluated with one protocol, can be compared. Remove the others."
+                f"reports: have {len(values)} different values of {field}. Runs of one stream or "
+                "of its draws, evaluated with one protocol, can be compared. Remove the others."
             )
 
 
