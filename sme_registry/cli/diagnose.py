@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,9 +18,8 @@ from sme_registry.spec import EnvFile, catalogue
 from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from sme_registry.diagnosis import Diagnosis, Subject, TeamDiagnosis, TeamSubject
+    from sme_registry.diagnosis.views import View
 
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
 
@@ -101,6 +99,7 @@ def diagnose(
       sme diagnose runs/Team4-PPO-seed0 --out runs/Team4-PPO-seed0/diagnosis
     """
     from sme_registry import diagnosis
+    from sme_registry.diagnosis.views import view_of
 
     if out_folder is not None:
         refuse_existing(out_folder / _JSON, force=force)
@@ -125,23 +124,14 @@ def diagnose(
         seed=seed,
         progress=lambda what: err().print(escape(what), style="dim", soft_wrap=True),
     )
+    view = view_of(result)
     if json:
         print_json(result.to_dict())
     else:
-        for part in _terminal(result):
+        for part in view.terminal():
             out().print(part)
     if out_folder is not None:
-        print_written(_write(result, subject, out_folder))
-
-
-def _terminal(result: Diagnosis | TeamDiagnosis) -> Iterator[RenderableType]:
-    from sme_registry.diagnosis import TeamDiagnosis, render, team_render
-
-    return (
-        team_render.terminal(result)
-        if isinstance(result, TeamDiagnosis)
-        else render.terminal(result)
-    )
+        print_written(_write(result, view, subject, out_folder))
 
 
 def _subject(
@@ -186,32 +176,11 @@ def _other_cell(
 
 
 def _write(
-    result: Diagnosis | TeamDiagnosis, subject: Subject | TeamSubject, folder: Path
+    result: Diagnosis | TeamDiagnosis, view: View, subject: Subject | TeamSubject, folder: Path
 ) -> list[Path]:
-    from sme_registry.diagnosis import TeamDiagnosis, render, team_render
-
-    figures = _figures(result, subject, folder) if can_draw() else ()
+    figures = view.draw(folder, subject) if can_draw() else ()
     names = [path.name for path in figures if path.suffix == ".png"]
-    if isinstance(result, TeamDiagnosis):
-        text = team_render.markdown(result, names)
-    else:
-        text = render.markdown(result, names)
-    page = write_atomically(folder / _PAGE, text)
+    page = write_atomically(folder / _PAGE, view.markdown(names))
     # Last, so that the other files exist once it does.
     data = write_atomically(folder / _JSON, to_json(result.to_dict()))
     return [*figures, page, data]
-
-
-def _figures(
-    result: Diagnosis | TeamDiagnosis, subject: Subject | TeamSubject, folder: Path
-) -> tuple[Path, ...]:
-    from sme_registry.diagnosis import TeamDiagnosis, TeamSubject
-
-    if isinstance(result, TeamDiagnosis) or isinstance(subject, TeamSubject):
-        from sme_registry.diagnosis.team_figures import draw_team
-
-        assert isinstance(result, TeamDiagnosis)  # of a team's subject
-        return draw_team(result, folder)
-    from sme_registry.diagnosis.figures import draw
-
-    return draw(result, folder, subject.log)

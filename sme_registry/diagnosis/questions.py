@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from sme_registry.diagnosis.document import Answer, Comparison, Kind, Measurements
+from sme_registry.diagnosis.document import Answer, Comparison, Kind, Measurements, Verdict
 from sme_registry.spec import SMESpec
 
-__all__ = ["THRESHOLDS", "Case", "Outcome", "Question", "Rule", "add_to"]
+__all__ = ["THRESHOLDS", "Case", "Outcome", "Question", "add_to", "answer_all", "verdict"]
+
+C = TypeVar("C")  # what the rules of a question read
 
 THRESHOLDS = {
     "solved": 0.1,  # normalised regret at most: nothing is left to explain
@@ -68,22 +70,46 @@ class Outcome(NamedTuple):
     thresholds: tuple[str, ...] = ()
 
 
-class Question(NamedTuple):
-    """A question: its kind, its rule, and the answer that each reason gives."""
+class Question(NamedTuple, Generic[C]):
+    """A question: its kind, its rule, which reads a case, and the answer that each reason gives."""
 
     kind: Kind
-    rule: Callable[[Case], Outcome]
+    rule: Callable[[C], Outcome]
     reasons: dict[str, Answer]
 
 
-Rule = Callable[[Case], Outcome]
-
-
-def add_to(questions: dict[str, Question], kind: Kind, **reasons: Answer) -> Callable[[Rule], Rule]:
+def add_to(
+    questions: dict[str, Question[C]], kind: Kind, **reasons: Answer
+) -> Callable[[Callable[[C], Outcome]], Callable[[C], Outcome]]:
     """Decorate a rule: add the question of its name, with the answer that each reason gives."""
 
-    def add(rule: Rule) -> Rule:
+    def add(rule: Callable[[C], Outcome]) -> Callable[[C], Outcome]:
         questions[rule.__name__.removeprefix("_")] = Question(kind, rule, reasons)
         return rule
 
     return add
+
+
+def verdict(
+    name: str, kind: Kind, answer: Answer, outcome: Outcome, thresholds: Mapping[str, float]
+) -> Verdict:
+    """The verdict on a question, from the outcome of its rule; `thresholds` are all by name."""
+    return Verdict(
+        question=name,
+        kind=kind,
+        answer=answer,
+        reason=outcome.reason,
+        evidence=outcome.evidence,
+        thresholds={threshold: thresholds[threshold] for threshold in outcome.thresholds},
+    )
+
+
+def answer_all(
+    questions: Mapping[str, Question[C]], case: C, thresholds: Mapping[str, float]
+) -> tuple[Verdict, ...]:
+    """Answer every question about a case by its rule alone, in order."""
+    outcomes = ((name, each, each.rule(case)) for name, each in questions.items())
+    return tuple(
+        verdict(name, each.kind, each.reasons[outcome.reason], outcome, thresholds)
+        for name, each, outcome in outcomes
+    )

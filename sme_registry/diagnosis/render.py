@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLOURS",
+    "answers",
     "headline",
     "label",
     "markdown",
+    "reason_in_words",
     "sentence",
     "templates",
     "terminal",
@@ -51,6 +53,19 @@ def words(macro: str, *arguments: Any, template: str = "sentences.jinja") -> str
     """A macro of a template, on one line."""
     macros: Any = templates().get_template(template).module
     return " ".join(getattr(macros, macro)(*arguments).split())
+
+
+def reason_in_words(verdict: Verdict, template: str) -> str:
+    """The verdict's reason, with its evidence and thresholds, by its question's macro."""
+    arguments = verdict.reason, verdict.evidence, verdict.thresholds
+    return words(verdict.question, *arguments, template=template)
+
+
+def answers(
+    verdicts: Iterable[Verdict], sentence: Callable[[Verdict], str]
+) -> list[tuple[str, str, str]]:
+    """The question, the answer and the sentence of each verdict."""
+    return [(label(each.question), each.answer, sentence(each)) for each in verdicts]
 
 
 def sentence(verdict: Verdict) -> str:
@@ -126,8 +141,6 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
 def _rows(diagnosis: Diagnosis) -> dict[str, list[tuple[str, str, str]]]:
     """The question, answer and sentence of each verdict, by heading."""
     return {
-        heading: [
-            (label(v.question), v.answer, sentence(v)) for v in diagnosis.verdicts if v.kind == kind
-        ]
+        heading: answers((each for each in diagnosis.verdicts if each.kind == kind), sentence)
         for kind, heading in _HEADINGS.items()
     }

@@ -17,9 +17,10 @@ import numpy as np
 
 from sme_registry.diagnosis import measure, rollouts, verdicts
 from sme_registry.diagnosis.document import POLICY, Measurements, Score
+from sme_registry.diagnosis.questions import answer_all
 from sme_registry.diagnosis.subject import TeamSubject
 from sme_registry.diagnosis.team_document import AgentDiagnosis, Credit, TeamDiagnosis
-from sme_registry.diagnosis.team_questions import TEAM_THRESHOLDS, TeamCase, judge_team
+from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLDS, TeamCase
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.envs.types import Observation
@@ -73,6 +74,7 @@ def diagnose_team(
                 measurements=measurements,
             )
         )
+    case = TeamCase(agents, subject.spec, visited.score)
     return TeamDiagnosis(
         name=subject.name,
         spec=subject.spec,
@@ -82,7 +84,7 @@ def diagnose_team(
         checkpoint_step=subject.checkpoint_step,
         uniform=uniform.score,
         visited=visited.score,
-        verdicts=judge_team(TeamCase(agents, subject.spec, visited.score)),
+        verdicts=answer_all(TEAM_QUESTIONS, case, TEAM_THRESHOLDS),
         agents=tuple(agents),
         left_out=tuple(name for name in WHY if name not in _questions(task.spec)),
         thresholds=TEAM_THRESHOLDS,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
-from sme_registry.diagnosis.document import POLICY, Answer, Score, Verdict
-from sme_registry.diagnosis.questions import THRESHOLDS
-from sme_registry.diagnosis.questions import Outcome as _Outcome
+from sme_registry.diagnosis.document import POLICY, Score
+from sme_registry.diagnosis.questions import THRESHOLDS, Outcome, Question, add_to
 from sme_registry.diagnosis.team_document import AgentDiagnosis
 from sme_registry.spec import SMESpec
 
-__all__ = ["TEAM_QUESTIONS", "TEAM_THRESHOLDS", "TeamCase", "judge_team"]
+__all__ = ["TEAM_QUESTIONS", "TEAM_THRESHOLDS", "TeamCase"]
 
 TEAM_THRESHOLDS = {
     **{name: THRESHOLDS[name] for name in ("solved", "difference", "on_policy_ratio")},
@@ -42,38 +42,9 @@ class TeamCase(NamedTuple):
         return max(self.agents, key=visited_regret)
 
 
-class _Question(NamedTuple):
-    rule: Callable[[TeamCase], _Outcome]
-    reasons: dict[str, Answer]
-
-
-TEAM_QUESTIONS: dict[str, _Question] = {}
+TEAM_QUESTIONS: dict[str, Question[TeamCase]] = {}
 """Questions about a team, in order."""
-
-
-def _question(**reasons: Answer) -> Callable[[Callable[[TeamCase], _Outcome]], None]:
-    def add(rule: Callable[[TeamCase], _Outcome]) -> None:
-        TEAM_QUESTIONS[rule.__name__.removeprefix("_")] = _Question(rule, reasons)
-
-    return add
-
-
-def judge_team(case: TeamCase) -> tuple[Verdict, ...]:
-    """Answer every question about a team."""
-    verdicts = []
-    for name, question in TEAM_QUESTIONS.items():
-        outcome = question.rule(case)
-        verdicts.append(
-            Verdict(
-                question=name,
-                kind="who",
-                answer=question.reasons[outcome.reason],
-                reason=outcome.reason,
-                evidence=outcome.evidence,
-                thresholds={threshold: _T[threshold] for threshold in outcome.thresholds},
-            )
-        )
-    return tuple(verdicts)
+_question = partial(add_to, TEAM_QUESTIONS, "who")
 
 
 def visited_regret(agent: AgentDiagnosis) -> float:
@@ -82,7 +53,7 @@ def visited_regret(agent: AgentDiagnosis) -> float:
 
 
 @_question(some_agents_to_blame="yes", spread_over_agents="no", solved="no")
-def _blame(case: TeamCase) -> _Outcome:
+def _blame(case: TeamCase) -> Outcome:
     total = max(case.visited.regret, _TINY)
     agents: list[dict[str, Any]] = [
         {
@@ -95,7 +66,7 @@ def _blame(case: TeamCase) -> _Outcome:
     ]
     blamed = [a for a in agents if a["regret_share"] >= _T["blame_ratio"] * a["channel_share"]]
     reason = "some_agents_to_blame" if blamed else "spread_over_agents"
-    return _Outcome(
+    return Outcome(
         "solved" if case.solved else reason,
         {"agents": agents, "blamed": blamed, "regret": case.visited.regret},
         ("blame_ratio",),
@@ -103,10 +74,10 @@ def _blame(case: TeamCase) -> _Outcome:
 
 
 @_question(agents_differ="yes", agents_alike="no")
-def _unequal_agents(case: TeamCase) -> _Outcome:
+def _unequal_agents(case: TeamCase) -> Outcome:
     best, worst = min(case.agents, key=visited_regret), case.worst
     low, high = visited_regret(best), visited_regret(worst)
-    return _Outcome(
+    return Outcome(
         "agents_differ" if high - low >= _T["difference"] else "agents_alike",
         {"best": best.name, "worst": worst.name, "lowest": low, "highest": high},
         ("difference",),
@@ -114,7 +85,7 @@ def _unequal_agents(case: TeamCase) -> _Outcome:
 
 
 @_question(optimum_harder="yes", optimum_not_harder="no", agents_alike="no")
-def _harder_optimum(case: TeamCase) -> _Outcome:
+def _harder_optimum(case: TeamCase) -> Outcome:
     """Whether the worst agent's π* is harder: further from what a linear policy attains."""
     worst = case.worst
     others = [agent for agent in case.agents if agent is not worst]
@@ -123,7 +94,7 @@ def _harder_optimum(case: TeamCase) -> _Outcome:
     alike = visited_regret(worst) - min(map(visited_regret, case.agents)) < _T["difference"]
     harder = regret[worst.name] - other >= _T["difference"]
     reason = "optimum_harder" if harder else "optimum_not_harder"
-    return _Outcome(
+    return Outcome(
         "agents_alike" if alike else reason,
         {
             "agent": worst.name,
@@ -141,13 +112,13 @@ def _linear_regret(agent: AgentDiagnosis) -> float:
 
 
 @_question(worse_where_visited="yes", not_worse_where_visited="no", solved="no")
-def _visited_states(case: TeamCase) -> _Outcome:
+def _visited_states(case: TeamCase) -> Outcome:
     """Whether the worst agent fails in the states that the team visits rather than everywhere."""
     worst = case.worst
     visited, uniform = visited_regret(worst), worst.measurements.policy.normalised_regret
     worse = visited >= _T["on_policy_ratio"] * uniform and visited - uniform >= _T["difference"]
     reason = "worse_where_visited" if worse else "not_worse_where_visited"
-    return _Outcome(
+    return Outcome(
         "solved" if case.solved else reason,
         {"agent": worst.name, "visited": visited, "uniform": uniform},
         ("on_policy_ratio", "difference"),
@@ -155,13 +126,13 @@ def _visited_states(case: TeamCase) -> _Outcome:
 
 
 @_question(one_agent_suffices="yes", several_must_improve="no", solved="no")
-def _one_correction(case: TeamCase) -> _Outcome:
+def _one_correction(case: TeamCase) -> Outcome:
     """Whether correcting one agent would remove most of the team's regret."""
     best = max(case.agents, key=lambda agent: agent.visited.difference_reward)
     gain, regret = best.visited.difference_reward, case.visited.regret
     suffices = gain >= _T["one_suffices"] * regret
     reason = "one_agent_suffices" if suffices else "several_must_improve"
-    return _Outcome(
+    return Outcome(
         "solved" if case.solved else reason,
         {"agent": best.name, "difference_reward": gain, "regret": regret},
         ("one_suffices",),
@@ -169,16 +140,16 @@ def _one_correction(case: TeamCase) -> _Outcome:
 
 
 @_question(no_survival_threshold="no", one_agent_ends_episodes="yes", no_agent_stands_out="no")
-def _ended_episodes(case: TeamCase) -> _Outcome:
+def _ended_episodes(case: TeamCase) -> Outcome:
     """Whether the threshold D ends episodes for all because of one agent."""
     if case.spec.D == 0:
-        return _Outcome("no_survival_threshold", {"D": case.spec.D})
+        return Outcome("no_survival_threshold", {"D": case.spec.D})
     rates = {agent.name: agent.measurements.on_policy.termination_rate for agent in case.agents}
     shares = dict(sorted(rates.items(), key=lambda rate: -rate[1]))
     first, *rest = shares.values()
     alone = not rest or rest[0] <= first / 2
     ends = first >= _T["termination_rate"] and alone
-    return _Outcome(
+    return Outcome(
         "one_agent_ends_episodes" if ends else "no_agent_stands_out",
         {"D": case.spec.D, "agent": next(iter(shares)), "shares": shares},
         ("termination_rate",),

@@ -6,8 +6,16 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from sme_registry.diagnosis.document import POLICY, Verdict
-from sme_registry.diagnosis.render import COLOURS, label, sentence, templates, title, words
-from sme_registry.diagnosis.team_document import AgentDiagnosis, TeamDiagnosis
+from sme_registry.diagnosis.render import (
+    COLOURS,
+    answers,
+    reason_in_words,
+    sentence,
+    templates,
+    title,
+    words,
+)
+from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.terminal import Answers, Paragraph, Table, fixed
 
 if TYPE_CHECKING:
@@ -25,7 +33,6 @@ _COLUMNS = (
     "N, linear",
     "gain if optimal",
 )
-_Rows = list[tuple[str, str, str]]
 
 
 def headline(diagnosis: TeamDiagnosis) -> str:
@@ -35,8 +42,7 @@ def headline(diagnosis: TeamDiagnosis) -> str:
 
 def team_sentence(verdict: Verdict) -> str:
     """The reason of a verdict on the team, with its evidence and thresholds."""
-    reason, evidence, thresholds = verdict.reason, verdict.evidence, verdict.thresholds
-    return words(verdict.question, reason, evidence, thresholds, template=_SENTENCES)
+    return reason_in_words(verdict, _SENTENCES)
 
 
 def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
@@ -55,9 +61,9 @@ def terminal(diagnosis: TeamDiagnosis) -> Iterator[RenderableType]:
         "reward, if this agent alone acted optimally",
         style="dim italic",
     )
-    yield Answers("Who is to blame", _team_rows(diagnosis), COLOURS)
+    yield Answers("Who is to blame", answers(diagnosis.verdicts, team_sentence), COLOURS)
     for agent in diagnosis.agents:
-        rows = [row for row in _agent_rows(agent) if row[1] == "yes"]
+        rows = [row for row in answers(agent.verdicts, sentence) if row[1] == "yes"]
         if rows:
             yield Answers(f"Where the error of {agent.name} is", rows, COLOURS)
     yield Paragraph(words("left_out", diagnosis.left_out, template=_SENTENCES))
@@ -74,8 +80,8 @@ def markdown(diagnosis: TeamDiagnosis, figures: Sequence[str] = ()) -> str:
             headline=headline(diagnosis),
             columns=_COLUMNS,
             rows=_numbers(diagnosis),
-            verdicts=_team_rows(diagnosis),
-            agents={agent.name: _agent_rows(agent) for agent in diagnosis.agents},
+            verdicts=answers(diagnosis.verdicts, team_sentence),
+            agents={agent.name: answers(agent.verdicts, sentence) for agent in diagnosis.agents},
             left_out=words("left_out", diagnosis.left_out, template=_SENTENCES),
             figures=figures,
         )
@@ -103,11 +109,3 @@ def _numbers(diagnosis: TeamDiagnosis) -> list[tuple[str, ...]]:
             )
         )
     return rows
-
-
-def _team_rows(diagnosis: TeamDiagnosis) -> _Rows:
-    return [(label(v.question), v.answer, team_sentence(v)) for v in diagnosis.verdicts]
-
-
-def _agent_rows(agent: AgentDiagnosis) -> _Rows:
-    return [(label(v.question), v.answer, sentence(v)) for v in agent.verdicts]

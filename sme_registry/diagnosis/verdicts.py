@@ -13,7 +13,7 @@ from pydantic import JsonValue
 
 from sme_registry.diagnosis.document import Answer, Comparison, Level, Measurements, Verdict
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
-from sme_registry.diagnosis.questions import Case, Outcome, Question
+from sme_registry.diagnosis.questions import Case, Outcome, Question, verdict
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.spec import SMESpec
@@ -64,7 +64,7 @@ def level(measurements: Measurements) -> Level:
     return "worse_than_linear" if regret > linear else "better_than_linear"
 
 
-def _verdict(case: Case, name: str, question: Question) -> Verdict:
+def _verdict(case: Case, name: str, question: Question[Case]) -> Verdict:
     answers = {**question.reasons, **COMPARISON_REASONS, **SOLVED}
     if question.kind == "why" and case.solved:
         regret = case.measurements.policy.normalised_regret
@@ -77,14 +77,7 @@ def _verdict(case: Case, name: str, question: Question) -> Verdict:
             thresholds = dict.fromkeys((*alone.thresholds, *compared.thresholds))
             evidence = {**alone.evidence, **compared.evidence, **own}
             outcome = Outcome(compared.reason, evidence, tuple(thresholds))
-    return Verdict(
-        question=name,
-        kind=question.kind,
-        answer=answers[outcome.reason],
-        reason=outcome.reason,
-        evidence=outcome.evidence,
-        thresholds={threshold: _T[threshold] for threshold in outcome.thresholds},
-    )
+    return verdict(name, question.kind, answers[outcome.reason], outcome, _T)
 
 
 def _decides(answers: dict[str, Answer], compared: str, alone: str) -> bool:

@@ -11,7 +11,7 @@ from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
 
 __all__ = ["WHERE"]
 
-WHERE: dict[str, Question] = {}
+WHERE: dict[str, Question[Case]] = {}
 """Questions about the policy, in order."""
 _question = partial(add_to, WHERE, "where")
 

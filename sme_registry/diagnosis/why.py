@@ -14,7 +14,7 @@ from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
 
 __all__ = ["WHY"]
 
-WHY: dict[str, Question] = {}
+WHY: dict[str, Question[Case]] = {}
 """Questions about training, in order."""
 _question = partial(add_to, WHY, "why")
 

@@ -1,0 +1,49 @@
+"""How a diagnosis is shown: `view_of` gives the functions of its kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sme_registry.diagnosis import render, team_render
+from sme_registry.diagnosis.document import Diagnosis
+from sme_registry.diagnosis.team_document import TeamDiagnosis
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+__all__ = ["View", "view_of"]
+
+
+class View(NamedTuple):
+    """The forms of one diagnosis.
+
+    Attributes:
+      terminal: what `sme diagnose` prints, part by part.
+      markdown: the page, which shows figures of the same folder, given by their names.
+      draw: writes the figures of the diagnosis of a subject into a folder, as PNG and PDF.
+    """
+
+    terminal: Callable[[], Iterator[RenderableType]]
+    markdown: Callable[[Sequence[str]], str]
+    draw: Callable[[Path, Any], tuple[Path, ...]]
+
+
+def view_of(diagnosis: Diagnosis | TeamDiagnosis) -> View:
+    """How to show a diagnosis."""
+    if isinstance(diagnosis, TeamDiagnosis):
+        from sme_registry.diagnosis.team_figures import draw_team
+
+        return View(
+            lambda: team_render.terminal(diagnosis),
+            lambda figures: team_render.markdown(diagnosis, figures),
+            lambda folder, subject: draw_team(diagnosis, folder),
+        )
+    from sme_registry.diagnosis.figures import draw
+
+    return View(
+        lambda: render.terminal(diagnosis),
+        lambda figures: render.markdown(diagnosis, figures),
+        lambda folder, subject: draw(diagnosis, folder, subject.log),
+    )
