@@ -95,6 +95,13 @@ class Lives:
             yield visit, visit // P * length + self._ends[visit % P]
 
     @property
+    def last_visit(self) -> tuple[int, int] | None:
+        """The last visit, and the step after which its phase goes on; None without a stream."""
+        if self._stream is None:
+            return None
+        return len(self._ends) * self._stream.cycles - 1, self._stream.steps
+
+    @property
     def _phases(self) -> Sequence[Any]:
         return self._stream.phases if self._stream else ()
 

@@ -32,6 +32,8 @@ ALGORITHMS: dict[str, tuple[Any, type[Program]]] = {
 }
 """Hyperparameters and program of each algorithm."""
 
+_OnVisit = Callable[[int, list[dict[str, Array]]], Any]
+
 POLICY = "policy_kwargs"
 _OF_POLICY = ("net_arch",)  # hyperparameters that Stable-Baselines3 has in `policy_kwargs`
 
@@ -164,7 +166,7 @@ def run(
     start_states: Callable[[int], Sequence[Array]] | None = None,
     on_log: Callable[[StepLog], Any],
     on_evaluation: Callable[[int, int, Evaluation], Any] | None = None,
-    on_visit: Callable[[int, list[dict[str, Array]]], Any] | None = None,
+    on_visit: _OnVisit | None = None,
     after_piece: Callable[[], Any] = lambda: None,
     piece: int = PIECE,
 ) -> None:
@@ -177,7 +179,8 @@ def run(
 
     The policy at the end of a visit of a stream's phase has learned from all that it collected in
     it: with TD3 and SAC up to the update that follows the last step, with PPO up to that of the
-    last rollout that was over by then.
+    last rollout that was over by then. The last visit ends with the training: PPO finishes its last
+    rollout in it.
 
     Args:
       program: whose state is saved only in `after_piece`, or before.
@@ -216,6 +219,8 @@ def run(
         after_piece()
     if program.budget:
         program.finish()
+    if on_visit is not None:
+        _end_last_visit(program, on_visit)
     evaluate([(k, program.steps) for k in range(len(steps), len(due))])
 
 
@@ -237,16 +242,26 @@ def _evaluated(
             yield k, step, Evaluation(*(x[:, i * n : (i + 1) * n] for x in done))
 
 
-def _end_visits(
-    program: Program, after: int, on_visit: Callable[[int, list[dict[str, Array]]], Any]
-) -> None:
-    """End the visits whose last step is later than `after`, and done."""
+def _end_visits(program: Program, after: int, on_visit: _OnVisit) -> None:
+    """End the visits, but the last one, whose last step is later than `after`, and done."""
     for visit, end in program.lives.visit_ends(after):
-        if end > program.steps:
+        if end > program.steps or (visit, end) == program.lives.last_visit:
             return
         if end == program.steps:
             program.finish()
-        on_visit(visit, [program.weights(lane) for lane in range(len(program.specs))])
+        on_visit(visit, _weights(program))
+
+
+def _end_last_visit(program: Program, on_visit: _OnVisit) -> None:
+    """End the last visit, if the training that is over has reached its end."""
+    last = program.lives.last_visit
+    if last is not None and last[1] <= program.steps:
+        on_visit(last[0], _weights(program))
+
+
+def _weights(program: Program) -> list[dict[str, Array]]:
+    """Of each lane that is no copy."""
+    return [program.weights(lane) for lane in range(len(program.specs))]
 
 
 def _lifetime(step: int) -> int:

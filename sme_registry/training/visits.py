@@ -2,8 +2,9 @@
 
 That policy has learned from all that the learner collected in the visit: with TD3 and SAC up to the
 update that follows its last step, with PPO up to that of the last rollout that was over by then. So
-it is the policy at the first step of the next visit, before any update that follows that step, or
-at the end of training. `jax.run.run` has the same rule.
+it is the policy at the first step of the next visit, before any update that follows that step.
+The last visit ends with the training, since the last phase goes on: PPO finishes its last rollout
+in it. `jax.run.run` has the same rule.
 """
 
 from __future__ import annotations
@@ -27,10 +28,9 @@ class VisitEnds:
     def __init__(
         self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0
     ) -> None:
-        visits = stream.cycles * len(stream.phases)
-        ends = enumerate(visit_ends(stream, visits).tolist())
-        self._upcoming = [(visit, end) for visit, end in ends if end >= steps]
-        self._on_visit = on_visit
+        *ends, end = visit_ends(stream, stream.cycles * len(stream.phases)).tolist()
+        self._upcoming = [(visit, end) for visit, end in enumerate(ends) if end >= steps]
+        self._last, self._on_visit = (len(ends), end), on_visit
 
     def after_step(self, steps: int) -> None:
         """Count a step; `steps` are all that were taken, and the learner has not learned since."""
@@ -40,3 +40,6 @@ class VisitEnds:
     def finish(self, steps: int) -> None:
         """End the visits that are over when training ends, after its last update."""
         self.after_step(steps + 1)
+        visit, end = self._last
+        if end <= steps:
+            self._on_visit(visit)

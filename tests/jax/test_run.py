@@ -138,7 +138,7 @@ def test_evaluations_are_of_the_task_on_which_their_step_was_taken() -> None:
 
 @pytest.mark.parametrize(
     ("rollout", "updates"),
-    [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 2])],
+    [(1, [5, 10, 15, 20]), (2, [2, 5, 7, 10]), (5, [1, 2, 3, 4]), (8, [0, 1, 1, 3])],
 )
 def test_a_visit_ends_after_the_update_of_the_last_rollout_in_it(
     rollout: int, updates: list[int]
@@ -164,6 +164,8 @@ def test_a_restored_run_goes_on_after_the_visits_that_have_ended() -> None:
     program.steps = 10
     scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
     assert ended == [2, 3]
+    scripted_run(program, [], on_visit=lambda visit, _: ended.append(visit))
+    assert ended == [2, 3, 3]  # saved after its last step: the last visit ends with the training
 
 
 @pytest.mark.parametrize(
