@@ -1,0 +1,46 @@
+"""`Snapshots`: the models of a life in a stream, before training and at the end of each visit.
+
+    initial.zip       before training
+    visit-00.zip      at the end of visit 0 (`visits`), and so on; the last one is the trained model
+
+Each is written as a trained model is. Visits count from 0, in as many digits as the last one has,
+at least two.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sme_registry.evaluation.policies import saved_sb3
+from sme_registry.io import write_atomically
+from sme_registry.spec import StreamSpec
+
+FOLDER = "snapshots"  # of a run
+
+
+class Snapshots:
+    """The files of a life's models in a folder.
+
+    Args:
+      folder: the folder, created with the first of them.
+      stream: the stream.
+
+    Attributes:
+      initial: the file of the model before training.
+      visits: the files of the models at the end of each visit, in order.
+    """
+
+    def __init__(self, folder: Path, stream: StreamSpec) -> None:
+        count = stream.cycles * len(stream.phases)
+        digits = max(2, len(str(count - 1)))
+        self.initial = folder / "initial.zip"
+        self.visits = [folder / f"visit-{visit:0{digits}}.zip" for visit in range(count)]
+
+    def write_initial(self, model: Any) -> None:
+        """Write a model of Stable-Baselines3 before training; OptionError if that fails."""
+        write_atomically(self.initial, saved_sb3(model))
+
+    def write(self, visit: int, model: Any) -> None:
+        """Write the model at the end of a visit; OptionError if that fails."""
+        write_atomically(self.visits[visit], saved_sb3(model))
