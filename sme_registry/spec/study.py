@@ -11,7 +11,7 @@ with which its plasticity is compared.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, JsonValue, model_validator
 
@@ -137,6 +137,21 @@ class Cell(Document):
         """What the agent lives in: the stream, or the task."""
         return self.stream or self.spec
 
+    @property
+    def fresh(self) -> tuple[Cell, ...]:
+        """Of a life: for each phase the run of an agent that trains on that phase alone."""
+        if self.stream is None:
+            return ()
+        evaluations = self.evaluations // (self.stream.cycles * len(self.stream.phases))
+        return tuple(
+            Cell(
+                **dict(self)
+                | _lived_in(_alone(phase))
+                | {"steps": phase.steps, "evaluations": evaluations}
+            )
+            for phase in self.stream.phases
+        )
+
 
 class PlannedCell(StrictModel):
     """A cell and its place in the plan.
@@ -215,35 +230,33 @@ class StudyPlan(Document):
         self, class_name: str, document: SMESpec | StreamSpec, algorithm: StudyAlgorithm, run: int
     ) -> Iterator[PlannedCell]:
         """A run on a task; a life in a stream, and a fresh agent for each of its phases."""
-
-        def planned(
-            document: SMESpec | StreamSpec, steps: int, evaluations: int, phase: int | None = None
-        ) -> PlannedCell:
-            stream = document if isinstance(document, StreamSpec) else None
-            cell = Cell(
-                spec=document.phases[0].spec if isinstance(document, StreamSpec) else document,
-                stream=stream,
-                uses=algorithm.uses,
-                hyperparameters=algorithm.hyperparameters,
-                action_range=algorithm.action_range,
-                seed=run,
-                steps=steps,
-                evaluations=evaluations,
-                evaluation_episodes=self.evaluation_episodes,
-                protocol=self.protocol,
-            )
-            return PlannedCell(
-                class_name=class_name, algorithm=algorithm.name, run=run, phase=phase, cell=cell
-            )
-
         if isinstance(document, SMESpec):
             steps = self.steps if algorithm.steps is None else algorithm.steps
-            yield planned(document, steps, self.evaluations)
-            return
-        yield planned(document, document.steps, self.evaluations)
-        visits = document.cycles * len(document.phases)
-        for index, phase in enumerate(document.phases):
-            yield planned(_alone(phase), phase.steps, self.evaluations // visits, index)
+        else:
+            steps = document.steps
+        cell = Cell(
+            **_lived_in(document),
+            uses=algorithm.uses,
+            hyperparameters=algorithm.hyperparameters,
+            action_range=algorithm.action_range,
+            seed=run,
+            steps=steps,
+            evaluations=self.evaluations,
+            evaluation_episodes=self.evaluation_episodes,
+            protocol=self.protocol,
+        )
+        cells: list[tuple[int | None, Cell]] = [(None, cell), *enumerate(cell.fresh)]
+        for phase, each in cells:
+            yield PlannedCell(
+                class_name=class_name, algorithm=algorithm.name, run=run, phase=phase, cell=each
+            )
+
+
+def _lived_in(document: SMESpec | StreamSpec) -> dict[str, Any]:
+    """The fields of a cell that say what its agent lives in."""
+    if isinstance(document, StreamSpec):
+        return {"spec": document.phases[0].spec, "stream": document}
+    return {"spec": document, "stream": None}
 
 
 def _alone(phase: Phase) -> SMESpec | StreamSpec:
