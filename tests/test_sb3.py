@@ -337,6 +337,11 @@ def test_lives_of_a_stream_are_those_of_a_dummy_vec_env(switch: str) -> None:
             assert_same(ours.reset(), theirs.reset())  # goes on
             ours = pickle.loads(pickle.dumps(ours))
     assert lifetimes == {1}
+    for env in (ours, theirs):
+        env.set_options({"lifetime": 85})
+    assert_same(ours.reset(), theirs.reset())
+    assert_same(ours.reset_infos, theirs.reset_infos)
+    assert [info["phase"] for info in ours.reset_infos] == [0, 0, 0]
     assert ours.env_method("reset", indices=1, seed=0)[0][1]["lifetime"] == 0
     assert ours.get_attr("spec", 0)[0].id == f"SME/{stream.content_name}-v1"
 

@@ -152,6 +152,14 @@ def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...
             )
 
 
+def lifetime_in(options: dict[str, Any] | None) -> int | None:
+    """The option `lifetime` of a stream's reset: an integer of at least 0; None without it."""
+    if not options or "lifetime" not in options:
+        return None
+    advice = "Leave it out to continue the life."
+    return integer_in("lifetime", options["lifetime"], 0, advice=advice)
+
+
 def initial_states(state: Any, shape: tuple[int, ...]) -> Array:
     """States at which episodes begin, as float64 of `shape`; StateError outside [0, 1]."""
     try:

@@ -161,6 +161,7 @@ class Batch:
     """
 
     lived: Mapping[str, Lanes] = MappingProxyType({})  # `life()` at the end of the last step
+    reset_options: tuple[str, ...] = ("state",)  # of an environment
 
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
@@ -222,6 +223,9 @@ class Batch:
     def seed(self, lane: int, seed: int) -> None:
         """Restart the generator of a lane's initial states."""
         self.initial_states.seed(lane, seed)
+
+    def live(self, lane: int, lifetime: int) -> None:
+        """Let a lane's life, if it lives through a stream, go on after so many steps."""
 
     def observe(self) -> Observation:
         """The present joint observations of all lanes, `[B, S + 1 + n]`."""

@@ -81,6 +81,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     _phase: Any = None  # in force, NumPy's number
     _lifetimes: list[Any] | None = None  # those of the next steps, the last one first
     _phase_shown: Observation = np.empty(0, np.float32)  # what observations end with
+    _reset_options: tuple[str, ...] = ("state",)
 
     def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
         """The task at the beginning."""
@@ -161,13 +162,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
         refuse_short_time_limit(self.sme_spec.horizon)
-        arguments.refuse_unknown_options(options, ("state",))
+        arguments.refuse_unknown_options(options, self._reset_options)
         S, seed = self.sme_spec.state_dim, arguments.checked_seed(seed)
+        lifetime = arguments.lifetime_in(options)
         start = None
         if options and "state" in options:
             start = arguments.initial_states(options["state"], (S,))
         super().reset(seed=seed)  # nothing changes before every argument is checked
-        life = self._begin_life(seed)
+        life = self._live(0 if lifetime is None and seed is not None else lifetime)
         s = self.np_random.random(S) if start is None else start
         self._lane[:LANE_STATE] = 0.0
         self._lane[LANE_STATE:] = s
@@ -179,8 +181,12 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._record(self, None)
         return observation, {**infos.at_reset(self._action_shape[0]), **life}
 
-    def _begin_life(self, seed: int | None) -> dict[str, Any]:
-        """Called by each reset before it draws a state; what it returns is added to the info."""
+    def _live(self, lifetime: int | None) -> dict[str, Any]:
+        """Called by each reset before it draws a state; what it returns is added to the info.
+
+        Args:
+          lifetime: of a stream, the steps after which a life begins; None continues the present.
+        """
         return {}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

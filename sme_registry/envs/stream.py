@@ -24,7 +24,8 @@ class SMEStreamEnv(SMEEnv):
     task in which the action was taken; at a reset, `phase` is the one that begins. `task` and
     `sme_spec` are those in force.
 
-    `reset(seed=…)` begins a new life at 0, and `reset()` continues it. With `switch="step"` a new
+    `reset(seed=…)` begins a new life at 0, and `reset()` continues it. The option `lifetime` begins
+    one after so many steps: `reset(options={"lifetime": 20_000})`. With `switch="step"` a new
     phase begins within an episode: state, t and r_cum carry over. The observation has the r_cum/k
     of the k then in force, at most 1, and with `observes_phase` ends with the phase, one-hot.
 
@@ -55,6 +56,8 @@ class SMEStreamEnv(SMEEnv):
             **overrides,
         )
 
+    _reset_options = ("state", "lifetime")
+
     def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
         self._tasks = arguments.load_stream_tasks(type(self), spec, overrides)
         self._piece, self._lifetimes = 0, []
@@ -72,11 +75,11 @@ class SMEStreamEnv(SMEEnv):
         """The stream, which is what the environment runs."""
         return self._tasks.stream
 
-    def _begin_life(self, seed: int | None) -> dict[str, Any]:
+    def _live(self, lifetime: int | None) -> dict[str, Any]:
         assert self._lifetimes is not None
-        lifetime = int(self._lifetimes[-1]) - 1
-        if seed is not None:
-            lifetime = 0
+        if lifetime is None:
+            lifetime = int(self._lifetimes[-1]) - 1
+        else:
             self._look_ahead(lifetime)
         self._enter(self._tasks.schedule.piece_at(lifetime))
         return infos.of_life(self._phase, np.int64(lifetime))

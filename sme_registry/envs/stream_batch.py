@@ -33,6 +33,8 @@ class StreamBatch(Batch):
       ResourceLimitError: a batch this large would not fit in memory.
     """
 
+    reset_options = ("state", "lifetime")
+
     def __init__(self, tasks: StreamTasks, lanes: int) -> None:
         refuse_large_batch(lanes, 40 + 20 * tasks.stream.observation_dim)
         self.tasks = tasks
@@ -80,7 +82,12 @@ class StreamBatch(Batch):
     def seed(self, lane: int, seed: int) -> None:
         """Restart a lane's generator, and its life."""
         super().seed(lane, seed)
-        self._lifetime[lane] = self._next_switch[lane] = 0
+        self.live(lane, 0)
+
+    def live(self, lane: int, lifetime: int) -> None:
+        """Let a lane's life go on after so many steps, at its next `begin`."""
+        self._lifetime[lane] = lifetime
+        self._next_switch[lane] = 0
 
     def observe(self) -> Observation:
         """The present observations of all lanes."""

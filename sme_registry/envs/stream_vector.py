@@ -20,7 +20,8 @@ class SMEStreamVectorEnv(SMEVectorEnv):
 
     Lanes live by themselves: with early termination they are at different steps of their lives, and
     near a switch in different phases. `get_attr("task")` gives the task in force in each lane, and
-    `task` that of all of them.
+    `task` that of all of them. The option `lifetime` of a reset is that of `SMEStreamEnv`, for each
+    lane that is reset.
 
     Args:
       stream: the stream, its fields, an id, a digest or a path.

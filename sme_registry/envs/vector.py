@@ -118,8 +118,9 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
         """
-        arguments.refuse_unknown_options(options, ("state", "reset_mask"))
+        arguments.refuse_unknown_options(options, (*self._batch.reset_options, "reset_mask"))
         options = options or {}
+        lifetime = arguments.lifetime_in(options)
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         seeds = self._seeds(seed)[lanes]
@@ -134,6 +135,8 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         for lane, lane_seed in zip(lanes, seeds, strict=True):
             if lane_seed is not None:
                 self._batch.seed(int(lane), lane_seed)
+            if lifetime is not None:
+                self._batch.live(int(lane), lifetime)
         observation = self._batch.observe()
         self._begin(lanes, observation, states)
         self._begun[lanes] = True

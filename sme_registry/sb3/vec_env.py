@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -106,6 +106,14 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
         return [False for _ in self._get_indices(indices)]
 
 
+class _Start(NamedTuple):
+    """How an episode begins: its seed, initial state `[1, S]` and lifetime; None for its own."""
+
+    seed: int | None
+    state: Array | None
+    lifetime: int | None
+
+
 class _SingleLane(Lane):
     """A lane of a single agent's task, which can be reset alone."""
 
@@ -113,8 +121,8 @@ class _SingleLane(Lane):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode in this lane alone; see `SMEEnv.reset`."""
-        start = self._owner._start([options or {}])
-        observations = self._owner._begin({self._index: (seed, start)})
+        start = self._owner._start(seed, [options or {}])
+        observations = self._owner._begin({self._index: start})
         return observations[self._index], self._owner._info_at_reset(self._index)
 
 
@@ -219,37 +227,39 @@ class _BatchVecEnv(LanesVecEnv):
         """
         n = len(self.agents)
         options = [self._options[team * n : (team + 1) * n] for team in range(self.num_teams)]
-        starts = [self._start(of_team) for of_team in options]
-        observations = self._begin(dict(enumerate(zip(self._seeds[::n], starts, strict=True))))
+        starts = [*map(self._start, self._seeds[::n], options)]
+        observations = self._begin(dict(enumerate(starts)))
         self.reset_infos = [self._info_at_reset(lane) for lane in range(self.num_envs)]
         self._clear_reset_arguments()
         return observations
 
-    def _begin(self, teams: dict[int, tuple[int | None, Array | None]]) -> Observation:
-        """Begin an episode in these teams, each with a seed and an initial state, or None."""
-        seeds = {team: arguments.checked_seed(seed) for team, (seed, _) in teams.items()}
+    def _begin(self, teams: dict[int, _Start]) -> Observation:
+        """Begin an episode in these teams."""
         joint = self._batch.observe()
-        for team, (_, start) in teams.items():
-            seed = seeds[team]
-            if seed is not None:
-                self._batch.seed(team, seed)
-            self._batch.begin(np.array([team]), joint, start)
+        for team, start in teams.items():
+            if start.seed is not None:
+                self._batch.seed(team, start.seed)
+            if start.lifetime is not None:
+                self._batch.live(team, start.lifetime)
+            self._batch.begin(np.array([team]), joint, start.state)
             self._begun[team] = True
         if self._renderer is not None:
             self._renderer.record(teams)
         return self._observations(joint)
 
-    def _start(self, options: list[dict[str, Any]]) -> Array | None:
-        """The initial state of a team, `[1, S]`, from the options of its lanes; None: draw it."""
+    def _start(self, seed: int | None, options: list[dict[str, Any]]) -> _Start:
+        """How a team begins an episode, from its seed and the options of its lanes."""
         for of_lane in options:
-            arguments.refuse_unknown_options(of_lane, ("state",))
+            arguments.refuse_unknown_options(of_lane, self._batch.reset_options)
         shape = (self._task.spec.state_dim,)
         states = [arguments.initial_states(of["state"], shape) for of in options if "state" in of]
-        if not states:
-            return None
-        if len(states) < len(options) or any((state != states[0]).any() for state in states):
+        if states and (
+            len(states) < len(options) or any((state != states[0]).any() for state in states)
+        ):
             raise OptionError("options: a team has one state. Give the same to each of its lanes.")
-        return states[0][None]
+        state = states[0][None] if states else None
+        # Only streams have a lifetime, and these have no teams.
+        return _Start(arguments.checked_seed(seed), state, arguments.lifetime_in(options[0]))
 
     def step_wait(self) -> StepResult:
         """One step of every lane.

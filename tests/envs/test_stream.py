@@ -17,6 +17,7 @@ from sme_registry.envs import SMEEnv, SMEStreamEnv, SMEStreamVectorEnv, SMEVecto
 from sme_registry.errors import (
     ActionError,
     EpisodeError,
+    OptionError,
     ResourceLimitError,
     UnexpectedKeywordError,
 )
@@ -148,6 +149,44 @@ def test_a_reset_continues_the_life_and_a_seed_begins_a_new_one() -> None:
     _, infos = batch.reset(seed=[None, 4])
     assert infos["lifetime"][0] > 0
     assert infos["lifetime"][1] == 0
+
+
+@pytest.mark.parametrize("switch", ["episode", "step"])
+@pytest.mark.parametrize(("lifetime", "phase"), [(36, 0), (37, 1), (61, 2), (91, 0), (400, 2)])
+def test_a_life_may_begin_after_some_steps(switch: str, lifetime: int, phase: int) -> None:
+    spec, options = stream(switch, D=0.0), {"lifetime": lifetime}
+    env, batch = SMEStreamEnv(spec), SMEStreamVectorEnv(spec, 2, autoreset_mode="SameStep")
+    for each, action in (env, HALF), (batch, np.stack([HALF, HALF])):
+        each.reset(seed=5)
+        each.step(action)
+    observation, info = env.reset(seed=1, options=options)
+    observations, infos = batch.reset(seed=1, options=options)
+    assert (info["phase"], info["lifetime"]) == (phase, lifetime)
+    assert infos["lifetime"].tolist() == [lifetime] * 2
+    for _ in range(40):
+        np.testing.assert_array_equal(observation, observations[0])
+        observation, reward, _, truncated, info = env.step(HALF)
+        if truncated:
+            observation, info = env.reset()
+        observations, rewards, *_, infos = batch.step(np.stack([HALF, HALF]))
+        assert (reward, info["phase"], info["lifetime"]) == (
+            rewards[0], infos["phase"][0], infos["lifetime"][0],
+        )  # fmt: skip
+
+
+def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes() -> None:
+    env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
+    for each in env, batch:
+        each.reset(seed=0)
+        for lifetime in (-1, 2.5, "late", None):
+            with pytest.raises(OptionError, match=r"^lifetime=.*must be an integer of at least 0"):
+                each.reset(seed=1, options={"lifetime": lifetime})
+        assert np.max(each.reset()[1]["lifetime"]) == 0
+        with pytest.raises(OptionError, match="unknown option"):
+            each.reset(options={"lifetmie": 1})
+    for task in SMEEnv(SPEC), SMEVectorEnv(SPEC, 2):
+        with pytest.raises(OptionError, match="unknown option"):
+            task.reset(options={"lifetime": 1})
 
 
 def test_a_refused_action_and_an_autoreset_are_no_steps_of_the_life() -> None:
