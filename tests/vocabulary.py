@@ -33,6 +33,8 @@ QUANTITIES = {
     "relearning": "gain of the second visit of a phase on its first",
     "plasticity_ratio": "normalised regret on the visited phase over a fresh agent's",
     "plasticity_difference": "their difference",
+    "learning_transfer": "online regret of a visit below a fresh agent's, as a share of the latter",
+    "fresh_online_regret": "online regret of an agent trained on a phase alone",
     "dynamic_regret": "Σ of regret over a lifetime, or over a visit",
     "cumulative_regret": "Σ of regret until a lifetime",
     "lifetime": "environment steps of a life",

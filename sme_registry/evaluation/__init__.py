@@ -5,8 +5,10 @@ from sme_registry.evaluation.continual import (
     across_seeds,
     dynamic_regret,
     evaluate_stream,
+    expected_regret,
     fresh_per_phase,
     frozen_after_first,
+    reference_regret,
 )
 from sme_registry.evaluation.evaluate import evaluate, evaluate_many, resolve_protocol
 from sme_registry.evaluation.policies import (
@@ -42,10 +44,12 @@ __all__ = [
     "evaluate",
     "evaluate_many",
     "evaluate_stream",
+    "expected_regret",
     "fresh_per_phase",
     "frozen_after_first",
     "interface_of",
     "load_sb3",
     "reference_policy",
+    "reference_regret",
     "resolve_protocol",
 ]

@@ -10,6 +10,7 @@ from sme_registry.evaluation.continual.evaluate import (
     fresh_per_phase,
     frozen_after_first,
 )
+from sme_registry.evaluation.continual.lives import expected_regret, reference_regret
 from sme_registry.evaluation.continual.report import (
     Retention,
     StreamRegion,
@@ -28,6 +29,8 @@ __all__ = [
     "across_seeds",
     "dynamic_regret",
     "evaluate_stream",
+    "expected_regret",
     "fresh_per_phase",
     "frozen_after_first",
+    "reference_regret",
 ]

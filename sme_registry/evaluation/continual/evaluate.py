@@ -12,12 +12,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sme_registry.errors import OptionError, PolicyError, UnknownNameError
 from sme_registry.evaluation.continual.dynamic_regret import visit_ends
 from sme_registry.evaluation.continual.report import StreamReport, Visit, stream_regions
-from sme_registry.evaluation.continual.retention import Subject, final_specs, measure
+from sme_registry.evaluation.continual.retention import (
+    Subject,
+    final_specs,
+    measure,
+    prepared,
+    refuse_other_count,
+)
 from sme_registry.evaluation.evaluate import Progress, resolve_protocol, versions_behind
-from sme_registry.evaluation.policies import Policy, as_policy
+from sme_registry.evaluation.policies import Policy
 from sme_registry.spec import ProtocolLike, StreamLike, StreamSpec
 from sme_registry.task import load_stream
 from sme_registry.task.draw import Array
@@ -67,26 +72,12 @@ def evaluate_stream(
     protocol = resolve_protocol(protocol)
     P = len(stream.phases)
     V = stream.cycles * P
-    _refuse_other_count(
-        "policies", policies, V, f"at the end of each visit ({stream.cycles} × {P})"
-    )
+    refuse_other_count("policies", policies, V, f"at the end of each visit ({stream.cycles} × {P})")
     if fresh is not None:
-        _refuse_other_count("fresh", fresh, P, "for each phase")
-    spec = stream.phases[0].spec
+        refuse_other_count("fresh", fresh, P, "for each phase")
 
     def subject(policy: Any, phases: Sequence[int], where: str) -> Subject:
-        try:
-            ready = as_policy(
-                policy,
-                spec,
-                action_range=action_range,
-                algorithm=algorithm,
-                observed_phases=stream.observed_phases,
-            )
-        except (PolicyError, UnknownNameError) as error:
-            raise type(error)(f"{where}: {error}") from error.__cause__
-        assert isinstance(ready, Policy)  # streams have no teams
-        return Subject(ready, phases, where)
+        return Subject(prepared(policy, stream, where, action_range, algorithm), phases, where)
 
     everywhere = range(P)
     subjects = [Subject(j, everywhere) for j in range(P)]
@@ -161,9 +152,3 @@ def _references(optima: Array, visits: int) -> dict[str, Array]:
         "fresh_optimum": optima[np.arange(visits) % P],
         "constant_half": np.ones((visits, *optima.shape[1:])),
     }
-
-
-def _refuse_other_count(name: str, policies: Any, count: int, which: str) -> None:
-    if not isinstance(policies, Sequence) or isinstance(policies, str) or len(policies) != count:
-        given = f"{len(policies)} of them" if isinstance(policies, list | tuple) else repr(policies)
-        raise OptionError(f"{name}={given:.60}: must be {count} policies, one {which}.")

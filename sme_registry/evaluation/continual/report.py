@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.continual import metrics
 from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
+from sme_registry.evaluation.continual.lives import expected_regret
 from sme_registry.evaluation.regions import region_name
 from sme_registry.evaluation.report import EvaluationReport
 from sme_registry.evaluation.report_file import ReportFile, as_text
@@ -38,9 +39,13 @@ LABELS = {
     "frozen_optimum": "optimum of phase 0",
     "fresh_optimum": "optimum of each phase",
     "constant_half": "constant ½",
+    "frozen_agent": "frozen after visit 0",
+    "fresh_agents": "fresh agent in each phase",
 }
-"""The reference agents, which need no training: one optimum for the whole life, that of the phase
-just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½."""
+"""The reference agents. Three need no training: one optimum for the whole life, that of the phase
+just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½. Two
+are known by their dynamic regret only: the agent itself if it stops learning at the end of its
+first visit, and agents that start anew in each visit."""
 
 METRICS = {
     "average_performance": "average performance",
@@ -164,6 +169,8 @@ class StreamReport(ReportFile):
       regions: WD, then OOD 1, 2, …
       ood: the mean of the matrices over the shells.
       dynamic_regret: of training; None without its log.
+      reference_regret: the dynamic regret of reference agents, by their names in `LABELS`; left out
+        of the JSON where there is none.
       versions: of Python and the packages that the numbers depend on.
     """
 
@@ -181,13 +188,15 @@ class StreamReport(ReportFile):
     regions: Annotated[TupleOf[StreamRegion], Field(min_length=1)]
     ood: StreamRegion
     dynamic_regret: DynamicRegret | None = None
+    reference_regret: dict[str, DynamicRegret] = Field(default_factory=dict)
     versions: dict[str, str]
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
-        if not plain["name"]:
-            del plain["name"]
+        for field in ("name", "reference_regret"):
+            if not plain[field]:
+                del plain[field]
         return plain
 
     @property
@@ -210,6 +219,10 @@ class StreamReport(ReportFile):
     def with_dynamic_regret(self, regret: DynamicRegret) -> Self:
         """This report with the dynamic regret of the agent's training."""
         return self.model_copy(update={"dynamic_regret": regret})
+
+    def with_reference_regret(self, references: Mapping[str, DynamicRegret]) -> Self:
+        """This report with the dynamic regret of these reference agents; see `reference_regret`."""
+        return self.model_copy(update={"reference_regret": {**self.reference_regret, **references}})
 
     def with_fresh(
         self,
@@ -235,7 +248,7 @@ class StreamReport(ReportFile):
             region.model_copy(update={"agent": region.agent.with_fresh(alone[:, k])})
             for k, region in enumerate(of_each)
         ]
-        own = self.dynamic_regret
+        own, others = self.dynamic_regret, dict(self.reference_regret)
         if online_regret is not None:
             if own is None:
                 raise OptionError(
@@ -243,8 +256,15 @@ class StreamReport(ReportFile):
                     "before: report.with_dynamic_regret(…)."
                 )
             own = own.with_fresh(self.stream, online_regret)
+            life = [*online_regret] * self.stream.cycles
+            others["fresh_agents"] = expected_regret(life, self.stream)
         return self.model_copy(
-            update={"regions": tuple(regions[:-1]), "ood": regions[-1], "dynamic_regret": own}
+            update={
+                "regions": tuple(regions[:-1]),
+                "ood": regions[-1],
+                "dynamic_regret": own,
+                "reference_regret": others,
+            }
         )
 
     def __repr__(self) -> str:
@@ -255,47 +275,13 @@ class StreamReport(ReportFile):
         )
 
     def __str__(self) -> str:
-        return f"{as_text(self.table())}\n\n{as_text(self.matrix())}"
+        return "\n\n".join(map(as_text, self.tables()))
 
     def table(self) -> Table:
         """The metrics at the end of the life: a column for each region."""
-        from rich.markup import escape
+        from sme_registry.evaluation.continual import tables
 
-        from sme_registry.terminal import Table
-
-        stream, regions = self.stream, self.regions
-        regret = self.dynamic_regret
-        cost = (
-            f"; dynamic regret {regret.dynamic_regret:,.1f} over {regret.steps:,} steps"
-            if regret
-            else ""
-        )
-        table = Table(
-            f"{escape(self.policy)} on {escape(self.title)} (S={stream.state_dim}, "
-            f"A={stream.action_dim}, {len(stream.phases)} phases, {len(self.visits)} visits)\n"
-            f"{self.stream_digest}\n{regions[0].states:,} states per region{cost}",
-            {"": "name"}
-            | {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in regions},
-            caption="Performance is 1 − normalised regret: 1 optimal, 0 the constant ½.",
-        )
-        shown = {self.policy: [region.agent for region in regions]}
-        for name in regions[0].references:
-            shown[LABELS.get(name, name)] = [region.references[name] for region in regions]
-        for metric, label in METRICS.items():
-            rows = {
-                name: [retention.final(metric) for retention in each]
-                for name, each in shown.items()
-            }
-            rows = {name: values for name, values in rows.items() if None not in values}
-            if not rows:
-                continue
-            table.add_row(label, style="italic")
-            for name, values in rows.items():
-                style = "bold" if name == self.policy else None
-                cells = [f"{value:.3f}" for value in values]
-                table.add_row(f"  {escape(name)}", *cells, style=style)
-            table.add_section()
-        return table
+        return tables.of_metrics(self)
 
     def matrix(self, region: str = "WD") -> Table:
         """The retention matrix of a region: a row for each visit, a column for each phase.
@@ -303,24 +289,20 @@ class StreamReport(ReportFile):
         Raises:
           UnknownNameError: no region has this name.
         """
-        from sme_registry.terminal import Table
+        from sme_registry.evaluation.continual import tables
 
-        agent, P = self.region(region).agent, len(self.stream.phases)
-        table = Table(
-            f"Normalised regret in {region} on the task of each phase",
-            {"policy at the end of": "name"} | {f"phase {j}": "number" for j in range(P)},
-        )
-        if agent.initial_normalised_regret:
-            table.add_row("initial policy", *_cells(agent.initial_normalised_regret))
-        for visit, row in zip(self.visits, agent.normalised_regret, strict=True):
-            table.add_row(f"visit {visit.visit}: phase {visit.phase}", *_cells(row))
-        if agent.fresh_normalised_regret:
-            table.add_row("fresh agent of the phase", *_cells(agent.fresh_normalised_regret))
-        return table
+        return tables.of_matrix(self, region)
 
+    def regret(self) -> Table:
+        """The online regret of each visit, beside that of the reference agents."""
+        from sme_registry.evaluation.continual import tables
 
-def _cells(row: Iterable[float]) -> list[str]:
-    return [f"{value:.3f}" for value in row]
+        return tables.of_regret(self)
+
+    def tables(self) -> list[Table]:
+        """`table`, `matrix`, and `regret` where a dynamic regret is known."""
+        known = self.dynamic_regret or self.reference_regret
+        return [self.table(), self.matrix(), *([self.regret()] if known else [])]
 
 
 def _fresh_regrets(

@@ -13,15 +13,15 @@ at the phase's end.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.compiled import Engine, engine
 from sme_registry.envs.types import Observation
-from sme_registry.errors import PolicyError
+from sme_registry.errors import OptionError, PolicyError, UnknownNameError
 from sme_registry.evaluation.evaluate import Progress, same_draw
-from sme_registry.evaluation.policies import Policy
+from sme_registry.evaluation.policies import Policy, as_policy
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, observations
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.task import materialize_together
@@ -45,6 +45,39 @@ class Subject(NamedTuple):
 def final_specs(stream: StreamSpec) -> tuple[SMESpec, ...]:
     """The task of each phase at its end: of a drifting one the spec of its last piece."""
     return tuple({piece.phase: piece.spec for piece in stream.pieces}.values())
+
+
+def prepared(
+    policy: Any,
+    stream: StreamSpec,
+    where: str,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+) -> Policy:
+    """A policy in any form, ready for a stream's observations; see `as_policy`.
+
+    Raises:
+      As `as_policy`, the message beginning with `where`.
+    """
+    try:
+        ready = as_policy(
+            policy,
+            stream.phases[0].spec,
+            action_range=action_range,
+            algorithm=algorithm,
+            observed_phases=stream.observed_phases,
+        )
+    except (PolicyError, UnknownNameError) as error:
+        raise type(error)(f"{where}: {error}") from error.__cause__
+    assert isinstance(ready, Policy)  # streams have no teams
+    return ready
+
+
+def refuse_other_count(name: str, policies: Any, count: int, which: str) -> None:
+    """Raise OptionError unless an argument is a sequence of so many policies."""
+    if not isinstance(policies, Sequence) or isinstance(policies, str) or len(policies) != count:
+        given = f"{len(policies)} of them" if isinstance(policies, list | tuple) else repr(policies)
+        raise OptionError(f"{name}={given:.60}: must be {count} policies, one {which}.")
 
 
 def measure(
@@ -106,9 +139,8 @@ def _actions(
         yield from ((phase, optimal[acts]) for phase in subject.phases)
     elif stream.observes_phase:
         for phase in subject.phases:
-            one_hot = np.zeros((len(batch), len(stream.phases)), dtype=np.float32)
-            one_hot[:, phase] = 1.0
-            yield phase, _acted(acts, np.concatenate([batch, one_hot], axis=1), subject.where)
+            shown = acts.in_phase(phase, stream.observed_phases)
+            yield phase, _acted(shown, batch, subject.where)
     else:
         a = _acted(acts, batch.copy(), subject.where)  # a copy: a policy may write into it
         yield from ((phase, a) for phase in subject.phases)

@@ -75,6 +75,18 @@ class Policy:
         """This policy at the start of a batch of episodes; a recurrent one keeps its state."""
         return self if self.episodes is None else replace(self, act=self.episodes())
 
+    def in_phase(self, phase: int, count: int) -> Policy:
+        """This policy, given the one-hot of a phase, of so many, behind each observation."""
+        one_hot = np.eye(count, dtype=np.float32)[phase]
+
+        def shown(policy: Policy) -> Callable[[Observation], Array]:
+            return lambda o: policy(np.concatenate([o, np.tile(one_hot, (len(o), 1))], axis=1))
+
+        # `policy` has converted its actions to the unit range, and named its own errors.
+        return replace(
+            self, action_range="unit", act=shown(self), episodes=lambda: shown(self.start())
+        )
+
     def __call__(self, observations: Observation) -> Array:
         """Actions `[B, A]`, converted to the unit range but not clipped to it.
 

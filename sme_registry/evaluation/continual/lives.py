@@ -1,0 +1,156 @@
+"""The expected dynamic regret of lives in which nobody learns, without living through them.
+
+    E D = Σ over the pieces of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: steps of a piece
+
+The expectations are over episodes of a policy on the piece's task, from uniform states. They run in
+parallel, so a life costs as much as a few thousand steps. Where pieces are of whole episodes, as in
+the catalogue, E D is exact but for the sampling error; a seed makes it repeatable. With early
+termination, or a switch within an episode, what differs is the episode at a switch: the piece after
+it begins in a state that the episode before left, or a few steps later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret, dynamic_regret
+from sme_registry.evaluation.continual.retention import final_specs, prepared, refuse_other_count
+from sme_registry.evaluation.evaluate import Progress, same_draw
+from sme_registry.evaluation.policies import Policy
+from sme_registry.evaluation.references import reference_policy
+from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.io import integer_in
+from sme_registry.spec import StreamLike, StreamSpec
+from sme_registry.task import load_stream, materialize_stream
+
+EPISODES = 5000
+
+
+def expected_regret(
+    life: Sequence[Any],
+    stream: StreamLike,
+    *,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+    progress: Progress | None = None,
+) -> DynamicRegret:
+    """The expected dynamic regret of a life in which given policies act and do not learn.
+
+    Args:
+      life: for each visit the policy that acts in it, in any form that `evaluate` accepts; or a
+        number, the online regret of an agent that learned in it.
+      stream: a stream, its fields, an id, a digest or a path.
+      episodes: run with each policy, over the pieces of one cycle; each has one or more. The
+        standard error of a policy's online regret is about 0.05/√episodes.
+      seed: of the initial states, which are the same for every policy and piece.
+      action_range: as in `evaluate`, of all policies.
+      algorithm: as in `evaluate`.
+      progress: called after the episodes of each piece with the number of pieces done, and of all.
+
+    Raises:
+      UnknownNameError, SpecError: no such stream, or a field is out of range.
+      OptionError: not one policy or number for each visit, or a number outside [0, 1].
+      PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
+      MissingDependencyError: the library that loads a policy is not installed.
+      ResourceLimitError: the tasks would not fit in memory together.
+    """
+    stream = load_stream(stream)
+    P = len(stream.phases)
+    refuse_other_count("life", life, stream.cycles * P, "or number for each visit")
+    integer_in("episodes", episodes, 1)
+    integer_in("seed", seed, 0)
+    policies = _policies(life, stream, action_range, algorithm)
+    steps = np.diff([*(piece.start for piece in stream.pieces), stream.cycle_steps])
+    of_phase = [[i for i, one in enumerate(stream.pieces) if one.phase == j] for j in range(P)]
+    parts = [(each, piece) for v, each in enumerate(life) for piece in of_phase[v % P]]
+
+    # A policy acts once in each piece, in however many cycles.
+    acts = dict.fromkeys((id(each), piece) for each, piece in parts if id(each) in policies)
+    tasks = materialize_stream(stream) if acts else ()
+    means: dict[tuple[int, int], float] = {}
+    for which, piece in acts:
+        states = start_states(seed, 0, _share(episodes, steps, piece), stream.state_dim)
+        policy = policies[which]
+        if stream.observes_phase:
+            policy = policy.in_phase(stream.pieces[piece].phase, P)
+        ran = rollouts(policy, tasks[piece], states)
+        means[which, piece] = ran.per_step(ran.regret)
+        if progress is not None:
+            progress(len(means), len(acts))
+    lengths = steps[[piece for _, piece in parts]]
+    regret = [means.get((id(each), piece), each) for each, piece in parts]
+    return dynamic_regret(stream, np.cumsum(lengths), regret, lengths)
+
+
+def reference_regret(
+    stream: StreamLike,
+    *,
+    frozen: Any = None,
+    training: DynamicRegret | None = None,
+    episodes: int = EPISODES,
+    seed: int = 0,
+) -> dict[str, DynamicRegret]:
+    """The dynamic regret of the reference agents, by their names in `report.LABELS`.
+
+    Args:
+      stream: as in `expected_regret`.
+      frozen: an agent's policy at the end of its first visit, for the agent that stops learning
+        then; None leaves it out.
+      training: that agent's dynamic regret, of which the first visit is taken.
+      episodes, seed: as in `expected_regret`.
+
+    Raises:
+      OptionError: only one of `frozen` and `training`, or a training without steps in visit 0.
+      As `expected_regret`.
+    """
+    stream = load_stream(stream)
+    if (frozen is None) != (training is None):
+        raise OptionError(
+            "frozen, training: must be given together or both left out. Give the policy at the "
+            "end of the first visit and the dynamic regret of the training."
+        )
+    V = stream.cycles * len(stream.phases)
+    first = final_specs(stream)[0]
+    # No regret in the task of which it is the optimum, also where this rounds observations.
+    optimum = reference_policy("optimal", first)
+    own = [
+        phase.drift is None and same_draw(phase.spec) == same_draw(first) for phase in stream.phases
+    ]
+    lives: dict[str, list[Any]] = {
+        "frozen_optimum": [0.0 if mine else optimum for mine in own] * stream.cycles,
+        "fresh_optimum": [0.0] * V,
+        "constant_half": [reference_policy("constant_half", first)] * V,
+    }
+    if training is not None:
+        lives["frozen_agent"] = [training.visits[0].online_regret, *[frozen] * (V - 1)]
+    return {
+        name: expected_regret(life, stream, episodes=episodes, seed=seed)
+        for name, life in lives.items()
+    }
+
+
+def _policies(
+    life: Sequence[Any], stream: StreamSpec, action_range: str | None, algorithm: str | None
+) -> dict[int, Policy]:
+    """The policies of a life by their identity, prepared."""
+    policies: dict[int, Policy] = {}
+    for v, each in enumerate(life):
+        if isinstance(each, Real):
+            if not 0.0 <= float(each) <= 1.0:
+                raise OptionError(f"life[{v}]={each}: must be a policy, or a regret in [0, 1].")
+        elif id(each) not in policies:
+            policies[id(each)] = prepared(each, stream, f"life[{v}]", action_range, algorithm)
+    return policies
+
+
+def _share(episodes: int, steps: npt.NDArray[np.int64], piece: int) -> int:
+    """A piece's share in the episodes of a cycle, at least 1."""
+    return -(-episodes * int(steps[piece]) // int(steps.sum()))

@@ -1,0 +1,205 @@
+"""Lives in which nobody learns: their expected dynamic regret, and reference agents."""
+
+import numpy as np
+import pytest
+
+import sme_registry
+from sme_registry import SMESpec, materialize
+from sme_registry.errors import OptionError, PolicyError, SMEError, UnknownNameError
+from sme_registry.evaluation import (
+    Perceptron,
+    StreamReport,
+    dynamic_regret,
+    evaluate,
+    evaluate_stream,
+    expected_regret,
+    reference_policy,
+    reference_regret,
+)
+from sme_registry.evaluation.report_file import as_text
+from sme_registry.spec import StreamSpec
+
+PROTOCOL = {"states_per_region": 50, "epsilons": [0.5, 1.0]}
+SPEC = SMESpec(state_dim=3, action_dim=1, hidden_width=8, complexity=2, horizon=10)
+
+
+def stream_of(*specs, steps=50, drift=None, **fields):
+    phases = [{"spec": spec, "steps": steps} for spec in specs]
+    if drift:
+        phases[-1]["drift"] = drift
+    return StreamSpec(phases=phases, **fields)
+
+
+TWICE = stream_of(SPEC, SPEC.derive(seed=1), cycles=2)
+
+
+def network(seed, inputs=SPEC.state_dim + 2):
+    random = np.random.default_rng(seed)
+    return Perceptron([(random.normal(size=(inputs, 1)) / 2, np.full(1, 0.5), "identity")])
+
+
+def test_a_constant_action_costs_its_regret_in_uniform_states():
+    spec = SPEC.derive(r_min=0.3, k=5)
+    life = expected_regret(["constant"], stream_of(spec), episodes=4000)
+    s = np.random.default_rng(0).random((100_000, spec.state_dim))
+    expected = materialize(spec).regret(s, np.full((len(s), 1), 0.5)).mean()
+    assert life.online_regret == pytest.approx(expected, rel=0.01)
+    assert life.dynamic_regret == pytest.approx(50 * expected, rel=0.01)
+
+
+GATED = SPEC.derive(seed=1, k=5, r_min=0.3)
+TURN = {"rotation": 2.0, "increments": 3}
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [
+        stream_of(SPEC, GATED, SPEC.derive(seed=2), steps=60, drift=TURN, cycles=2),
+        stream_of(SPEC, GATED, observes_phase=True),
+        stream_of(SPEC, SPEC.derive(seed=1, D=0.1), steps=400),
+        stream_of(SPEC, SPEC.derive(seed=1), steps=205, switch="step"),
+    ],
+    ids=["drift", "observes_phase", "early termination", "switch within an episode"],
+)
+def test_expected_regret_is_the_mean_regret_of_lives(stream):
+    policies = [network(v, stream.observation_dim) for v in range(visits_of(stream))]
+    expected = expected_regret(policies, stream, episodes=4000)
+    env = sme_registry.make(stream)
+    lives = np.array([regret_by_visit(env, policies, seed) for seed in range(25)])
+    errors = lives.std(axis=0, ddof=1) / 5
+    found = [visit.dynamic_regret for visit in expected.visits]
+    assert (np.abs(found - lives.mean(axis=0)) < 4 * errors).all()
+    assert (errors < 0.05 * lives.mean(axis=0)).all()  # so that another task is another number
+    assert expected.steps == stream.steps
+    assert expected.dynamic_regret == pytest.approx(sum(found))
+
+
+def visits_of(stream):
+    return stream.cycles * len(stream.phases)
+
+
+def regret_by_visit(env, policies, seed):
+    """The regret of one life in the environment, in which the policy of each visit acts."""
+    stream = env.unwrapped.stream
+    found = np.zeros(len(policies))
+    observation, _ = env.reset(seed=seed)
+    visit, ended = 0, False
+    for lifetime in range(stream.steps):
+        if ended or stream.switch == "step":
+            phase = stream.pieces[stream.piece_at(lifetime)].phase
+            visit = lifetime // stream.cycle_steps * len(stream.phases) + phase
+        action = policies[visit](observation[None])[0].astype(np.float32)
+        observation, _, terminated, truncated, info = env.step(action)
+        found[visit] += info["regret"]
+        if ended := terminated or truncated:
+            observation, _ = env.reset()
+    return found
+
+
+def test_a_number_is_the_online_regret_of_a_visit():
+    life = expected_regret([0.5, 0.25, 0.0, 1.0], TWICE)
+    assert [visit.dynamic_regret for visit in life.visits] == [25.0, 12.5, 0.0, 50.0]
+    assert life.cumulative_regret == (25.0, 37.5, 37.5, 87.5)
+    mixed = expected_regret([0.5, network(0), network(1), 1.0], TWICE, episodes=50)
+    alone = expected_regret(
+        [network(1), network(0)], stream_of(SPEC, SPEC.derive(seed=1)), episodes=50
+    )
+    assert mixed.visits[1].dynamic_regret == alone.visits[1].dynamic_regret
+    assert mixed.visits[2].dynamic_regret == alone.visits[0].dynamic_regret
+
+
+def test_a_policy_runs_once_in_each_piece_and_is_repeatable():
+    calls, done = [], []
+
+    def counted(observations):
+        calls.append(len(observations))
+        return np.full((len(observations), 1), 0.5)
+
+    once = expected_regret([counted] * 4, TWICE, episodes=10, progress=lambda *n: done.append(n))
+    assert sum(calls) == 10 * SPEC.horizon
+    assert done == [(1, 2), (2, 2)]
+    assert once.visits[2].dynamic_regret == once.visits[0].dynamic_regret
+    assert once == expected_regret(["constant"] * 4, TWICE, episodes=10)
+    assert once != expected_regret(["constant"] * 4, TWICE, episodes=10, seed=1)
+
+
+# Reference agents
+
+
+def test_reference_agents_have_no_regret_in_the_tasks_of_which_they_are_the_optimum():
+    gated = SPEC.derive(seed=1, k=5, r_min=0.3)
+    stream = stream_of(SPEC, gated, SPEC.derive(r_min=0.5), drift=TURN, cycles=2)
+    found = reference_regret(stream, episodes=300)
+    assert found.keys() == {"frozen_optimum", "fresh_optimum", "constant_half"}
+    assert found["fresh_optimum"].dynamic_regret == 0.0
+    frozen, half = found["frozen_optimum"], found["constant_half"]
+    assert (frozen.visits[0].dynamic_regret, frozen.visits[3].dynamic_regret) == (0.0, 0.0)
+    optimum = reference_policy("optimal", SPEC)
+    acting = expected_regret([optimum] * 6, stream, episodes=300)
+    for v in (1, 2, 4, 5):
+        assert frozen.visits[v].dynamic_regret == acting.visits[v].dynamic_regret > 1.0
+    assert acting.visits[0].dynamic_regret < 1e-4  # of rounded observations
+    assert half == expected_regret(["constant"] * 6, stream, episodes=300)
+
+
+def test_the_optimum_of_a_drifting_phase_is_that_of_its_last_task():
+    found = reference_regret(stream_of(SPEC, drift=TURN), episodes=300)
+    last = reference_policy("optimal", SPEC.derive(rotation=2.0 * 2 / 3))
+    assert found["frozen_optimum"] == expected_regret(
+        [last], stream_of(SPEC, drift=TURN), episodes=300
+    )
+    assert found["frozen_optimum"].dynamic_regret > 1.0
+
+
+def test_a_frozen_agent_has_its_own_first_visit():
+    training = dynamic_regret(TWICE, [50, 100], [0.75, 0.1], 50)
+    frozen = network(0)
+    found = reference_regret(TWICE, frozen=frozen, training=training, episodes=50)["frozen_agent"]
+    acting = expected_regret([frozen] * 4, TWICE, episodes=50)
+    assert found.visits[0].dynamic_regret == 37.5 != acting.visits[0].dynamic_regret
+    assert found.visits[1:] == acting.visits[1:]
+
+
+def test_a_report_has_the_regret_of_reference_agents(tmp_path):
+    report = evaluate_stream(["linear"] * 4, TWICE, PROTOCOL, name="agent")
+    assert len(report.tables()) == 2
+    assert "reference_regret" not in report.to_dict()
+    training = dynamic_regret(TWICE, [50, 100, 150], [0.75, 0.125, 0.5], 50)
+    references = reference_regret(TWICE, episodes=50)
+    report = report.with_reference_regret(references).with_dynamic_regret(training)
+    fresh = [evaluate("linear", phase.spec, PROTOCOL) for phase in TWICE.phases]
+    report = report.with_fresh(fresh, [0.5, 0.25])
+    life = report.reference_regret["fresh_agents"]
+    assert [visit.online_regret for visit in life.visits] == [0.5, 0.25, 0.5, 0.25]
+    assert report.reference_regret["constant_half"] == references["constant_half"]
+    assert StreamReport.read(report.write(tmp_path / "stream.json")) == report
+
+    text = str(report)
+    for value in (0.75, -0.5, references["frozen_optimum"].visits[1].online_regret):
+        assert f" {value:.3f}" in text
+    assert f"{references['constant_half'].dynamic_regret:,.1f}" in text
+    assert all(label in text for label in ("fresh agent in each phase", "learning transfer"))
+    untrained = evaluate_stream(["linear"] * 4, TWICE, PROTOCOL).with_reference_regret(references)
+    assert "constant ½" in as_text(untrained.tables()[2])
+
+
+@pytest.mark.parametrize(
+    ("life", "fields", "error", "message"),
+    [
+        (["constant"], {}, OptionError, "life=1 of them: must be 4"),
+        ([0.5, 1.5, 0.5, 0.5], {}, OptionError, r"life\[1\]=1.5: must be"),
+        ([0.5, "linaer", 0.5, 0.5], {}, UnknownNameError, r"life\[1\]: .*'linear'"),
+        ([0.5, lambda o: o, 0.5, 0.5], {}, PolicyError, "policy 'policy'"),
+        (["constant"] * 4, {"episodes": 0}, OptionError, "episodes=0"),
+        (["constant"] * 4, {"seed": -1}, OptionError, "seed=-1"),
+    ],
+)
+def test_bad_input_is_refused(life, fields, error, message):
+    with pytest.raises(error, match=message):
+        expected_regret(life, TWICE, **fields)
+    assert issubclass(error, SMEError)
+
+
+def test_a_frozen_agent_needs_its_training():
+    with pytest.raises(OptionError, match="frozen, training: must be given together"):
+        reference_regret(TWICE, frozen="linear")
