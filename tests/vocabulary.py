@@ -149,6 +149,12 @@ QUANTITIES = {
     "state_shift": "Kolmogorov-Smirnov distance of the visited states from uniform",
     "exploration_sd": "SD of the exploration noise, per channel",
     "thresholds": "of verdicts, by name",
+    "best_normalised_regret": "on a phase: lowest at the end of one of its visits",
+    "final_normalised_regret": "on a phase: at the end of the life",
+    "dormant_units": "share of hidden units whose mean output is under 0.025 of their layer's mean",
+    "saturated_units": "share of hidden units of tanh whose mean output is at least 0.95",
+    "effective_rank": "singular values of the last hidden layer that make up 99 % of their sum",
+    "weight_norm": "√ of the sum of a network's squared weights",
     # Counts
     "states": "number of states",
     "states_per_region": "number of states in each region",

@@ -18,7 +18,7 @@ from sme_registry.spec import EnvFile, catalogue
 from sme_registry.terminal import err, out, print_json
 
 if TYPE_CHECKING:
-    from sme_registry.diagnosis import Diagnosis, Subject, TeamDiagnosis, TeamSubject
+    from sme_registry.diagnosis import AnyDiagnosis, AnySubject
     from sme_registry.diagnosis.views import View
 
 _JSON, _PAGE = "diagnosis.json", "diagnosis.md"
@@ -81,6 +81,8 @@ def diagnose(
     diagnosis.json, diagnosis.md and figures.
 
     Of a team, it shows who is to blame for the team's regret, and where each agent's own error is.
+    Of a life in a stream, it shows which phases were costly, forgotten or never learnt, whether
+    plasticity was lost, and the state of the network after each visit.
 
     Loading a model's .zip can run code: use only files whose author you trust.
 
@@ -97,6 +99,8 @@ def diagnose(
       sme diagnose runs/smoke --cell 3f2a91c4
 
       sme diagnose runs/Team4-PPO-seed0 --out runs/Team4-PPO-seed0/diagnosis
+
+      sme diagnose runs/Switch5-PPO-seed0 --out runs/Switch5-PPO-seed0/diagnosis
     """
     from sme_registry import diagnosis
     from sme_registry.diagnosis.views import view_of
@@ -141,7 +145,7 @@ def _subject(
     set_: list[str] | None,
     action_range: str | None,
     log: Path | None = None,
-) -> Subject | TeamSubject:
+) -> AnySubject:
     """The run, cell or policy that the arguments name."""
     from sme_registry import diagnosis
 
@@ -161,9 +165,7 @@ def _subject(
     return diagnosis.load_run(run)
 
 
-def _other_cell(
-    run: str, task: str | None, cell: str | None, against: str
-) -> Subject | TeamSubject | None:
+def _other_cell(run: str, task: str | None, cell: str | None, against: str) -> AnySubject | None:
     """The cell that --against names, as STUDY:KEY or as a key of the same study; else None."""
     from sme_registry import diagnosis
 
@@ -175,9 +177,7 @@ def _other_cell(
     return None if cell is None else diagnosis.load_cell(run, against)
 
 
-def _write(
-    result: Diagnosis | TeamDiagnosis, view: View, subject: Subject | TeamSubject, folder: Path
-) -> list[Path]:
+def _write(result: AnyDiagnosis, view: View, subject: AnySubject, folder: Path) -> list[Path]:
     figures = view.draw(folder, subject) if can_draw() else ()
     names = [path.name for path in figures if path.suffix == ".png"]
     page = write_atomically(folder / _PAGE, view.markdown(names))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import overload
+from typing import TypeAlias, overload
 
 from sme_registry.diagnosis import measure, networks, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
 from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
 from sme_registry.diagnosis.questions import THRESHOLDS
-from sme_registry.diagnosis.subject import Subject, TeamSubject
+from sme_registry.diagnosis.stream import diagnose_stream
+from sme_registry.diagnosis.stream_document import StreamDiagnosis
+from sme_registry.diagnosis.stream_subject import StreamSubject
+from sme_registry.diagnosis.subject import AnySubject, Subject, TeamSubject
 from sme_registry.diagnosis.team import diagnose_team
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.errors import OptionError
@@ -17,7 +20,9 @@ from sme_registry.evaluation.policies import Perceptron
 from sme_registry.io import integer_in, versions
 from sme_registry.task import materialize
 
-__all__ = ["EPISODES", "STATES", "diagnose"]
+__all__ = ["EPISODES", "STATES", "AnyDiagnosis", "diagnose"]
+
+AnyDiagnosis: TypeAlias = Diagnosis | TeamDiagnosis | StreamDiagnosis
 
 STATES, EPISODES = 8192, 64
 
@@ -26,7 +31,7 @@ STATES, EPISODES = 8192, 64
 def diagnose(
     subject: Subject,
     *,
-    against: Subject | TeamSubject | None = None,
+    against: AnySubject | None = None,
     probe_capacity: bool = False,
     states: int = STATES,
     episodes: int = EPISODES,
@@ -37,9 +42,22 @@ def diagnose(
 
 @overload
 def diagnose(
+    subject: StreamSubject,
+    *,
+    against: AnySubject | None = None,
+    probe_capacity: bool = False,
+    states: int = STATES,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> StreamDiagnosis: ...
+
+
+@overload
+def diagnose(
     subject: TeamSubject,
     *,
-    against: Subject | TeamSubject | None = None,
+    against: AnySubject | None = None,
     probe_capacity: bool = False,
     states: int = STATES,
     episodes: int = EPISODES,
@@ -49,28 +67,30 @@ def diagnose(
 
 
 def diagnose(
-    subject: Subject | TeamSubject,
+    subject: AnySubject,
     *,
-    against: Subject | TeamSubject | None = None,
+    against: AnySubject | None = None,
     probe_capacity: bool = False,
     states: int = STATES,
     episodes: int = EPISODES,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> Diagnosis | TeamDiagnosis:
+) -> AnyDiagnosis:
     """Measure a policy and the references, and answer every question about its regret.
 
     Of a team, it measures every agent over its own action channels, and answers who is to blame
-    for the team's regret.
+    for the team's regret. Of a life in a stream, it measures the networks at the ends of the
+    visits, and answers which phases were costly, forgotten or not learnt, and whether plasticity
+    was lost.
 
     Args:
       subject: from `load_run`, `load_cell` or `load_policy`.
       against: another run of a single agent, e.g. with a single axis changed. It is measured in
         the same way.
       probe_capacity: fit a network of the same layers to a*; tens of seconds. Ignored if the
-        policy's network is unknown. Single agents only.
+        policy's network is unknown. Single agents on one task only.
       states: uniform states, in [64, 1,000,000]; fewer are used if a state is large.
-      episodes: in [8, 10,000]; fewer are used if a state is large.
+      episodes: in [8, 10,000]; fewer are used if a state is large. None are run of a life.
       seed: of everything random here, at least 0.
       progress: called with a description of each step.
 
@@ -84,13 +104,15 @@ def diagnose(
     episodes = integer_in("episodes", episodes, 8, 10_000)
     seed = integer_in("seed", seed, 0, 2**53 - 1)
     report = progress or (lambda description: None)
-    if isinstance(subject, TeamSubject) or isinstance(against, TeamSubject):
-        if isinstance(subject, Subject) or against is not None or probe_capacity:
-            raise OptionError(
-                "against, probe_capacity: compare runs and fit networks of single agents only. "
-                "Leave them out for a team."
-            )
+    if not isinstance(subject, Subject) and against is None and not probe_capacity:
+        if isinstance(subject, StreamSubject):
+            return diagnose_stream(subject, states, seed, report)
         return diagnose_team(subject, states, episodes, seed, report)
+    if not isinstance(subject, Subject) or not isinstance(against, Subject | None):
+        raise OptionError(
+            "against, probe_capacity: compare runs and fit networks of single agents on one task "
+            "only. Leave them out for a team or a life in a stream."
+        )
     measurements = _measurements(subject, states, episodes, seed, report)
     if probe_capacity:
         probe = _probe(subject, seed, report)

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import JsonValue
 
 from sme_registry.diagnosis import networks
+from sme_registry.diagnosis.stream_subject import StreamSubject, life_in_cell, life_of_run
 from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.evaluation import Policy, TeamPolicy, as_policy, load_sb3
@@ -27,7 +28,15 @@ from sme_registry.training import episodes as episode_files
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import MODEL
 
-__all__ = ["Log", "Subject", "TeamSubject", "load_cell", "load_policy", "load_run"]
+__all__ = [
+    "AnySubject",
+    "Log",
+    "Subject",
+    "TeamSubject",
+    "load_cell",
+    "load_policy",
+    "load_run",
+]
 
 _MIN_DIGITS = 6
 
@@ -69,6 +78,9 @@ class TeamSubject:
     checkpoint_step: int | None = None
 
 
+AnySubject: TypeAlias = Subject | TeamSubject | StreamSubject
+
+
 def load_policy(
     policy: Any,
     spec: SMESpec,
@@ -98,8 +110,8 @@ def load_policy(
     return Subject(name or act.name, spec, act, {}, episodes, explore)
 
 
-def load_run(folder: str | Path) -> Subject | TeamSubject:
-    """A run of `sme train`, finished or not.
+def load_run(folder: str | Path) -> AnySubject:
+    """A run of `sme train`, finished or not; a life in a stream only when it has ended.
 
     Raises:
       OptionError: the folder holds no run, or the run has neither a model nor a checkpoint yet.
@@ -115,6 +127,11 @@ def load_run(folder: str | Path) -> Subject | TeamSubject:
         if (folder / "cells").is_dir():
             advice = f"This is the folder of a study. Add a cell: --cell {_example_key(folder)}."
         raise OptionError(f"run={str(folder)!r}: contains no run.json. {advice}")
+    name = folder.name or str(folder)
+    fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
+    plan = {field: getattr(record, field) for field in fields}
+    if record.stream is not None:
+        return life_of_run(folder, name, record, plan)
     path, checkpoint_step = folder / record.model_name, None
     if (record.independent or in_jax(record.algorithm)) and not path.exists():
         agents = "independent agents" if record.independent else "agents in JAX"
@@ -129,9 +146,7 @@ def load_run(folder: str | Path) -> Subject | TeamSubject:
             f"run={str(folder)!r}: has neither {MODEL} nor {checkpoint.FILE} yet. Wait for its "
             "first checkpoint, or continue it with `sme train … --resume`."
         )
-    spec, name = record.spec.named(record.task), folder.name or str(folder)
-    fields = ("algorithm", "hyperparameters", "seed", "action_range", "num_envs", "steps")
-    plan = {field: getattr(record, field) for field in fields}
+    spec = record.spec.named(record.task)
     if spec.team is not None:
         team = _team_policy(str(path), spec, record.action_range)
         return TeamSubject(name, spec, team, plan, checkpoint_step)
@@ -154,8 +169,8 @@ def _team_policy(policy: Any, spec: SMESpec, action_range: str | None) -> TeamPo
     return team
 
 
-def load_cell(study: str | Path, key: str) -> Subject | TeamSubject:
-    """A finished cell of a study that kept its model.
+def load_cell(study: str | Path, key: str) -> AnySubject:
+    """A finished cell of a study that kept its model; a life in a stream also without its models.
 
     Args:
       study: the study's folder.
@@ -176,10 +191,12 @@ def load_cell(study: str | Path, key: str) -> Subject | TeamSubject:
             f"cell={path.stem[:12]!r}: has a model for each agent. Train it with `sme train "
             "--independent`, and diagnose that run."
         )
-    model = _cell_model(study, path.stem, cell)
     fields = ("hyperparameters", "seed", "action_range", "steps")
     plan = {"algorithm": cell.uses, **{field: getattr(cell, field) for field in fields}}
     name = f"{cell.uses}, cell {path.stem[:12]}"
+    if cell.stream is not None:
+        return life_in_cell(study, name, path, cell, plan)
+    model = _cell_model(study, path.stem, cell)
     reference = callable(model) or isinstance(model, dict)
     action_range = None if reference else cell.action_range
     if cell.spec.team is not None:

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sme_registry.diagnosis import render, team_render
-from sme_registry.diagnosis.document import Diagnosis
+from sme_registry.diagnosis import render, stream_render, team_render
+from sme_registry.diagnosis.diagnose import AnyDiagnosis
+from sme_registry.diagnosis.stream_document import StreamDiagnosis
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class View(NamedTuple):
     draw: Callable[[Path, Any], tuple[Path, ...]]
 
 
-def view_of(diagnosis: Diagnosis | TeamDiagnosis) -> View:
+def view_of(diagnosis: AnyDiagnosis) -> View:
     """How to show a diagnosis."""
     if isinstance(diagnosis, TeamDiagnosis):
         from sme_registry.diagnosis.team_figures import draw_team
@@ -39,6 +40,14 @@ def view_of(diagnosis: Diagnosis | TeamDiagnosis) -> View:
             lambda: team_render.terminal(diagnosis),
             lambda figures: team_render.markdown(diagnosis, figures),
             lambda folder, subject: draw_team(diagnosis, folder),
+        )
+    if isinstance(diagnosis, StreamDiagnosis):
+        from sme_registry.diagnosis.stream_figures import draw_stream
+
+        return View(
+            lambda: stream_render.terminal(diagnosis),
+            lambda figures: stream_render.markdown(diagnosis, figures),
+            lambda folder, subject: draw_stream(diagnosis, folder, subject),
         )
     from sme_registry.diagnosis.figures import draw
 

@@ -235,7 +235,7 @@ def test_a_cell_of_a_study_of_teams_is_diagnosed(tmp_path: Any) -> None:
 def test_comparisons_and_probes_are_refused_for_teams() -> None:
     subject = load_policy(optimal(), SPEC)
     for options in ({"against": subject}, {"probe_capacity": True}):
-        with pytest.raises(OptionError, match="single agents only"):
+        with pytest.raises(OptionError, match="single agents on one task only"):
             diagnose(subject, **options)  # type: ignore[arg-type]
 
 

@@ -8,7 +8,7 @@ Perceptron([(W, b, "identity")])                          # a linear map
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,13 +86,18 @@ class Perceptron:
         """A, entries of an action."""
         return len(self.layers[-1][1])
 
-    def __call__(self, observations: Observation) -> Weights:
-        """Actions `[B, A]` float32, not clipped."""
+    def outputs(self, observations: Observation) -> Iterator[Weights]:
+        """The outputs `[B, out]` of each layer, in order; the last are not scaled to actions."""
         x: Weights = np.asarray(observations, np.float32)
         for W, b, activation in self.layers:
             x = x @ W
             x += b
             ACTIVATIONS[activation](x, out=x)
+            yield x
+
+    def __call__(self, observations: Observation) -> Weights:
+        """Actions `[B, A]` float32, not clipped."""
+        *_, x = self.outputs(observations)
         if self.low is None or self.high is None:
             return x
         return self.low + 0.5 * (x + 1.0) * (self.high - self.low)

@@ -1,0 +1,122 @@
+"""Lives in streams whose faults are known, and the folders that training leaves of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sme_registry import SMESpec, StreamSpec
+from sme_registry.diagnosis import StreamDiagnosis, StreamSubject, diagnose
+from sme_registry.evaluation import StreamReport, dynamic_regret, evaluate_stream, resolve_protocol
+from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.references import reference_policy
+from sme_registry.training import RunRecord, snapshots
+from sme_registry.training.sb3_models import new_sb3_model
+
+SPEC = SMESpec(state_dim=3, action_dim=2, hidden_width=8, horizon=10, complexity=2)
+PROTOCOL = {"states_per_region": 64, "epsilons": [0.5]}
+STEPS = 100  # of each phase
+
+
+def stream_of(phases: int, cycles: int = 1, **fields: Any) -> StreamSpec:
+    """Unrelated tasks of equal difficulty."""
+    specs = [{"spec": SPEC.derive(seed=seed), "steps": STEPS} for seed in range(phases)]
+    return StreamSpec(phases=specs, cycles=cycles, **fields)
+
+
+def optima(stream: StreamSpec) -> list[Any]:
+    """π* of each phase."""
+    return [reference_policy("optimal", phase.spec) for phase in stream.phases]
+
+
+def report_of(
+    policies: Sequence[Any],
+    stream: StreamSpec,
+    regret: Sequence[float] | None = None,
+    fresh_regret: Sequence[float] | None = None,
+    **options: Any,
+) -> StreamReport:
+    """The report of a life, whose visits have these online regrets."""
+    options = {"protocol": PROTOCOL, "initial": "random", "name": "agent", **options}
+    report = evaluate_stream(policies, stream, **options)
+    if regret is not None:
+        step = STEPS * np.arange(1, len(regret) + 1)
+        log = dynamic_regret(stream, step, np.array(regret), STEPS)
+        report = report.with_dynamic_regret(
+            log if fresh_regret is None else log.with_fresh(stream, fresh_regret)
+        )
+    return report
+
+
+def diagnosis_of(report: StreamReport, networks: Any = None, **options: Any) -> StreamDiagnosis:
+    subject = StreamSubject("life", report, {"algorithm": "PPO"}, networks, **options)
+    found = diagnose(subject, states=128)
+    assert isinstance(found, StreamDiagnosis)
+    return found
+
+
+def network(
+    dead: int = 0, stuck: int = 0, scale: float = 1.0, same: bool = False, inputs: int = 5
+) -> Perceptron:
+    """20 hidden units of ReLU and 20 of tanh, of which some are dead or stuck at a bound.
+
+    Args:
+      dead: units of ReLU.
+      stuck: units of tanh.
+      scale: of all weights.
+      same: whether all units of tanh do the same.
+      inputs: of the network.
+    """
+    generator = np.random.default_rng(0)
+    W = [generator.normal(size=shape) * scale for shape in ((inputs, 20), (20, 20), (20, 2))]
+    W[0] = np.abs(W[0])  # units of ReLU that are on
+    W[1] *= 0.05
+    if same:
+        W[1] = np.repeat(W[1][:, :1], 20, axis=1)
+    b = np.where(np.arange(20) < dead, -1e3, 0.0), np.where(np.arange(20) < stuck, 1e3, 0.0)
+    return Perceptron([(W[0], b[0], "relu"), (W[1], b[1], "tanh"), (W[2], np.zeros(2), "identity")])
+
+
+def model_of(uses: str, document: SMESpec | StreamSpec, seed: int = 0) -> Any:
+    """An untrained model of Stable-Baselines3."""
+    settings = {"policy_kwargs": {"net_arch": [12, 8]}}
+    return new_sb3_model(
+        uses, document, seed=seed, action_range="symmetric", hyperparameters=settings, steps=STEPS
+    )
+
+
+def write_run(folder: Path, stream: StreamSpec, uses: str = "jax:PPO") -> list[Any]:
+    """A finished run of `sme train` whose models did not learn; returns these, by visit."""
+    visits = stream.cycles * len(stream.phases)
+    models = [model_of(uses, stream, seed) for seed in range(visits + 1)]
+    kept = snapshots.Snapshots(folder / snapshots.FOLDER, stream)
+    kept.write_initial(models[visits])
+    for visit in range(visits):
+        kept.write(visit, models[visit])
+    report = report_of(
+        models[:visits], stream, [0.5] * visits, initial=models[visits], action_range="symmetric"
+    )
+    report.write(folder / "stream.json")
+    protocol = resolve_protocol(PROTOCOL)
+    RunRecord(
+        status="finished",
+        spec=stream.phases[0].spec,
+        spec_digest=stream.phases[0].spec.digest,
+        stream=stream,
+        stream_digest=stream.digest,
+        task="Mine",
+        algorithm=uses.removeprefix("jax:"),
+        seed=0,
+        action_range="symmetric",
+        num_envs=1,
+        steps=stream.steps,
+        steps_done=stream.steps,
+        checkpoint_every=1000,
+        protocol=protocol,
+        protocol_digest=protocol.digest,
+        versions={},
+    ).write(folder)
+    return models
