@@ -165,12 +165,10 @@ def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
       ResourceLimitError: the file's task would not fit in memory.
     """
     from sme_registry.spec import SMESpec, StreamSpec
-    from sme_registry.spec.resolve import names_stream
-    from sme_registry.task import load_spec, load_stream
+    from sme_registry.task import load_document, load_spec, load_stream
 
-    if kind is StreamSpec or (kind is not SMESpec and names_stream(id_or_path_or_digest)):
-        return load_stream(id_or_path_or_digest)
-    return load_spec(id_or_path_or_digest)
+    loaders: dict[Any, Any] = {SMESpec: load_spec, StreamSpec: load_stream}
+    return loaders.get(kind, load_document)(id_or_path_or_digest)
 
 
 def save(

@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import Force
+from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
 from sme_registry.terminal import Table, err, out
 from sme_registry.terminal.templates import environment
@@ -81,6 +82,7 @@ def demo(
     out().print(_stages_table(stages))
     out().print(result.report.table())
     report = write_atomically(out_folder / REPORT, _report(result, stages))
+    assert isinstance(result.report, EvaluationReport)  # of a task, not of a stream
     within = result.report.regions[0]
     out().print(
         f"\nWithin distribution: r̃ = {within.similarity:.3f}, normalised regret "

@@ -44,7 +44,7 @@ def print_training(
         record, report = result.record.to_dict(), result.report.to_dict()
         print_json({"folder": str(folder), "run": record, "evaluation": report})
         return
-    for each in (*tables, result.report.table()):
+    for each in (*tables, *result.report.tables()):
         out().print(each)
     out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
 

@@ -7,13 +7,14 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from sme_registry import load
 from sme_registry.cli.arguments import Force, Json, Out, Protocol, changes
 from sme_registry.cli.files import print_training
 from sme_registry.cli.study_plan import Jobs
 from sme_registry.cli.train_suite import refuse_fields, refuse_without_suite, train_suite
+from sme_registry.envs.arguments import another_stream
 from sme_registry.errors import OptionError
-from sme_registry.spec import EnvFile, SMESpec, SuiteFile, catalogue
+from sme_registry.spec import EnvFile, SMESpec, StreamFile, StreamSpec, SuiteFile, catalogue
+from sme_registry.task import load_document
 from sme_registry.terminal import err
 
 
@@ -23,8 +24,8 @@ def train(
         str | None,
         typer.Argument(
             metavar="TASK",
-            help="The task: a name, a path or a digest.",
-            autocompletion=catalogue.completion(EnvFile),
+            help="The task or stream: a name, a path or a digest.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
         ),
     ] = None,
     suite: Annotated[
@@ -55,8 +56,14 @@ def train(
         str | None, typer.Option(help="Of agents in JAX: cpu, gpu or tpu. Default JAX's.")
     ] = None,
     steps: Annotated[
-        int, typer.Option("--steps", "-n", help="Environment steps; for a team, of the team.")
-    ] = 20_000,
+        int | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            help="Environment steps; for a team, of the team. Default 20,000, and those of a "
+            "stream.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the algorithm and of the start states.")] = 0,
     seeds: Annotated[
         int | None,
@@ -169,7 +176,7 @@ def train(
             algorithm=algorithm,
             agents=agents,
             device=device,
-            steps=steps,
+            steps=training.DEFAULT_STEPS if steps is None else steps,
             seeds=seeds,
             folder=out_folder,
             action_range=action_range,
@@ -183,16 +190,16 @@ def train(
     refuse_without_suite(context)
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
-    spec = load(task, SMESpec).derive(**overrides)
-    algorithm = training.full_name(algorithm or training.default_algorithm(spec), agents)
+    document = _changed(load_document(task), task, overrides)
+    algorithm = training.full_name(algorithm or training.default_algorithm(document), agents)
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:
-        label = _label(task, spec, changed=bool(overrides))
+        label = _label(task, document, changed=bool(overrides))
         name = training.folder_name(algorithm)
         out_folder = Path("runs") / f"{label}-{'independent-' * independent}{name}-seed{seed}"
     try:
         result = training.train(
-            spec,
+            document,
             algorithm=algorithm,
             steps=steps,
             seed=seed,
@@ -227,10 +234,21 @@ def _split(values: dict[str, Any], path: Path | None) -> tuple[dict[str, Any], d
     return fields, {**from_file, **settings}
 
 
-def _label(task: str, spec: SMESpec, *, changed: bool) -> str:
+def _changed(
+    document: SMESpec | StreamSpec, name: str, overrides: dict[str, Any]
+) -> SMESpec | StreamSpec:
+    """A task with some fields changed; a stream has none to change."""
+    if isinstance(document, SMESpec):
+        return document.derive(**overrides)
+    for field in overrides:
+        raise OptionError(f"--set {field}: {name} is a stream. {another_stream(field)}")
+    return document
+
+
+def _label(task: str, document: SMESpec | StreamSpec, *, changed: bool) -> str:
     """A task's name in a folder's name; a changed or unnamed task is named by content."""
     if changed or task.startswith("sha256"):
-        return spec.content_name
+        return document.content_name
     return Path(task).name.removesuffix(".json").removesuffix("-v1")
 
 

@@ -71,14 +71,19 @@ def refuse_override(environment: type, name: str) -> NoReturn:
     named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
     advice = did_you_mean(name, named) or " Remove it."
     if name in SMESpec.model_fields:
-        advice = (
-            " It is a field of specs: to change it, make another stream in Python, such as "
-            f"`StreamSpec(phases=[{{'spec': phase.spec.derive({name}=…), 'steps': phase.steps}} "
-            "for phase in stream.phases])`."
-        )
+        advice = f" {another_stream(name)}"
     raise UnexpectedKeywordError(
         f"{environment.__name__}() got an unexpected keyword argument {name!r} for a stream: must "
         f"be {', '.join(named)}.{advice}"
+    )
+
+
+def another_stream(field: str) -> str:
+    """What to do in order to change a field of the specs of a stream."""
+    return (
+        "It is a field of specs: to change it, make another stream in Python, such as "
+        f"`StreamSpec(phases=[{{'spec': phase.spec.derive({field}=…), 'steps': phase.steps}} "
+        "for phase in stream.phases])`."
     )
 
 

@@ -55,6 +55,10 @@ class ReportFile(StrictModel):
     def table(self) -> Table:
         """The report as a table."""
 
+    def tables(self) -> list[Table]:
+        """All tables of the report."""
+        return [self.table()]
+
     def _repr_html_(self) -> str:
         """The table, for notebooks."""
         from sme_registry.terminal.html import table_html

@@ -38,7 +38,7 @@ from sme_registry.plots import files as plot_files
 from sme_registry.spec import ProtocolLike, SpecLike
 from sme_registry.training import known_algorithm
 from sme_registry.training.record import PACKAGES
-from sme_registry.training.run import EVALUATION
+from sme_registry.training.reports import EVALUATION
 
 RECORD = "offline.json"
 POLICY = "policy.npz"

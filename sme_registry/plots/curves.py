@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sme_registry.errors import OptionError
+from sme_registry.evaluation.continual import Visit
+from sme_registry.plots.streams import shade_visits
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -47,6 +49,7 @@ def training_curve(
     *,
     title: str = "",
     window: int | None = None,
+    visits: Sequence[Visit] = (),
     ax: Axes | None = None,
 ) -> Figure:
     """Draw the exact regret of each training episode over environment steps.
@@ -61,6 +64,7 @@ def training_curve(
       title: above a new figure.
       window: number of episodes in the median, at least 1; None for a tenth of them, at most 50,
         but all that end at one step.
+      visits: of a life in a stream, `StreamReport.visits`: a band for each, and its phase above.
       ax: the axes to draw in, without legend; None for a new figure.
 
     Returns:
@@ -74,6 +78,8 @@ def training_curve(
     with canvas(ax, (6.2, 4.0), path) as (axes,):
         draw_training(axes, step, regret, window)
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
+        if visits:
+            shade_visits(axes, visits)
         if title and ax is None:
             entitle(figure_of(axes), title)
     return figure_of(axes)

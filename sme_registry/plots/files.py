@@ -2,22 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sme_registry.evaluation import EvaluationReport
+from sme_registry.evaluation import EvaluationReport, StreamReport
+from sme_registry.evaluation.continual import Visit
 from sme_registry.plots.curves import Run, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
+from sme_registry.plots.streams import (
+    dynamic_regret_curve,
+    performance_curve,
+    plasticity_curve,
+    retention_map,
+)
 from sme_registry.plots.style import WRITTEN, save_figure
 
 _TRAINING, _DECAY, _MAP = "training_curve", "decay_curve", "similarity_map"
-FILES = tuple(f"{name}.{ending}" for name in (_TRAINING, _DECAY, _MAP) for ending in WRITTEN)
+_OF_STREAMS: dict[str, Callable[[StreamReport], Any]] = {
+    "retention_map": retention_map,
+    "performance_curve": performance_curve,
+    "dynamic_regret_curve": dynamic_regret_curve,
+    "plasticity_curve": plasticity_curve,
+}
+FILES = tuple(
+    f"{name}.{ending}" for name in (_TRAINING, _DECAY, _MAP, *_OF_STREAMS) for ending in WRITTEN
+)
 
 
-def write_training(episodes: Run, folder: Path, title: str) -> list[Path]:
+def write_training(
+    episodes: Run, folder: Path, title: str, visits: Sequence[Visit] = ()
+) -> list[Path]:
     """Write the training curve; see `training_curve` for arguments and errors."""
-    return save_figure(training_curve(episodes, title=title), folder / _TRAINING, WRITTEN)
+    figure = training_curve(episodes, title=title, visits=visits)
+    return save_figure(figure, folder / _TRAINING, WRITTEN)
+
+
+def write_stream(report: StreamReport, folder: Path) -> list[Path]:
+    """Write the figures of a life in a stream for which its report has the numbers.
+
+    Args:
+      report: of the life.
+      folder: the folder.
+
+    Raises:
+      MissingDependencyError: Matplotlib is not installed.
+      OptionError: a file cannot be written.
+    """
+    missing = {
+        "dynamic_regret_curve": report.dynamic_regret is None,
+        "plasticity_curve": report.regions[0].agent.fresh_normalised_regret is None,
+    }
+    files: list[Path] = []
+    for name, draw in _OF_STREAMS.items():
+        if not missing.get(name, False):
+            files += save_figure(draw(report), folder / name, WRITTEN)
+    return files
 
 
 def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from sme_registry.task.draw import Layer
 from sme_registry.task.loading import (
+    load_document,
     load_spec,
     load_stream,
     load_task,
@@ -16,6 +17,7 @@ __all__ = [
     "Layer",
     "Step",
     "Task",
+    "load_document",
     "load_spec",
     "load_stream",
     "load_task",

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from sme_registry.errors import FingerprintMismatchError
 from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamLike, StreamSpec, as_spec
-from sme_registry.spec.resolve import resolve, resolve_stream
+from sme_registry.spec.resolve import names_stream, resolve, resolve_stream
 from sme_registry.task import draw, memory
 from sme_registry.task.fingerprint import check_fingerprint
 from sme_registry.task.task import Task
@@ -136,6 +136,13 @@ def load_stream(stream: StreamLike) -> StreamSpec:
     if resolved.fingerprints:
         materialize_stream(resolved.stream, resolved.fingerprints)
     return resolved.stream
+
+
+def load_document(name: SpecLike | StreamLike) -> SMESpec | StreamSpec:
+    """The stream of a name, or the spec; see `load_stream` and `load_spec` for errors."""
+    if names_stream(name):
+        return load_stream(cast("StreamLike", name))
+    return load_spec(cast("SpecLike", name))
 
 
 def _draw(spec: SMESpec) -> Task:

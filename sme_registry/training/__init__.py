@@ -23,10 +23,11 @@ from sme_registry.training.hyperparameters import (
 )
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord
-from sme_registry.training.run import TrainingResult, train
+from sme_registry.training.run import DEFAULT_STEPS, TrainingResult, train
 
 __all__ = [
     "ALGORITHMS",
+    "DEFAULT_STEPS",
     "Episode",
     "RunRecord",
     "TrainingResult",

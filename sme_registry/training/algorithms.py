@@ -23,7 +23,7 @@ from typing import Any
 
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, import_object, require_packages
-from sme_registry.spec import SMESpec
+from sme_registry.spec import SMESpec, StreamSpec
 from sme_registry.spec.study import JAX, in_jax
 
 # Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
@@ -39,9 +39,10 @@ _TEAMS = 8
 _MAX_REPLAY = 1_000_000  # SB3's default
 
 
-def default_algorithm(spec: SMESpec) -> str:
+def default_algorithm(document: SMESpec | StreamSpec) -> str:
     """The algorithm used by default: TD3, and PPO for a team."""
-    return "TD3" if spec.team is None else "PPO"
+    single = isinstance(document, StreamSpec) or document.team is None
+    return "TD3" if single else "PPO"
 
 
 def default_num_envs(spec: SMESpec, algorithm: Any) -> int:

@@ -27,6 +27,8 @@ from sme_registry.training.episodes import Episode
 from sme_registry.training.learn import RunLog
 from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
 from sme_registry.training.sb3_models import new_sb3_model, set_weights
+from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
+from sme_registry.training.snapshots import Snapshots
 
 _PIECE = 100  # steps between two reports of progress, and the longest wait for Ctrl-C
 _EPISODE = "episode"  # of the checkpoint: the sums of the present episode
@@ -43,13 +45,14 @@ def new_model(record: RunRecord) -> Agent:
     """The program of a run and its model, untrained.
 
     Raises:
-      SpecError: the task is not one that JAX has, such as a team's.
+      SpecError: the task is not one that JAX has, such as a team's; or the stream, see
+        `jax.lives.check_switches`.
       OptionError: there is no such device, or a hyperparameter has no such value.
       ResourceLimitError: the program does not fit in the device's memory.
     """
     program = jax_run.new_program(
         record.algorithm,
-        [record.spec],
+        [record.document],
         [record.seed],
         hyperparameters=record.hyperparameters,
         action_range=record.action_range,
@@ -58,7 +61,7 @@ def new_model(record: RunRecord) -> Agent:
     )
     model = new_sb3_model(
         record.algorithm,
-        record.spec,
+        record.document,
         seed=record.seed,
         action_range=record.action_range,
         hyperparameters=record.hyperparameters,
@@ -112,7 +115,8 @@ def learn(
             if log.is_checkpoint_due() or program.steps >= program.budget:
                 save()
 
-        jax_run.run(program, on_log=on_log, after_piece=after_piece, piece=piece)
+        on_visit = _on_visit(agent, record, folder)
+        jax_run.run(program, on_log=on_log, on_visit=on_visit, after_piece=after_piece, piece=piece)
         _check_finite(program, folder)
     board.close()
     set_weights(model, program.weights(0), program.steps)
@@ -120,6 +124,23 @@ def learn(
         write_atomically(folder / MODEL, saved_sb3(model))
         log.record().write(folder)
     return log.record(), log.episodes, model
+
+
+def _on_visit(agent: Agent, record: RunRecord, folder: Path) -> Any:
+    """What writes the snapshots of a life in a stream; None for a task."""
+    if record.stream is None:
+        return None
+    program, model = agent
+    snapshots = Snapshots(folder / SNAPSHOTS, record.stream)
+
+    def on_visit(visit: int, weights: list[dict[str, Any]]) -> None:
+        set_weights(model, weights[0], program.steps)
+        snapshots.write(visit, model)
+
+    if program.steps == 0:
+        set_weights(model, program.weights(0), 0)
+        snapshots.write_initial(model)
+    return on_visit
 
 
 def _check_finite(program: Program, folder: Path) -> None:

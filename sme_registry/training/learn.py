@@ -30,6 +30,9 @@ from sme_registry.training.episodes import Episode, EpisodeLog
 from sme_registry.training.independent import IndependentLearners
 from sme_registry.training.learners import new_learner
 from sme_registry.training.record import MODEL, MODELS, TENSORBOARD, RunRecord
+from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
+from sme_registry.training.snapshots import Snapshots
+from sme_registry.training.visits import VisitEnds
 
 _RECENT = 20  # episodes in the running mean that the progress shows
 
@@ -44,7 +47,7 @@ def new_model(record: RunRecord) -> Any:
     if record.independent:
         return IndependentLearners(record)
     env_class = SMEVecEnv if record.spec.team is None else SMETeamVecEnv
-    env = VecMonitor(env_class(record.spec, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
+    env = VecMonitor(env_class(record.document, record.num_envs, action_range=record.action_range))  # type: ignore[arg-type, unused-ignore]
     model: Any = new_learner(
         record.algorithm,
         env,
@@ -88,24 +91,31 @@ def learn(
     first_step = int(model.num_timesteps) // lanes_of_a_step
     total = _total_steps(record, model, first_step)
     _set_loggers(model, folder / TENSORBOARD)
+    visits = _visits(model, record, folder, first_step)
     with RunLog(record, folder, first_step, total, progress, console) as log:
         if first_step < record.steps:
-            train = _train_independent if record.independent else _train
-            train(model, record, first_step, log)
+            if record.independent:
+                _train_independent(model, record, first_step, log)
+            else:
+                _train(model, record, first_step, log, visits)
             _save_checkpoint(model, log)
     for each in _models(model):
         each.logger.close()
     env.close()
+    if visits is not None:
+        visits.finish(log.record().steps_done)
     with defer_interrupts():
         _write_model(model, folder)
         log.record().write(folder)
     return log.record(), log.episodes, model.models if record.independent else model
 
 
-def _train(model: Any, record: RunRecord, first_step: int, log: RunLog) -> None:
+def _train(
+    model: Any, record: RunRecord, first_step: int, log: RunLog, visits: VisitEnds | None
+) -> None:
     model.learn(
         (record.steps - first_step) * record.agents,
-        callback=_Callback(model, log),
+        callback=_Callback(model, log, visits),
         reset_num_timesteps=first_step == 0,
     )
 
@@ -128,6 +138,16 @@ def _train_independent(
             _save_checkpoint(learners, log)
 
     learners.learn(record.steps, on_step, on_rollout)
+
+
+def _visits(model: Any, record: RunRecord, folder: Path, first_step: int) -> VisitEnds | None:
+    """What writes the snapshots of a life in a stream; None for a task."""
+    if record.stream is None:
+        return None
+    snapshots = Snapshots(folder / SNAPSHOTS, record.stream)
+    if first_step == 0:
+        snapshots.write_initial(model)
+    return VisitEnds(record.stream, lambda visit: snapshots.write(visit, model), first_step)
 
 
 def _save_checkpoint(model: Any, log: RunLog) -> None:
@@ -184,7 +204,7 @@ class RunLog:
     def __enter__(self) -> RunLog:
         self._progress.__enter__()
         self._start = time.monotonic()
-        self._note = self._running_mean()
+        self._note = self._progress_note()
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -224,7 +244,7 @@ class RunLog:
                 )
             )
         if finished:
-            self._note = self._running_mean()
+            self._note = self._progress_note()
         self._progress.update(steps, self._note)
 
     def record(self) -> RunRecord:
@@ -253,21 +273,24 @@ class RunLog:
         """Seconds of training over all sessions."""
         return self._wall_before + time.monotonic() - self._start
 
-    def _running_mean(self) -> str:
-        recent = self.episodes[-_RECENT:]
-        if not recent:
-            return ""
-        regret = np.mean([episode.regret for episode in recent])
-        whose = "team's mean regret" if self._log.agents else "mean regret"
-        return f"{whose} {regret:.3f} (last {len(recent)} episodes)"
+    def _progress_note(self) -> str:
+        """The phase of a stream, and the mean regret of the last episodes."""
+        notes, stream, recent = [], self._record.stream, self.episodes[-_RECENT:]
+        if stream is not None:
+            notes.append(f"phase {stream.pieces[stream.piece_at(self._steps)].phase}")
+        if recent:
+            regret = np.mean([episode.regret for episode in recent])
+            whose = "team's mean regret" if self._log.agents else "mean regret"
+            notes.append(f"{whose} {regret:.3f} (last {len(recent)} episodes)")
+        return ", ".join(notes)
 
 
 class _Callback(RegretCallback):
     """Logs finished episodes, saves checkpoints and updates the progress during SB3's training."""
 
-    def __init__(self, model: Any, log: RunLog) -> None:
+    def __init__(self, model: Any, log: RunLog, visits: VisitEnds | None) -> None:
         super().__init__()
-        self.model, self._log, self._logged = model, log, 0
+        self.model, self._log, self._logged, self._visits = model, log, 0, visits
 
     def _on_rollout_start(self) -> None:
         # Between rollouts the model is consistent: it has learnt from all transitions, and they are
@@ -277,6 +300,8 @@ class _Callback(RegretCallback):
 
     def _on_step(self) -> bool:
         super()._on_step()
+        if self._visits is not None:
+            self._visits.after_step(self.steps)
         self._log.add(self.steps, self.episodes[self._logged :])
         self._logged = len(self.episodes)
         return True
@@ -297,6 +322,8 @@ def _continued(model: Any, record: RunRecord, folder: Path) -> Any:
     # Another stream than the first session's, but the same whenever this session is repeated.
     sequence = np.random.SeedSequence([record.seed, model.num_timesteps])
     model.set_random_seed(int(sequence.generate_state(1)[0] >> 1))
+    if record.stream is not None:  # a seed begins a new life, here where the checkpoint was
+        model.env.set_options({"lifetime": int(model.num_timesteps)})
     return model
 
 

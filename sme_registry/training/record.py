@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -114,8 +115,8 @@ class RunRecord(StrictModel):
                 f"the run in {folder} has done. Choose more, or keep {previous.steps:,}."
             )
         fields = (
-            "spec_digest",
             "stream_digest",
+            "spec_digest",
             "algorithm",
             "seed",
             "action_range",
@@ -128,12 +129,24 @@ class RunRecord(StrictModel):
             pairs[f"hyperparameters.{name}"] = (before, value)
         for field, (before, now) in pairs.items():
             if before != now:
+                where = _difference(previous, self) if field == "stream_digest" else ""
                 raise OptionError(
-                    f"{field}={now!r}: the run in {folder} has {before!r}. Resume it with the same "
-                    "value, or train into another folder."
+                    f"{field}={now!r}: the run in {folder} has {before!r}{where}. Resume it with "
+                    "the same value, or train into another folder."
                 )
         return self.updated(
             hyperparameters=previous.hyperparameters,
             sessions=previous.sessions + 1,
             steps_done=previous.steps_done,
         )
+
+
+def _difference(one: RunRecord, other: RunRecord) -> str:
+    """Where the streams of two runs differ first; nothing where one of them has none."""
+    if one.stream is None or other.stream is None:
+        return ""
+    before, now = one.stream.to_dict(), other.stream.to_dict()
+    phases = zip_longest(before.pop("phases"), now.pop("phases"))
+    different = [f"phases.{index}" for index, (a, b) in enumerate(phases) if a != b]
+    different += [name for name in before if before[name] != now[name]]
+    return f" ({different[0]} differs)"

@@ -1,4 +1,4 @@
-"""`train`: train one algorithm on one task, with exact regret of every episode.
+"""`train`: train one algorithm on one task or stream, with exact regret of every episode.
 
 The folder of a run, which `resume` continues after an interruption, and of which one process at a
 time writes the files:
@@ -8,6 +8,8 @@ time writes the files:
     model.zip         the trained model, of Stable-Baselines3, also where it was trained in JAX
     model/            instead: one model for each agent of a team, `<agent>.zip`
     evaluation.json   its evaluation
+    stream.json       instead, of a life in a stream: what it retained and what it cost
+    snapshots/        and its models at the end of each visit (`snapshots`)
     *.png, *.pdf      figures, if matplotlib is installed
     tensorboard/      if TensorBoard is installed
 """
@@ -24,22 +26,28 @@ from typing import Any, Literal
 from rich.console import Console
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation import EvaluationReport, evaluate, resolve_protocol
+from sme_registry.evaluation import EvaluationReport, StreamReport, resolve_protocol
 from sme_registry.io import (
     Lock,
     choice,
     claim_folder,
     file_lock,
     integer_in,
-    is_installed,
     is_locked,
 )
-from sme_registry.plots import files as plot_files
-from sme_registry.spec import ACTION_RANGES, ActionRange, ProtocolLike, SpecLike
+from sme_registry.spec import (
+    ACTION_RANGES,
+    ActionRange,
+    ProtocolLike,
+    SMESpec,
+    SpecLike,
+    StreamLike,
+    StreamSpec,
+    catalogue,
+)
 from sme_registry.spec.study import in_jax
-from sme_registry.task import load_spec, materialize
-from sme_registry.terminal.progress import Progress
-from sme_registry.training import checkpoint
+from sme_registry.task import load_document, materialize, materialize_stream
+from sme_registry.training import checkpoint, reports
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
     default_algorithm,
@@ -49,21 +57,21 @@ from sme_registry.training.algorithms import (
     one_thread,
     quiet,
     require_sb3,
-    short_name,
 )
 from sme_registry.training.episodes import Episode
 from sme_registry.training.hyperparameters import for_lanes, nested_hyperparameters, refuse_unknown
 from sme_registry.training.record import MODEL, MODELS, RECORD, TENSORBOARD, RunRecord, versions_for
+from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
 
-EVALUATION = "evaluation.json"
 REPORT = "report.md"  # written by `sme demo`
 _FILES = (
-    RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, EVALUATION,
-    *plot_files.FILES, REPORT, TENSORBOARD,
+    RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
+    REPORT, TENSORBOARD,
 )  # fmt: skip
 
 _LOCK = ".lock"  # held by the process that trains; the file stays
 MAX_STEPS = 10**10
+DEFAULT_STEPS = 20_000
 _CHECKPOINTS = 20
 _MIN_STEPS_BETWEEN_CHECKPOINTS = 1_000
 
@@ -75,7 +83,7 @@ class TrainingResult:
     folder: Path
     record: RunRecord  # the content of `run.json`
     episodes: tuple[Episode, ...] = field(repr=False)  # the content of `episodes.csv`
-    report: EvaluationReport  # of the final model
+    report: EvaluationReport | StreamReport  # of the final model, or of the life in a stream
     figures: tuple[Path, ...]  # empty if matplotlib is not installed
 
     @property
@@ -89,10 +97,10 @@ class TrainingResult:
 
 
 def train(
-    spec: SpecLike,
+    spec: SpecLike | StreamLike,
     *,
     algorithm: str | None = None,
-    steps: int = 20_000,
+    steps: int | None = None,
     seed: int = 0,
     folder: str | os.PathLike[str],
     hyperparameters: Mapping[str, Any] | None = None,
@@ -120,13 +128,17 @@ def train(
     Episodes logged after the checkpoint are dropped. In JAX the checkpoint holds everything, and
     the resumed run is the uninterrupted one, bit for bit on the same device and versions.
 
+    On a stream the agent lives through all phases, and `folder/snapshots` keeps its model at the
+    end of each visit. A resumed life goes on at the step of its checkpoint.
+
     Args:
-      spec: the task: a spec, its fields, an id, a digest or a path.
+      spec: the task or the stream: a document, its fields, an id, a digest or a path.
       algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; "module:Class", such as
         "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); "jax:PPO", "jax:TD3"
         or "jax:SAC" in JAX; None takes TD3, and PPO for a team.
-      steps: environment steps over all environments, at least 1. One step of a team is a step of
-        all its n agents and gives n transitions. PPO and A2C finish their last rollout.
+      steps: environment steps over all environments, at least 1; None takes 20,000, and those of
+        a stream, which must not be others. One step of a team is a step of all its n agents and
+        gives n transitions. PPO and A2C finish their last rollout.
       seed: of the algorithm and of the environment's starts, in [0, 2**32 - num_envs].
       folder: output folder, created if it is missing.
       hyperparameters: those that differ from the algorithm's defaults, as JSON values, such as
@@ -135,7 +147,7 @@ def train(
         observations and rewards; otherwise they share one. For on-policy algorithms.
       action_range: of the policy's actions, "symmetric" [−1, 1] or "unit" [0, 1].
       num_envs: environments (or teams) stepped in parallel, in [1, 4096]; None takes 1, and 8 for a
-        team and an on-policy algorithm.
+        team and an on-policy algorithm. 1 on a stream.
       checkpoint_every: steps between checkpoints; None takes a twentieth of `steps`, at least
         1,000.
       protocol: of the final evaluation.
@@ -153,7 +165,8 @@ def train(
       The finished run.
 
     Raises:
-      UnknownNameError, SpecError: no such task, algorithm or protocol, or a field is out of range.
+      UnknownNameError, SpecError: no such task, algorithm or protocol, or a field is out of range;
+        or a stream that agents in JAX cannot live through.
       OptionError: another argument is out of range; or the folder contains another run, a finished
         run, no run to resume or other files, is in use by another process, or is not writable.
       PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer (JAX).
@@ -171,7 +184,8 @@ def train(
     )
     with quiet():
         plan = _with_algorithm(plan, algorithm, agents, num_envs, hyperparameters or {}, device)
-    materialize(plan.spec)  # fails before the folder is created
+    # Fails before the folder is created.
+    materialize(plan.spec) if plan.stream is None else materialize_stream(plan.stream)
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread():
@@ -185,16 +199,18 @@ def train(
                 _remove_run(folder)
             record.write(folder)
             record, episodes, model = training.learn(model, record, folder, progress, console)
-            report, figures = _evaluate(model, record, folder, progress, console)
+            report, figures = reports.write_report(
+                model, record, episodes, folder, progress, console
+            )
             record = record.updated(status="finished")
             record.write(folder)
     return TrainingResult(folder, record, tuple(episodes), report, figures)
 
 
 def _plan(
-    task: SpecLike,
+    task: SpecLike | StreamLike,
     *,
-    steps: int,
+    steps: int | None,
     seed: int,
     action_range: ActionRange,
     checkpoint_every: int | None,
@@ -202,13 +218,15 @@ def _plan(
     independent: bool,
 ) -> RunRecord:
     """The record of a new run, still without its algorithm."""
-    spec = load_spec(task)
+    document = load_document(task)
+    stream = document if isinstance(document, StreamSpec) else None
+    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
     if independent and spec.team is None:
         raise OptionError(
             "independent=True: must be False for a task of a single agent. Leave it out, or give a "
             "team, such as Team4."
         )
-    steps = integer_in("steps", steps, 1, MAX_STEPS)
+    steps = _steps(document, steps)
     if checkpoint_every is None:
         checkpoint_every = max(_MIN_STEPS_BETWEEN_CHECKPOINTS, steps // _CHECKPOINTS)
     choice("action_range", action_range, ACTION_RANGES)
@@ -217,7 +235,9 @@ def _plan(
         status="running",
         spec=spec,
         spec_digest=spec.digest,
-        task=spec.name,
+        stream=stream,
+        stream_digest="" if stream is None else stream.digest,
+        task=document.name,
         algorithm="",
         seed=integer_in("seed", seed, 0, 2**32 - 1),
         action_range=action_range,
@@ -230,6 +250,19 @@ def _plan(
         protocol_digest=resolved_protocol.digest,
         versions={},
     )
+
+
+def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
+    """The steps of a run; those of a stream are its own."""
+    if isinstance(document, SMESpec):
+        return integer_in("steps", DEFAULT_STEPS if steps is None else steps, 1, MAX_STEPS)
+    if steps not in (None, document.steps):
+        raise OptionError(
+            f"steps={steps!r}: must be {document.steps:,}, since an agent lives through the whole "
+            f"stream {catalogue.title(document)}. Leave it out, or make another stream, whose "
+            "phases have other steps."
+        )
+    return integer_in("steps", document.steps, 1, MAX_STEPS, advice="Make a shorter stream.")
 
 
 def _with_algorithm(
@@ -255,6 +288,11 @@ def _with_algorithm(
     if num_envs is None:
         num_envs = default_num_envs(plan.spec, algorithm)
     num_envs = integer_in("num_envs", num_envs, 1, 4096)
+    if plan.stream is not None and num_envs > 1:
+        raise OptionError(
+            f"num_envs={num_envs}: must be 1 on a stream, since each environment would live a life "
+            "of its own. Leave it out."
+        )
     integer_in("seed", plan.seed, 0, 2**32 - num_envs)
     return plan.updated(
         algorithm=uses,
@@ -352,31 +390,7 @@ def _in_use(folder: Path) -> OptionError:
 
 def _remove_run(folder: Path) -> None:
     for name in _FILES:
-        if name in (MODELS, TENSORBOARD):
+        if name in (MODELS, SNAPSHOTS, TENSORBOARD):
             shutil.rmtree(folder / name, ignore_errors=True)
         else:
             (folder / name).unlink(missing_ok=True)
-
-
-def _evaluate(
-    model: Any, record: RunRecord, folder: Path, progress: bool, console: Console | None
-) -> tuple[EvaluationReport, tuple[Path, ...]]:
-    """Evaluate the trained model; write its report and the figures of the run."""
-    states = record.protocol.states_per_region * len(record.protocol.edges)
-    with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
-        report = evaluate(
-            model,
-            record.spec,
-            record.protocol,
-            action_range=record.action_range,
-            name=f"{'independent ' * record.independent}{short_name(record.algorithm)}",
-            progress=lambda done, total: bar.update(done),
-        )
-    report.write(folder / EVALUATION)
-    figures: list[Path] = []
-    if is_installed("matplotlib"):
-        if record.episodes:
-            title = f"{report.policy} on {report.title}"
-            figures += plot_files.write_training(folder / episode_files.FILE, folder, title)
-        figures += plot_files.write_evaluation(report, folder, model)
-    return report, tuple(figures)

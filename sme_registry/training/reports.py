@@ -1,0 +1,130 @@
+"""`write_report`: the evaluation of a finished run, its file and its figures.
+
+A run on a task has an `EvaluationReport` of its trained model. A life in a stream has a
+`StreamReport` of its snapshots, with the dynamic regret of its episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from sme_registry.evaluation import (
+    EvaluationReport,
+    StreamReport,
+    dynamic_regret,
+    evaluate,
+    evaluate_stream,
+    reference_regret,
+)
+from sme_registry.evaluation.evaluate import Progress as OnBatch
+from sme_registry.io import is_installed
+from sme_registry.plots import files as plot_files
+from sme_registry.plots.streams import FILE as STREAM
+from sme_registry.spec import StreamSpec
+from sme_registry.terminal.progress import Progress
+from sme_registry.training import episodes as episode_files
+from sme_registry.training import snapshots
+from sme_registry.training.algorithms import short_name
+from sme_registry.training.episodes import Episode
+from sme_registry.training.record import RunRecord
+
+EVALUATION = "evaluation.json"
+FILES = (EVALUATION, STREAM, *plot_files.FILES)
+
+
+def write_report(
+    model: Any,
+    record: RunRecord,
+    episodes: Sequence[Episode],
+    folder: Path,
+    progress: bool,
+    console: Console | None,
+) -> tuple[EvaluationReport | StreamReport, tuple[Path, ...]]:
+    """Evaluate a finished run; write its report, and its figures if Matplotlib is installed.
+
+    Args:
+      model: the trained model.
+      record: of the run.
+      episodes: all its finished episodes.
+      folder: its folder, which for a life in a stream holds its snapshots.
+      progress: whether to show progress.
+      console: where.
+
+    Returns:
+      The report and the paths of the figures.
+
+    Raises:
+      PolicyError: actions of the model are invalid, or a snapshot is missing or damaged.
+      OptionError: a file cannot be written.
+    """
+    states = record.protocol.states_per_region * len(record.protocol.edges)
+    with Progress("evaluating", states, console=console, unit="states", enabled=progress) as bar:
+
+        def on_batch(done: int, total: int) -> None:
+            bar.update(done)
+
+        if record.stream is not None:
+            report = _evaluate_life(record, record.stream, episodes, folder, on_batch)
+            report.write(folder / STREAM)
+            return report, _draw_life(report, episodes, folder)
+        evaluated = evaluate(
+            model,
+            record.spec,
+            record.protocol,
+            action_range=record.action_range,
+            name=f"{'independent ' * record.independent}{short_name(record.algorithm)}",
+            progress=on_batch,
+        )
+    evaluated.write(folder / EVALUATION)
+    return evaluated, _draw(evaluated, episodes, folder, model)
+
+
+def _evaluate_life(
+    record: RunRecord,
+    stream: StreamSpec,
+    episodes: Sequence[Episode],
+    folder: Path,
+    on_batch: OnBatch,
+) -> StreamReport:
+    files = snapshots.Snapshots(folder / snapshots.FOLDER, stream)
+    report = evaluate_stream(
+        files.visits,
+        stream,
+        record.protocol,
+        initial=files.initial,
+        action_range=record.action_range,
+        name=short_name(record.algorithm),
+        progress=on_batch,
+    )
+    if not episodes:
+        return report
+    step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)
+    log = dynamic_regret(stream, step, regret, length)
+    references = reference_regret(stream, frozen=files.visits[0], training=log)
+    return report.with_dynamic_regret(log).with_reference_regret(references)
+
+
+def _draw(
+    report: EvaluationReport, episodes: Sequence[Episode], folder: Path, model: Any
+) -> tuple[Path, ...]:
+    if not is_installed("matplotlib"):
+        return ()
+    figures: list[Path] = []
+    if episodes:
+        title = f"{report.policy} on {report.title}"
+        figures += plot_files.write_training(folder / episode_files.FILE, folder, title)
+    return (*figures, *plot_files.write_evaluation(report, folder, model))
+
+
+def _draw_life(report: StreamReport, episodes: Sequence[Episode], folder: Path) -> tuple[Path, ...]:
+    if not is_installed("matplotlib"):
+        return ()
+    figures: list[Path] = []
+    if episodes:
+        title, log = f"{report.policy} on {report.title}", folder / episode_files.FILE
+        figures += plot_files.write_training(log, folder, title, report.visits)
+    return (*figures, *plot_files.write_stream(report, folder))
