@@ -229,13 +229,13 @@ def print_status(status: StudyStatus, json: bool) -> None:
     from sme_registry.studies.engine.jobs import available_cores
     from sme_registry.studies.engine.status import STATES
 
-    algorithms = unique(cell.planned.algorithm for cell in status.cells)
+    algorithms = unique(cell.planned.algorithm for cell in status.places)
     title = f"[bold]{status.file.versioned_name}[/] in {escape(str(status.folder))}"
     columns = {"class": "name", **{escape(name): "number" for name in algorithms}}
     counts = status.counts
     rows = (
         (class_name, *(_counts(counts.get((class_name, name))) for name in algorithms))
-        for class_name in unique(cell.planned.class_name for cell in status.cells)
+        for class_name in unique(cell.planned.class_name for cell in status.places)
     )
     out().print(Table(title, columns, rows))
     out().print("done · [cyan]+ running[/] · [red]! failed[/] · [dim]/ all[/]")

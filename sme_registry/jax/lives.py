@@ -148,10 +148,7 @@ def _check_alike(lanes: Sequence[Lane]) -> None:
 
 def _switches(lane: Lane) -> Any:
     """What streams of one program have in common; None for a task."""
-    if isinstance(lane, SMESpec):
-        return None
-    starts = [(piece.phase, piece.start) for piece in lane.pieces]
-    return starts, lane.cycle_steps, lane.cycles, lane.switch, lane.observes_phase
+    return lane.switches if isinstance(lane, StreamSpec) else None
 
 
 def _tasks(lane: Lane) -> tuple[Task, ...]:

@@ -235,6 +235,12 @@ class StreamSpec(NamedDocument):
         """`piece_at` and `next_switch`, without the cost of finding the pieces at each call."""
         return Schedule(_pieces(self.phases)[1], self.cycle_steps, self.cycles)
 
+    @property
+    def switches(self) -> tuple[Any, ...]:
+        """When its tasks change, and how: equal for all draws of a stream, whatever its tasks."""
+        pieces = tuple((piece.phase, piece.start) for piece in self.pieces)
+        return pieces, self.cycle_steps, self.cycles, self.switch, self.observes_phase
+
     def piece_at(self, lifetime: int) -> int:
         """The index of the piece in force after so many environment steps; the last one at the end.
 

@@ -152,6 +152,12 @@ class Cell(Document):
             for phase in self.stream.phases
         )
 
+    @property
+    def specs(self) -> tuple[SMESpec, ...]:
+        """The task, or those of the stream's phases."""
+        stream = self.stream
+        return (self.spec,) if stream is None else tuple(phase.spec for phase in stream.phases)
+
 
 class PlannedCell(StrictModel):
     """A cell and its place in the plan.

@@ -65,6 +65,7 @@ class MonitoredVecEnv(LanesVecEnv):
     Attributes:
       steps: environment steps taken so far.
       regret: sum of their regret.
+      info: of the last step; empty before the first.
       seconds: CPU time of this thread spent in them.
       after_step: called with `steps` after each step; its time is not in `seconds`. An exception
         that it raises ends the training.
@@ -80,6 +81,7 @@ class MonitoredVecEnv(LanesVecEnv):
             self._env = SMEEnv(document, action_range=action_range)
         super().__init__([self._env])
         self.steps, self.regret, self.seconds = 0, 0.0, 0.0
+        self.info: dict[str, Any] = {}
         self.after_step: Callable[[int], None] = lambda steps: None
 
     def reset(self) -> Observation:
@@ -93,7 +95,7 @@ class MonitoredVecEnv(LanesVecEnv):
         """One step; see `SMEVecEnv.step_wait`."""
         begun = time.thread_time()
         observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
-        self.regret += info["regret"]
+        self.regret, self.info = self.regret + info["regret"], info
         ended = terminated or truncated
         info["TimeLimit.truncated"] = truncated and not terminated
         if ended:

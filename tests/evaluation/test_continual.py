@@ -25,7 +25,7 @@ from sme_registry.evaluation import (
     fresh_per_phase,
     frozen_after_first,
 )
-from sme_registry.evaluation.continual import metrics
+from sme_registry.evaluation.continual import RegretBlocks, metrics
 from sme_registry.evaluation.continual.retention import final_specs
 from sme_registry.spec import StreamSpec
 
@@ -336,6 +336,40 @@ def test_invalid_regret_of_fresh_agents_is_refused(online, message):
 def test_an_invalid_log_is_refused(columns, message):
     with pytest.raises(OptionError, match=message):
         dynamic_regret(THREE, *columns)
+
+
+@pytest.mark.parametrize("fields", [{}, {"switch": "step"}, {"cycles": 1}])
+def test_blocks_of_a_life_give_the_regret_of_its_single_steps(fields):
+    """With early termination, phases shorter than an episode, and steps after the last visit."""
+    fields = {"cycles": 2, **fields}
+    specs = [SPEC, SPEC.derive(seed=1, D=0.3), SPEC.derive(k=5)]
+    phases = [
+        {"spec": spec, "steps": steps} for spec, steps in zip(specs, (700, 5, 605), strict=True)
+    ]
+    stream = StreamSpec(phases=phases, **fields)
+    env = sme_registry.make(stream)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rows = []
+    for _ in range(stream.steps + 30):
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        rows.append((info["lifetime"], info["regret"], info["phase"]))
+        if terminated or truncated:
+            env.reset()
+    lifetime, regret, phase = map(np.array, zip(*rows, strict=True))
+    blocks = RegretBlocks(stream, 2)
+    for begin in range(0, len(rows), 97):
+        part = slice(begin, begin + 97)
+        both = np.stack([np.zeros_like(regret[part]), regret[part]], axis=1)
+        blocks.add(lifetime[part][-1], both, phase[part])
+    found = blocks.dynamic_regret(1)
+    expected = dynamic_regret(stream, lifetime, regret, phase=phase)
+    assert [visit.steps for visit in found.visits] == [visit.steps for visit in expected.visits]
+    sums = [[visit.dynamic_regret for visit in each.visits] for each in (found, expected)]
+    np.testing.assert_allclose(*sums, atol=1e-9)
+    assert found.dynamic_regret == pytest.approx(expected.dynamic_regret)
+    assert blocks.dynamic_regret(0).dynamic_regret == 0.0
+    assert len(blocks.steps) <= 1000 < len(rows)
 
 
 # Reports

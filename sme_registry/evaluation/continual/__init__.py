@@ -11,6 +11,7 @@ from sme_registry.evaluation.continual.evaluate import (
     frozen_after_first,
 )
 from sme_registry.evaluation.continual.lives import expected_regret, reference_regret
+from sme_registry.evaluation.continual.regret_blocks import RegretBlocks
 from sme_registry.evaluation.continual.report import (
     Retention,
     StreamRegion,
@@ -21,6 +22,7 @@ from sme_registry.evaluation.continual.seeds import across_seeds
 
 __all__ = [
     "DynamicRegret",
+    "RegretBlocks",
     "Retention",
     "StreamRegion",
     "StreamReport",

@@ -138,9 +138,9 @@ def dynamic_regret(
     if spec.switch == "step":
         steps, by_visit = _divided(spec, ends, lengths, sums)
     else:
-        visits = _visit_at(spec, ends - lengths)
+        visits = visit_at(spec, ends - lengths)
         if phase is not None:
-            visits = _in_force(spec, visits, phase)
+            visits = visits_in_force(spec, visits, phase)
         steps = np.bincount(visits, lengths).astype(np.float64)
         by_visit = np.bincount(visits, sums).astype(np.float64)
     cumulative = np.cumsum(sums)
@@ -177,7 +177,7 @@ def _is_over(stream: StreamSpec, visit: VisitRegret) -> bool:
     return visit.steps > stream.phases[visit.phase].steps - stream.horizon
 
 
-def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
+def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
     """`[N]` the visits to which lifetimes belong; the last visit goes on at the end."""
     ends = np.cumsum([phase.steps for phase in stream.phases])
     cycle, inside = np.divmod(lifetime, stream.cycle_steps)
@@ -185,7 +185,7 @@ def _visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
     return np.asarray(np.minimum(visits, stream.cycles * len(ends) - 1))
 
 
-def _in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
+def visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
     """`[N]` visits in force: the latest one of each row's phase that has begun."""
     phases = _column("phase", phase, len(visits)).astype(np.int64)
     P = len(stream.phases)
@@ -202,7 +202,7 @@ def _divided(
     stream: StreamSpec, ends: _Integers, lengths: _Integers, sums: Array
 ) -> tuple[Array, Array]:
     """Steps and regret of each visit, rows divided in proportion where a switch lies in them."""
-    reached = int(_visit_at(stream, ends[-1:] - 1)[0]) + 1
+    reached = int(visit_at(stream, ends[-1:] - 1)[0]) + 1
     bounds = np.concatenate([[0], visit_ends(stream, reached - 1), ends[-1:]])
     at = np.stack([ends - lengths, ends], axis=1).ravel()
 

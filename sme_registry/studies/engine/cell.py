@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from sme_registry.errors import PolicyError
-from sme_registry.evaluation import Policy, TeamPolicy, as_policy, evaluate
+from sme_registry.evaluation import (
+    EvaluationReport,
+    Policy,
+    StreamReport,
+    TeamPolicy,
+    as_policy,
+    evaluate,
+)
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states
 from sme_registry.io import write_atomically
@@ -25,10 +32,10 @@ from sme_registry.studies.engine.algorithms import find_algorithm, reference_nam
 from sme_registry.studies.engine.checks import refuse_of_reference
 from sme_registry.studies.engine.jobs import Lanes
 from sme_registry.studies.engine.lanes import run_lanes
+from sme_registry.studies.engine.life import Life, TasksInForce
 from sme_registry.studies.engine.offline_cell import offline_name, run_offline
-from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
-from sme_registry.studies.engine.training import training
-from sme_registry.task import materialize
+from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing, report_field
+from sme_registry.studies.engine.training import Training, training
 from sme_registry.training.algorithms import one_thread, quiet
 from sme_registry.training.record import versions_for
 
@@ -47,7 +54,8 @@ def run_cell(
     Args:
       cell: the cell to run.
       progress: called after each step with the steps done and the steps in all.
-      model_path: where to save the trained model, if it has a `save` method.
+      model_path: where to save the trained model, if it has a `save` method. Of a life in a
+        stream, the folder of the same name without suffix gets those at the ends of its visits.
 
     Returns:
       The result. Its times are CPU seconds of this thread, so that other jobs on the machine do
@@ -73,18 +81,22 @@ def run_cell(
         find_algorithm(cell.uses)  # refuse an unknown one before anything is loaded
     recorder = _Recorder(cell, progress)
     with quiet(), contextlib.nullcontext() if reference else one_thread():
+        learned: Policy | TeamPolicy | Life
         if reference:
-            policy = _evaluate_reference(cell, reference, recorder)
+            learned = _evaluate_reference(cell, reference, recorder)
         else:
-            policy = _train(cell, recorder, model_path)
+            learned = _train(cell, recorder, model_path)
         evaluation_start = time.thread_time()
-        report = evaluate(policy, cell.spec, cell.protocol, name=cell.uses)
+        if isinstance(learned, Life):
+            report: EvaluationReport | StreamReport = learned.report()
+        else:
+            report = evaluate(learned, cell.spec, cell.protocol, name=cell.uses)
         recorder.evaluation_seconds += time.thread_time() - evaluation_start
     return CellResult(
         key=cell.digest,
         cell=cell,
         curve=recorder.curve(),
-        report=report,
+        **report_field(report),
         **recorder.online_regret(),
         timing=recorder.timing(time.thread_time() - start),
         versions=versions_for(cell.uses),
@@ -97,12 +109,14 @@ def _run_alone(cell: Cell, progress: ReportSteps, model_path: Path | None) -> Ce
     def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
         progress(done, total)
 
-    ((_, ended, model),) = run_lanes((cell,), Lanes(1), report, model_path is not None)
-    if isinstance(ended, PolicyError):
-        raise ended
-    if model_path is not None and model is not None:
-        write_atomically(model_path, model)
-    return ended
+    (lane,) = run_lanes((cell,), Lanes(1), report, model_path is not None)
+    if isinstance(lane.ended, PolicyError):
+        raise lane.ended
+    if model_path is not None and lane.model is not None:
+        for name, snapshot in lane.snapshots.items():
+            write_atomically(model_path.with_suffix("") / name, snapshot)
+        write_atomically(model_path, lane.model)
+    return lane.ended
 
 
 class _Recorder:
@@ -110,11 +124,11 @@ class _Recorder:
 
     def __init__(self, cell: Cell, progress: ReportSteps) -> None:
         self._cell, self._progress = cell, progress
-        self._task = materialize(cell.spec)
+        self._tasks = TasksInForce(cell.document)
         n = cell.evaluations
         self.due = [round(cell.steps * k / n) for k in range(1, n + 1)]
         self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
-        self._agents = () if cell.spec.team is None else self._task.names
+        self._agents = () if cell.spec.team is None else self._tasks.after(0).names
         self.steps, self.regret = 0, 0.0
         self.agents_regret = np.zeros(len(self._agents))
         self.agents_rows: list[list[float]] = []  # the regret of each agent in an evaluation
@@ -137,7 +151,7 @@ class _Recorder:
         states = start_states(
             cell.seed, len(self.rows), cell.evaluation_episodes, cell.spec.state_dim
         )
-        done = rollouts(policy, self._task, states)
+        done = rollouts(self._tasks.shown_to(policy, steps), self._tasks.after(steps), states)
         self.rows.append(
             (
                 steps,
@@ -193,21 +207,38 @@ def _evaluate_reference(cell: Cell, reference: str, recorder: _Recorder) -> Poli
     return policy
 
 
-def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy | TeamPolicy:
+def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy | TeamPolicy | Life:
     """Train the cell's learner, and evaluate it whenever an evaluation is due."""
     run = training(cell)
+    life = None
+    if cell.stream is not None:
+        life = Life(cell, run, model_path and model_path.with_suffix(""))
+    _learn(cell, run, recorder, life)
+    while len(recorder.rows) < cell.evaluations:
+        recorder.evaluate(run.env.steps, run.policy())
+    if model_path is not None:
+        run.save(model_path)
+    if life is None:
+        return run.policy()
+    life.finish(run.env.steps)
+    return life
+
+
+def _learn(cell: Cell, run: Training, recorder: _Recorder, life: Life | None) -> None:
     env = run.env
 
-    def evaluate_now(steps: int) -> None:
-        recorder.evaluate(steps, run.policy())
-
-    def after_step(steps: int) -> None:
+    def evaluate_due(steps: int) -> None:
         while recorder.is_due(steps):
-            evaluate_now(steps)
+            recorder.evaluate(steps, run.policy())
         recorder.report(steps)
 
+    def after_step(steps: int) -> None:
+        if life is not None:
+            life.after_step(steps)
+        evaluate_due(steps)
+
     env.after_step = after_step
-    after_step(0)
+    evaluate_due(0)
     start, evaluating = time.thread_time(), recorder.evaluation_seconds
     if cell.steps:
         run.learn()
@@ -221,8 +252,3 @@ def _train(cell: Cell, recorder: _Recorder, model_path: Path | None) -> Policy |
     recorder.agents_regret = getattr(env, "agents_regret", recorder.agents_regret)
     recorder.environment_seconds = env.seconds
     recorder.training_seconds = learning - env.seconds
-    while len(recorder.rows) < cell.evaluations:
-        evaluate_now(env.steps)
-    if model_path is not None:
-        run.save(model_path)
-    return run.policy()

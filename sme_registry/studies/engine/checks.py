@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, SpecError
 from sme_registry.offline.hyperparameters import resolve_hyperparameters
 from sme_registry.spec import Cell, StudyAlgorithm
 from sme_registry.spec.study import in_jax
@@ -74,12 +74,23 @@ def check_task(cell: Cell) -> None:
     """Check that the algorithm of a cell has such tasks, where that depends on more than a team.
 
     Raises:
-      SpecError: JAX does not have one of the fields.
+      SpecError: JAX does not have one of the fields, or agents in JAX cannot live in the stream.
     """
-    if in_jax(cell.uses):
-        from sme_registry.jax.task import check_supported
+    if not in_jax(cell.uses):
+        return
+    from sme_registry.jax.task import check_supported
 
+    if cell.stream is None:
         check_supported(cell.spec)
+        return
+    from sme_registry.jax.lives import check_switches
+
+    for index, phase in enumerate(cell.stream.phases):
+        try:
+            check_supported(phase.spec)
+        except SpecError as error:
+            raise SpecError(f"phases.{index}.spec: {error}") from None
+    check_switches(cell.stream)
 
 
 def refuse_of_reference(uses: str, hyperparameters: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ of the optimal policy:
 
     start + P · step + E · T · batch step + N · (state + layer · (L − 1))
 
+A life in a stream takes the last term for each of its tasks at the end.
 In JAX it is a lane of a program of ten on a CPU, and a batch step takes more for each layer, too.
 Once cells have finished, the sum after `start` is multiplied by the median ratio of their measured
 to their estimated seconds, over cells of the same algorithm and setting, or else of the same
@@ -17,7 +18,7 @@ from __future__ import annotations
 import heapq
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import NamedTuple
 
 from sme_registry.spec import Cell, SMESpec
@@ -60,7 +61,7 @@ class Estimator:
     """Estimates the seconds of cells; improves as cells finish."""
 
     def __init__(self, finished: Iterable[CellResult] = ()) -> None:
-        self._ratios: dict[str | tuple[str, SMESpec], list[float]] = defaultdict(list)
+        self._ratios: dict[Hashable, list[float]] = defaultdict(list)
         for result in finished:
             self.observe(result)
 
@@ -103,14 +104,16 @@ def _work(cell: Cell) -> Span:
     states = cell.protocol.states_per_region * len(cell.protocol.edges)
     step = SECONDS_PER_STEP.get(uses, _UNKNOWN)
 
+    inner = [spec.complexity - 1 for spec in cell.specs]
+    layers = sum(inner) / len(inner)
+
     def bound(i: int) -> float:
         training = transitions * step[i]
-        inner = cell.spec.complexity - 1
         batch_step = _BATCH_STEP[i]
         if in_jax(cell.uses):
-            batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * inner
+            batch_step = _BATCH_STEP_IN_JAX[i] + _BATCH_LAYER_IN_JAX[i] * layers
         curve = cell.evaluations * cell.spec.horizon * batch_step
-        return training + curve + states * (_STATE[i] + _LAYER[i] * inner)
+        return training + curve + states * len(inner) * (_STATE[i] + _LAYER[i] * layers)
 
     return Span(bound(0), bound(1))
 
@@ -124,5 +127,5 @@ def _agents(spec: SMESpec) -> int:
     return 1 if spec.team is None else len(spec.team.agents)
 
 
-def _setting(cell: Cell) -> SMESpec:
-    return cell.spec.model_copy(update={"seed": 0})
+def _setting(cell: Cell) -> Hashable:
+    return tuple(spec.model_copy(update={"seed": 0}) for spec in cell.specs)

@@ -12,7 +12,7 @@ import tempfile
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,10 +35,18 @@ _SECONDS_BETWEEN_REPORTS = 0.5
 
 
 class Outcome(NamedTuple):
-    """How a cell ended: its result or failure, and the .zip of its model if that is kept."""
+    """How a cell ended.
+
+    Attributes:
+      entry: its result or failure.
+      model: the .zip of its model, if that is kept.
+      snapshots: of a life in a stream, its models before training and at the ends of visits, if
+        models are kept, by the names of their files (`training.snapshots`).
+    """
 
     entry: CellResult | CellFailure
     model: bytes | None = None
+    snapshots: Mapping[str, bytes] = {}
 
 
 class Executor(Protocol):
@@ -85,20 +93,21 @@ def run_job(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iter
 
 def _outcomes(run: RunCell, job: Job, keep_models: bool, progress: Report) -> Iterator[Outcome]:
     if job.lanes is not None:
-        for cell, ended, model in run_lanes(job.cells, job.lanes, progress, keep_models):
-            if isinstance(ended, CellResult):
-                yield Outcome(ended, model)
+        for lane in run_lanes(job.cells, job.lanes, progress, keep_models):
+            if isinstance(lane.ended, CellResult):
+                yield Outcome(lane.ended, lane.model, lane.snapshots)
             else:
-                yield failed(cell, f"{type(ended).__name__}: {ended}", "")
+                yield failed(lane.cell, f"{type(lane.ended).__name__}: {lane.ended}", "")
         return
     (cell,) = job.cells
     with tempfile.TemporaryDirectory(prefix="sme-cell-") as folder:
         path = Path(folder) / "model.zip"
         result = run(cell, progress, path if keep_models else None)
         saved = path.read_bytes() if path.exists() else None
+        snapshots = {each.name: each.read_bytes() for each in path.with_suffix("").glob("*.zip")}
     if result.key != cell.digest:
         raise RuntimeError(f"the result belongs to another cell, {result.key}")
-    yield Outcome(result, saved)
+    yield Outcome(result, saved, snapshots)
 
 
 def failed(cell: Cell, error: str, details: str) -> Outcome:

@@ -131,7 +131,7 @@ class Programs:
         for cell in cells:
             if in_jax(cell.uses):
                 self._cells[cell.digest] = cell
-                self._shapes[self.group(cell)][cell.digest] = _shape(cell.spec)
+                self._shapes[self.group(cell)][cell.digest] = shape_of(cell)
 
     @property
     def one_at_a_time(self) -> bool:
@@ -184,7 +184,6 @@ class Programs:
 
     def group(self, cell: Cell) -> Hashable:
         """What the cells of a program have in common."""
-        spec = cell.spec
         return (
             cell.uses,
             to_json(dict(sorted(cell.hyperparameters.items()))),
@@ -193,8 +192,9 @@ class Programs:
             cell.evaluations,
             cell.evaluation_episodes,
             # Rewards that change no observation and end no episode are computed in another way.
-            spec.k == 1 and spec.D == 0,
-            _shape(spec) if self.platform == CPU else _bucket(spec),
+            all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
+            tuple(_shape(spec) if self.platform == CPU else _bucket(spec) for spec in cell.specs),
+            cell.stream and cell.stream.switches,
         )
 
 
@@ -209,7 +209,7 @@ def new_program(cells: Sequence[Cell], lanes: Lanes, at_once: int = 1) -> Progra
     cell = cells[0]
     return new_program(
         cell.uses,
-        [each.spec for each in cells],
+        [each.document for each in cells],
         [each.seed for each in cells],
         hyperparameters=cell.hyperparameters,
         action_range=cell.action_range,
@@ -258,6 +258,14 @@ def _without_room(programs: Sequence[tuple[Cell, Lanes]], at_once: int) -> dict[
         except ResourceLimitError as error:
             reasons[cell.digest] = str(error)
     return reasons
+
+
+def shape_of(cell: Cell) -> Shape:
+    """The shape that covers the cell's tasks: of a stream, those of several layers, if any."""
+    from sme_registry.jax.task import Shape
+
+    shapes = [Shape.of(spec) for spec in cell.specs]
+    return Shape.covering([shape for shape in shapes if shape.complexity > 1] or shapes)
 
 
 def _shape(spec: SMESpec) -> Shape:

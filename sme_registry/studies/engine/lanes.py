@@ -14,33 +14,67 @@ import multiprocessing
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import EvaluationReport, as_policy, evaluate_many
+from sme_registry.evaluation import EvaluationReport, StreamReport, as_policy, evaluate_many
+from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
+from sme_registry.evaluation.continual.dynamic_regret import visit_ends
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
 from sme_registry.spec import Cell
-from sme_registry.studies.engine.jobs import CPU, Lanes, Report, child_environment, new_program
+from sme_registry.studies.engine.jobs import (
+    CPU,
+    Lanes,
+    Report,
+    child_environment,
+    new_program,
+    shape_of,
+)
+from sme_registry.studies.engine.life import life_report
 from sme_registry.studies.engine.program_state import read_header, read_state, write_state
-from sme_registry.studies.engine.result import CellResult, LearningCurve, ProgramResult, Timing
+from sme_registry.studies.engine.result import (
+    CellResult,
+    LearningCurve,
+    ProgramResult,
+    Timing,
+    report_field,
+)
 from sme_registry.terminal.interrupts import end_with_parent
 from sme_registry.training.record import versions_for
+from sme_registry.training.snapshots import Snapshots
 
 if TYPE_CHECKING:
     from sme_registry.jax.program import Evaluation, StepLog
 
-Ended = tuple[Cell, CellResult | PolicyError, bytes | None]
-"""A cell, its result or the reason why it has none, and its model's .zip if that is kept."""
+_PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
+_SNAPSHOT = "snapshot/"  # prefix of the records of lives: the weights before training and of visits
+
+
+class Ended(NamedTuple):
+    """How the cell of a lane ended.
+
+    Attributes:
+      cell: the cell.
+      ended: its result, or the reason why it has none.
+      model: its model's .zip, if that is kept.
+      snapshots: of a life, those before training and at the ends of visits, by their files' names.
+    """
+
+    cell: Cell
+    ended: CellResult | PolicyError
+    model: bytes | None = None
+    snapshots: Mapping[str, bytes] = {}
+
 
 SECONDS_BETWEEN_STATES = 180.0
 _TRAINING, _EVALUATION = 0, 1  # what a program's time is for
-_PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
 
 
 def run_lanes(
@@ -76,8 +110,6 @@ class _Run:
     """A program, the cells of its lanes, and the records of what they did."""
 
     def __init__(self, cells: Sequence[Cell], lanes: Lanes, progress: Report) -> None:
-        from sme_registry.jax.task import Shape
-
         cell = self._cell = cells[0]
         self._lanes, self._progress = lanes, progress
         self._own = {cell.digest: cell for cell in cells}
@@ -87,7 +119,7 @@ class _Run:
         self._made = ProgramResult(
             device=str(self._program.device.device_kind),
             lanes=lanes.count,
-            shape=lanes.shape or Shape.of(cell.spec),
+            shape=lanes.shape or shape_of(cell),
         )
         n = cell.evaluations
         self._due = [round(cell.steps * k / n) for k in range(1, n + 1)]
@@ -101,6 +133,7 @@ class _Run:
             "failed_at": np.full(lanes.count, -1),
             "seconds": np.zeros(2),
         }
+        self._begin_lives()
         self._restore()
         self._last_state = time.monotonic()
 
@@ -114,6 +147,7 @@ class _Run:
             start_states=self._start_states,
             on_log=self._on_log,
             on_evaluation=self._on_evaluation,
+            on_visit=self._on_visit if self._blocks else None,
             after_piece=self._after_piece,
         )
         self._note_failures()
@@ -121,20 +155,18 @@ class _Run:
     def results(self, keep_models: bool) -> Iterator[Ended]:
         """Evaluate the trained policies within and out of distribution.
 
-        Those with tasks of the same draw are evaluated together, which is faster.
+        Those with tasks of the same draw are evaluated together, which is faster; each life alone.
         """
-        draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes with tasks of one draw
+        draws: dict[Hashable, list[int]] = defaultdict(list)  # lanes that are evaluated together
         for lane, key in enumerate(self._keys):
             if key in self._own:
                 cell, step = self._cells[lane], int(self._records["failed_at"][lane])
                 if step >= 0:
-                    yield cell, _not_finite(step), None
+                    yield Ended(cell, _not_finite(step))
                 else:
-                    draws[cell.spec.seed, cell.protocol.digest].append(lane)
-        groups = [
-            [_Trained(self._cells[lane], self._program.weights(lane)) for lane in group]
-            for group in draws.values()
-        ]
+                    life = lane if cell.stream else None
+                    draws[cell.spec.seed, cell.protocol.digest, life].append(lane)
+        groups = [[self._trained(lane) for lane in group] for group in draws.values()]
         evaluated = _evaluate(groups, self._lanes.processes)
         for group, (reports, seconds) in zip(draws.values(), evaluated, strict=True):
             for lane, report in zip(group, reports, strict=True):
@@ -143,24 +175,56 @@ class _Run:
     def _ended(
         self,
         lane: int,
-        report: EvaluationReport | PolicyError,
+        report: _Report | PolicyError,
         seconds: float,
         keep_models: bool,
     ) -> Ended:
         cell = self._cells[lane]
         if isinstance(report, PolicyError):
-            return cell, report, None
+            return Ended(cell, report)
         result = CellResult(
             key=cell.digest,
             cell=cell,
             curve=self._curve(lane),
-            report=report,
+            **report_field(report),
             online_regret=self._online_regret(lane),
             program=self._made,
             timing=self._timing(seconds),
             versions=versions_for(cell.uses),
         )
-        return cell, result, self._model(lane) if keep_models else None
+        if not keep_models:
+            return Ended(cell, result)
+        return Ended(cell, result, self._model(lane), self._snapshots(lane))
+
+    def _trained(self, lane: int) -> _Trained:
+        cell = self._cells[lane]
+        if self._blocks is None:
+            return _Trained(cell, [self._program.weights(lane)])
+        return _Trained(cell, self._weights_of_life(lane), self._blocks.dynamic_regret(lane))
+
+    def _begin_lives(self) -> None:
+        """Records of lives, which hold the weights of visits for as long as the program runs."""
+        stream = self._cell.stream
+        self._blocks = None if stream is None else RegretBlocks(stream, self._lanes.count)
+        if stream is None or self._blocks is None:
+            return
+        self._records |= {"block_steps": self._blocks.steps, "block_regret": self._blocks.regret}
+        snapshots = stream.cycles * len(stream.phases) + 1
+        for lane in range(len(self._cells)):
+            for name, weight in self._program.weights(lane).items():
+                kept = np.zeros((snapshots, *weight.shape), weight.dtype)
+                kept[0] = weight
+                self._records[f"{_SNAPSHOT}{lane}/{name}"] = kept
+
+    def _on_visit(self, visit: int, weights: list[Arrays]) -> None:
+        for lane, own in enumerate(weights):
+            for name, weight in own.items():
+                self._records[f"{_SNAPSHOT}{lane}/{name}"][visit + 1] = weight
+
+    def _weights_of_life(self, lane: int) -> list[Arrays]:
+        """A lane's weights before training, and at the end of each visit."""
+        kept = _named(self._records, f"{_SNAPSHOT}{lane}/")
+        return [dict(zip(kept, each, strict=True)) for each in zip(*kept.values(), strict=True)]
 
     def _start_states(self, k: int) -> list[Any]:
         return [
@@ -170,6 +234,8 @@ class _Run:
 
     def _on_log(self, log: StepLog) -> None:
         self._records["regret"] += log.regret.sum(axis=0)
+        if self._blocks is not None:
+            self._blocks.add(self._program.steps, log.regret)
         self._spend(_TRAINING)
 
     def _on_evaluation(self, k: int, step: int, done: Evaluation) -> None:
@@ -220,6 +286,23 @@ class _Run:
         set_weights(model, self._program.weights(lane), self._program.steps)
         return saved_sb3(model)
 
+    def _snapshots(self, lane: int) -> dict[str, bytes]:
+        """The models of a life before training and at the ends of its visits."""
+        from sme_registry.training.sb3_models import set_weights
+
+        cell = self._cells[lane]
+        if cell.stream is None:
+            return {}
+        files, model = Snapshots(Path(), cell.stream), _new_model(cell)
+        ends = visit_ends(cell.stream, len(files.visits)).tolist()
+        steps = [0, *ends[:-1], self._program.steps]
+        weights = self._weights_of_life(lane)
+        snapshots = {}
+        for path, own, trained in zip([files.initial, *files.visits], weights, steps, strict=True):
+            set_weights(model, own, trained)
+            snapshots[path.name] = saved_sb3(model)
+        return snapshots
+
     def _online_regret(self, lane: int) -> float | None:
         steps = self._program.steps
         return float(self._records["regret"][lane]) / steps if steps else None
@@ -260,8 +343,11 @@ class _Run:
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
             self._progress(0, self._cell.steps, 0, f"starts again, without {state}: {error}")
-        else:
-            self._records = records
+            return
+        self._records = records
+        if self._blocks is not None:
+            self._blocks.steps = records["block_steps"]
+            self._blocks.regret = records["block_regret"]
 
 
 def _named(arrays: Arrays, prefix: str) -> Arrays:
@@ -279,7 +365,7 @@ def _new_model(cell: Cell) -> Any:
 
     return new_sb3_model(
         cell.uses,
-        cell.spec,
+        cell.document,
         seed=cell.seed,
         action_range=cell.action_range,
         hyperparameters=cell.hyperparameters,
@@ -288,13 +374,21 @@ def _new_model(cell: Cell) -> Any:
 
 
 class _Trained(NamedTuple):
-    """A cell and its trained weights, by SB3's names."""
+    """A cell and what it learned.
+
+    Attributes:
+      cell: the cell.
+      weights: by SB3's names; of a life those before training and at the end of each visit.
+      regret: of a life.
+    """
 
     cell: Cell
-    weights: Arrays
+    weights: list[Arrays]
+    regret: DynamicRegret | None = None
 
 
-_Evaluated = tuple[list[EvaluationReport | PolicyError], float]
+_Report = EvaluationReport | StreamReport
+_Evaluated = tuple[Sequence[_Report | PolicyError], float]
 """The reports of some cells, or why there is none, and the CPU seconds of all of them."""
 
 
@@ -313,21 +407,39 @@ def _evaluate(groups: list[list[_Trained]], processes: int) -> Iterator[_Evaluat
 
 
 def _evaluate_together(group: list[_Trained]) -> _Evaluated:
+    start = time.process_time()
+    first = group[0]
+    reports: Sequence[_Report | PolicyError]
+    if first.regret is not None:
+        reports = [_evaluate_life(first.cell, first.weights, first.regret)]
+    else:
+        policies = []
+        for cell, (weights,), _ in group:
+            range_, name, act = cell.action_range, cell.uses, _policy(cell, weights)
+            policies.append((as_policy(act, cell.spec, action_range=range_, name=name), cell.spec))
+        reports = evaluate_many(policies, first.cell.protocol)
+    return reports, time.process_time() - start
+
+
+def _evaluate_life(
+    cell: Cell, weights: Sequence[Arrays], regret: DynamicRegret
+) -> StreamReport | PolicyError:
+    initial, *visits = (_policy(cell, each) for each in weights)
+    try:
+        return life_report(cell, visits, initial, regret)
+    except PolicyError as error:
+        return error
+
+
+def _policy(cell: Cell, weights: Arrays) -> Any:
     from sme_registry.jax.run import policy_of
 
-    start = time.process_time()
-    policies = []
-    for cell, weights in group:
-        act = policy_of(
-            cell.uses,
-            weights,
-            hyperparameters=cell.hyperparameters,
-            action_range=cell.action_range,
-        )
-        range_, name = cell.action_range, cell.uses
-        policies.append((as_policy(act, cell.spec, action_range=range_, name=name), cell.spec))
-    reports = evaluate_many(policies, group[0].cell.protocol)
-    return reports, time.process_time() - start
+    return policy_of(
+        cell.uses,
+        weights,
+        hyperparameters=cell.hyperparameters,
+        action_range=cell.action_range,
+    )
 
 
 def _begin_worker() -> None:

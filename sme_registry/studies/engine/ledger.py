@@ -14,6 +14,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from sme_registry.errors import OptionError, SMEError
@@ -120,12 +121,18 @@ class Ledger:
         """Failures by key, as `results`."""
         return self._read(CellFailure, FAILED, keys)
 
-    def write(self, entry: CellResult | CellFailure, model: bytes | None = None) -> None:
+    def write(
+        self,
+        entry: CellResult | CellFailure,
+        model: bytes | None = None,
+        snapshots: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
         """Write a cell's result or failure, completely or not at all.
 
         Args:
           entry: a result, which replaces a failure of the same cell; or a failure.
           model: the trained model's .zip, to keep with a result.
+          snapshots: further models of a life in a stream, by the names of their files.
 
         Raises:
           OptionError: it cannot be written; existing files are unchanged.
@@ -133,7 +140,10 @@ class Ledger:
         if isinstance(entry, CellFailure):
             write_atomically(self.failure_path(entry.key), to_json(entry.to_dict()))
             return
-        if model is not None:  # first: a kill in between must not leave a result without its model
+        # Models first: a kill in between must not leave a result without them.
+        for name, snapshot in snapshots.items():
+            write_atomically(self.snapshots_path(entry.key) / name, snapshot)
+        if model is not None:
             write_atomically(self.model_path(entry.key), model)
         write_atomically(self._path(CELLS, entry.key), to_json(entry.to_dict()))
         with contextlib.suppress(FileNotFoundError):
@@ -142,6 +152,10 @@ class Ledger:
     def model_path(self, key: str) -> Path:
         """Where a cell's trained model is, if it was kept."""
         return self.folder / MODELS / f"{_hex(key)}.zip"
+
+    def snapshots_path(self, key: str) -> Path:
+        """The folder of the models at the ends of the visits of a life, if they were kept."""
+        return self.model_path(key).with_suffix("")
 
     def failure_path(self, key: str) -> Path:
         """Where a cell's failure is, if it failed."""

@@ -168,6 +168,11 @@ class CellResult(StrictModel):
         return self.any_report._repr_html_()
 
 
+def report_field(report: EvaluationReport | StreamReport) -> dict[str, Any]:
+    """The field of a `CellResult` that a report is."""
+    return {"stream_report" if isinstance(report, StreamReport) else "report": report}
+
+
 class CellFailure(StrictModel):
     """A run that raised an error: its message and the last lines of its traceback."""
 

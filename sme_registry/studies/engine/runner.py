@@ -30,7 +30,7 @@ from sme_registry.studies.engine.ledger import Ledger, SavedState
 from sme_registry.studies.engine.processes import Processes
 from sme_registry.studies.engine.ray_executor import OnRay
 from sme_registry.studies.engine.result import CellFailure, CellResult
-from sme_registry.studies.engine.scaling import selected
+from sme_registry.studies.engine.scaling import first_places, selected
 from sme_registry.studies.engine.status import StudyStatus, label, plan_status
 from sme_registry.terminal import Progress, duration
 from sme_registry.training.record import versions_for
@@ -95,7 +95,7 @@ def run_study(
         jobs = integer_in("jobs", jobs, 1)
     if lanes is not None:
         lanes = integer_in("lanes", lanes, 1, 100_000)
-    planned = {cell.cell.digest: cell for cell in selected(plan_file.plan.cells, only)}
+    planned = first_places(selected(plan_file.plan.cells, only))
     programs = None
     if run is run_cell:
         _check(plan_file.plan, planned.values())
@@ -480,7 +480,7 @@ class _StudyRun:
         if isinstance(entry, CellFailure) and key in self._failures:
             attempts = self._failures[key].attempts + 1
             entry = entry.model_copy(update={"attempts": attempts})
-        self._ledger.write(entry, outcome.model)
+        self._ledger.write(entry, outcome.model, outcome.snapshots)
         lock, started, job = self._running.pop(key)
         lock.release()
         if isinstance(entry, CellResult):

@@ -22,18 +22,22 @@ STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
 
 
 def label(planned: PlannedCell) -> str:
-    """A cell's name for people: `PPO on k-25, run 3`."""
-    return f"{planned.algorithm} on {planned.class_name}, run {planned.run}"
+    """A cell's name for people: `PPO on k-25, run 3`, `PPO on phase 2 of Switch5 alone, run 3`."""
+    alone = "" if planned.phase is None else f"phase {planned.phase} of "
+    where = f"{alone}{planned.class_name}{alone and ' alone'}"
+    return f"{planned.algorithm} on {where}, run {planned.run}"
 
 
 @dataclass(frozen=True)
 class CellStatus:
     """The state of a planned cell, and its error if it failed.
 
-    It is "running" if any process runs it, and "failed" if it failed and none runs it again.
+    It is "running" if any process runs it, and "failed" if it failed and none runs it again. A cell
+    with several places in the plan has a state for each; `key` is its digest.
     """
 
     planned: PlannedCell
+    key: str
     state: State
     failure: CellFailure | None = None
 
@@ -45,18 +49,27 @@ class StudyStatus:
     Attributes:
       folder: of the study.
       file: its plan.
-      cells: the selected cells of the plan, in its order; see `study_status`. Those that any run
-        asked for include all that have finished, failed or are running.
+      places: the selected cells of the plan, in its order; see `study_status`. Those that any run
+        asked for include all that have finished, failed or are running. Streams may share fresh
+        agents, which run once and count once, except in `counts`.
       seconds_left: of one core, for the unfinished cells; running ones count in full.
       other_results: results in the folder that belong to no cell of the plan.
     """
 
     folder: Path
     file: StudyFile
-    cells: tuple[CellStatus, ...]
+    places: tuple[CellStatus, ...]
     seconds_left: Span
     other_results: int
     never_requested: int = 0  # cells of the plan that no run asked for, where these are left out
+
+    @property
+    def cells(self) -> tuple[CellStatus, ...]:
+        """Every selected cell once."""
+        first: dict[str, CellStatus] = {}
+        for cell in self.places:
+            first.setdefault(cell.key, cell)
+        return tuple(first.values())
 
     def count(self, state: State) -> int:
         """How many cells are in this state."""
@@ -71,7 +84,7 @@ class StudyStatus:
     def counts(self) -> dict[tuple[str, str], Counter[State]]:
         """(class, algorithm) → number of cells in each state, in the plan's order."""
         counts: dict[tuple[str, str], Counter[State]] = {}
-        for cell in self.cells:
+        for cell in self.places:
             group = cell.planned.class_name, cell.planned.algorithm
             counts.setdefault(group, Counter())[cell.state] += 1
         return counts
@@ -152,26 +165,25 @@ def plan_status(ledger: Ledger, file: StudyFile, only: Sequence[str] | None) -> 
     keys = {id(planned): planned.cell.digest for planned in every}
     results, failures = ledger.results(), ledger.failures()
     estimator = Estimator(results.values())
-    cells = []
+    places = []
     for planned in selected(every, only or ()):
         key = keys[id(planned)]
         state: State = "done" if key in results else "failed" if key in failures else "waiting"
         if state != "done" and ledger.is_running(key):
             state = "running"
-        cells.append(CellStatus(planned, state, failures.get(key) if state == "failed" else None))
+        failure = failures.get(key) if state == "failed" else None
+        places.append(CellStatus(planned, key, state, failure))
     asked = requested(ledger, file) if only is None else None
     shown = [
-        cell
-        for cell in cells
-        if asked is None or cell.state != "waiting" or keys[id(cell.planned)] in asked
+        cell for cell in places if asked is None or cell.state != "waiting" or cell.key in asked
     ]
-    never_requested, cells = len(cells) - len(shown), shown
-    spans = [estimator.seconds(c.planned.cell) for c in cells if c.state in ("running", "waiting")]
+    unfinished = {c.key: c.planned.cell for c in shown if c.state in ("running", "waiting")}
+    spans = [estimator.seconds(cell) for cell in unfinished.values()]
     return StudyStatus(
         folder=ledger.folder,
         file=file,
-        cells=tuple(cells),
+        places=tuple(shown),
         seconds_left=Span(sum(span.low for span in spans), sum(span.high for span in spans)),
         other_results=len(results.keys() - set(keys.values())),
-        never_requested=never_requested,
+        never_requested=len({cell.key for cell in places} - {cell.key for cell in shown}),
     )

@@ -33,12 +33,14 @@ class Training:
 
     Attributes:
       env: a monitored environment, which counts the steps of the task.
+      learner: what learns in it; of a team with a model for each agent, all of them.
       learn: trains for at least the cell's steps.
-      policy: the present policy.
+      policy: the present policy. Training may change it.
       save: writes the model to a path; does nothing for a learner without a model.
     """
 
     env: Any
+    learner: Any
     learn: Callable[[], Any]
     policy: Callable[[], Policy | TeamPolicy]
     save: Callable[[Path], Any]
@@ -58,14 +60,15 @@ def training(cell: Cell) -> Training:
 def _single(cell: Cell) -> Training:
     from sme_registry.training.monitored_env import MonitoredVecEnv
 
-    env = MonitoredVecEnv(cell.spec, action_range=cell.action_range)
+    env = MonitoredVecEnv(cell.document, action_range=cell.action_range)
     learner = new_learner(
         cell.uses, env, seed=cell.seed, steps=cell.steps, hyperparameters=cell.hyperparameters
     )
     return Training(
         env,
+        learner,
         lambda: learner.learn(cell.steps),
-        lambda: numpy_policy(learner, cell.spec, action_range=cell.action_range),
+        lambda: numpy_policy(learner, cell.document, action_range=cell.action_range),
         lambda path: _save(learner, path),
     )
 
@@ -78,6 +81,7 @@ def _shared(cell: Cell) -> Training:
     )
     return Training(
         env,
+        learner,
         lambda: learner.learn(transitions),
         lambda: numpy_team_policy(learner, cell.spec, action_range=cell.action_range),
         lambda path: _save(learner, path),
@@ -111,6 +115,7 @@ def _independent(cell: Cell) -> Training:
     learners.env = env
     return Training(
         env,
+        learners,
         lambda: learners.learn(cell.steps, lambda *step: None, lambda: None),
         lambda: numpy_team_policy(learners.models, cell.spec, action_range=cell.action_range),
         learners.save_checkpoint,

@@ -1,0 +1,393 @@
+"""Cells that are lives in streams: the policies of their visits, their regret, their files."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sme_registry import SMESpec, StreamSpec, materialize
+from sme_registry.errors import PolicyError, SMEError, SpecError
+from sme_registry.evaluation import evaluate_stream
+from sme_registry.spec import Cell, StudyFile, StudyPlan
+from sme_registry.studies.engine import lanes
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.checks import check_task
+from sme_registry.studies.engine.estimate import Estimator
+from sme_registry.studies.engine.jobs import Programs
+from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.engine.runner import run_study
+from sme_registry.studies.engine.status import label, study_status
+
+pytest.importorskip("stable_baselines3")
+
+ROOT = Path(__file__).resolve().parents[3]
+TASK = SMESpec(state_dim=2, action_dim=2, horizon=8)
+OTHER = TASK.derive(seed=1)
+SMALL = {"n_steps": 16, "batch_size": 16, "n_epochs": 2, "policy_kwargs": {"net_arch": [4]}}
+PROTOCOL = {"states_per_region": 50, "epsilons": [1.0]}
+
+
+def stream_of(*specs: SMESpec, steps: int = 32, **fields: Any) -> StreamSpec:
+    return StreamSpec(phases=[{"spec": spec, "steps": steps} for spec in specs], **fields)
+
+
+TWICE = stream_of(TASK, OTHER, cycles=2)
+
+
+def life(stream: StreamSpec = TWICE, uses: str = "PPO", **changes: Any) -> Cell:
+    fields: dict[str, Any] = {
+        "spec": stream.phases[0].spec,
+        "stream": stream,
+        "uses": uses,
+        "hyperparameters": SMALL if "PPO" in uses else {},
+        "action_range": "symmetric",
+        "seed": 3,
+        "steps": stream.steps,
+        "evaluations": 8,
+        "evaluation_episodes": 3,
+        "protocol": PROTOCOL,
+    }
+    return Cell(**{**fields, **changes})
+
+
+def plan_file(uses: str = "PPO", **fields: Any) -> StudyFile:
+    """Two streams that share phase 0, two runs each."""
+    plan = StudyPlan.from_dict(
+        {
+            "streams": [
+                {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]},
+                {
+                    "name": "related",
+                    "stream": stream_of(TASK, TASK.derive(rotation=1.0)).to_dict(),
+                    "draws": [0, 1],
+                },
+            ],
+            "algorithms": [{"name": "agent", "uses": uses, "hyperparameters": SMALL}],
+            "seeds": 2,
+            "evaluations": 4,
+            "evaluation_episodes": 2,
+            "protocol": PROTOCOL,
+        }
+        | fields
+    )
+    return StudyFile(name="lives", digest=plan.digest, plan=plan)
+
+
+def matrix(report: Any, region: str = "WD") -> Any:
+    return np.array(report.region(region).agent.normalised_regret)
+
+
+class Knowing:
+    """A learner that acts optimally in one phase, or in the one that it observes."""
+
+    def __init__(self, env: Any, copies: bool) -> None:
+        stream = env.get_attr("stream")[0]
+        self._env, self._tasks = env, [materialize(phase.spec) for phase in stream.phases]
+        self._lock = None if copies else (each for each in ())
+
+    def learn(self, total_timesteps: int) -> None:
+        observation = self._env.reset()
+        for _ in range(total_timesteps):
+            action, _ = self.predict(observation, deterministic=True)
+            observation = self._env.step(action.astype(np.float32))[0]
+
+    def predict(self, observation: Any, *, deterministic: bool) -> tuple[Any, None]:
+        s, shown = observation[:, :2].astype(np.float64), observation[:, 4:]
+        phase = int(shown[0].argmax()) if shown.size else 0
+        return 2.0 * self._tasks[phase].optimal_action(s) - 1.0, None
+
+
+def knowing(env: Any, *, seed: int, copies: bool = True) -> Knowing:
+    return Knowing(env, copies)
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellResult, Path]:
+    """The result of a life, and where its models are."""
+    model = tmp_path_factory.mktemp("life") / "model.zip"
+    return run_cell(life(), model_path=model), model
+
+
+def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
+    lived: tuple[CellResult, Path],
+) -> None:
+    from stable_baselines3 import PPO
+
+    from sme_registry.sb3 import SMEVecEnv
+
+    result, _ = lived
+    settings = SMALL | {"policy_kwargs": dict(SMALL["policy_kwargs"])}  # type: ignore[call-overload]
+    env = SMEVecEnv(TWICE, 1, action_range="symmetric")
+    model: Any = PPO("MlpPolicy", env, seed=3, device="cpu", **settings)
+    rows = []
+    for _ in range(4):
+        model.learn(32, reset_num_timesteps=not rows)
+        rows.append(matrix(evaluate_stream([model] * 4, TWICE, PROTOCOL))[0])
+    assert result.report is None
+    assert result.stream_report is not None
+    assert result.stream_report.policy == "PPO"
+    np.testing.assert_allclose(matrix(result.stream_report), rows, atol=1e-6)
+    assert len({*matrix(result.stream_report)[:, 0]}) == 4
+
+
+def test_a_life_s_document_is_read_again_and_holds_one_report(
+    lived: tuple[CellResult, Path],
+) -> None:
+    result, _ = lived
+    document = json.loads(json.dumps(result.to_dict()))
+    assert "report" not in document
+    assert CellResult.from_dict(document) == result
+    single = run_cell(life().fresh[0])
+    assert "stream_report" not in single.to_dict()
+    for wrong in (
+        document | {"report": single.to_dict()["report"]},
+        {name: value for name, value in document.items() if name != "stream_report"},
+        single.to_dict() | {"report": None},
+    ):
+        with pytest.raises(SpecError, match="report: must be the only report"):
+            CellResult.from_dict(wrong)
+
+
+def test_the_dynamic_regret_of_a_life_is_that_of_its_training(
+    lived: tuple[CellResult, Path],
+) -> None:
+    result, _ = lived
+    assert result.stream_report is not None
+    regret = result.stream_report.dynamic_regret
+    assert regret is not None
+    assert [visit.steps for visit in regret.visits] == [32] * 4
+    assert regret.online_regret == pytest.approx(result.online_regret)
+    assert regret.lifetime == tuple(range(1, 129))
+    fresh = [run_cell(cell) for cell in result.cell.fresh]
+    report = result.stream_report.with_fresh(
+        [each.any_report for each in fresh], [each.online_regret or 0.0 for each in fresh]
+    )
+    assert None not in report.region().agent.plasticity_ratio
+    assert report.dynamic_regret is not None
+    assert report.dynamic_regret.learning_transfer is not None
+    assert report.dynamic_regret.visits[0].learning_transfer == pytest.approx(0.0)  # the same agent
+
+
+def test_the_models_of_a_life_are_kept_before_training_and_after_each_visit(
+    lived: tuple[CellResult, Path],
+) -> None:
+    result, model = lived
+    names = ["initial.zip", "visit-00.zip", "visit-01.zip", "visit-02.zip", "visit-03.zip"]
+    files = sorted(model.with_suffix("").iterdir())
+    assert [path.name for path in files] == names
+    initial, *visits = map(str, files)
+    again = evaluate_stream(visits, TWICE, PROTOCOL, initial=initial)
+    assert result.stream_report is not None
+    np.testing.assert_allclose(matrix(again), matrix(result.stream_report), atol=1e-6)
+    last = evaluate_stream([str(model)] * 4, TWICE, PROTOCOL)
+    np.testing.assert_array_equal(matrix(last)[3], matrix(again)[3])
+    agent, own = again.region().agent, result.stream_report.region().agent
+    assert agent.forward_transfer == pytest.approx(own.forward_transfer, abs=1e-6)
+
+
+def test_evaluations_during_a_life_are_on_the_task_in_force() -> None:
+    name = f"{__name__}:knowing"
+    regret = np.array(run_cell(life(uses=name)).curve.regret).reshape(4, 2)
+    assert (regret[[0, 2]] < 1e-5).all()
+    assert (regret[[1, 3]] > 0.1).all()
+
+
+def test_a_learner_that_observes_the_phase_is_shown_the_one_in_force() -> None:
+    stream = stream_of(TASK, OTHER, cycles=2, observes_phase=True)
+    result = run_cell(life(stream, f"{__name__}:knowing"))
+    assert max(result.curve.regret) < 1e-5
+    assert result.stream_report is not None
+    assert np.abs(matrix(result.stream_report)).max() < 1e-6
+
+
+def test_a_life_of_a_learner_that_cannot_be_copied_is_refused_before_it_begins() -> None:
+    with pytest.raises(PolicyError, match=r"cannot be copied at the end of a visit: TypeError"):
+        run_cell(life(uses=f"{__name__}:knowing", hyperparameters={"copies": False}))
+
+
+def test_a_phase_that_goes_on_to_the_end_of_an_episode_gets_its_regret() -> None:
+    stream = stream_of(TASK, OTHER, steps=30, cycles=2)  # 30 is no multiple of the horizon
+    result = run_cell(life(stream, f"{__name__}:knowing"))
+    assert result.stream_report is not None
+    regret = result.stream_report.dynamic_regret
+    assert regret is not None
+    assert [visit.steps for visit in regret.visits] == [32, 32, 32, 24]
+    first, second, *_ = (visit.dynamic_regret for visit in regret.visits)
+    assert first < 1e-4 < second
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of lives that has been run, with its models."""
+    study = tmp_path_factory.mktemp("study")
+    ran(study, plan_file(), keep_models=True)
+    return study
+
+
+def ran(study: Path, file: StudyFile, **options: Any) -> Any:
+    console = Console(file=io.StringIO(), width=200)
+    options = {"executor": "in-process", "console": console, **options}
+    return run_study(file, study, **options)
+
+
+def test_fresh_agents_that_two_streams_share_run_once_and_count_once(studied: Path) -> None:
+    file = plan_file()
+    status = study_status(studied, only=())
+    places = file.plan.cells
+    assert len(places) == 12
+    assert len(status.cells) == status.count("done") == len(Ledger(studied).results()) == 10
+    assert {name: sum(of.values()) for (name, _), of in status.counts.items()} == {
+        "switch": 6,
+        "related": 6,
+    }
+    assert status.other_results == status.never_requested == 0
+    names = [label(place) for place in places if place.run == 1]
+    assert names[:2] == ["agent on switch, run 1", "agent on phase 0 of switch alone, run 1"]
+
+
+def test_a_study_keeps_the_models_of_its_lives(studied: Path) -> None:
+    ledger = Ledger(studied)
+    for place in plan_file().plan.cells:
+        key = place.cell.digest
+        kept = sorted(path.name for path in ledger.snapshots_path(key).glob("*"))
+        assert kept == (
+            [] if place.phase is not None else ["initial.zip", "visit-00.zip", "visit-01.zip"]
+        )
+        assert ledger.model_path(key).exists()
+
+
+def test_a_life_takes_longer_than_a_task_of_equal_steps() -> None:
+    one = life(stream_of(TASK, steps=128))
+    many = life(TWICE)
+    assert Estimator().seconds(many).low > Estimator().seconds(one).low
+
+
+@pytest.mark.parametrize(
+    ("stream", "message"),
+    [
+        (stream_of(TASK, OTHER.derive(D=0.5)), "phases.1.spec: D=0.5: must be 0"),
+        (stream_of(TASK, OTHER, steps=30), "phases.1: begins or ends a task at step 30"),
+    ],
+)
+def test_a_stream_that_agents_in_jax_cannot_live_in_is_refused_before_anything_runs(
+    stream: StreamSpec, message: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("jax")
+    with pytest.raises(SMEError, match=message):
+        check_task(life(stream, "jax:PPO"))
+    check_task(life(stream, "PPO"))
+    file = plan_file("jax:PPO", streams=[{"name": "one", "stream": stream.to_dict()}])
+    with pytest.raises(SMEError, match=message):
+        ran(tmp_path / "study", file, device="cpu")
+    assert not (tmp_path / "study").exists()
+
+
+def test_lives_that_switch_at_the_same_steps_are_lanes_of_one_program() -> None:
+    pytest.importorskip("jax")
+    deep = TASK.derive(complexity=3, hidden_width=8)
+    base = life(stream_of(TASK, OTHER), "jax:PPO")
+    same = [
+        life(stream_of(OTHER, TASK.derive(rotation=1.0)), "jax:PPO"),
+        life(base.stream or TWICE, "jax:PPO", seed=4),
+    ]
+    others = [
+        life(stream_of(TASK, OTHER, steps=16, cycles=2), "jax:PPO"),
+        life(stream_of(TASK, OTHER, switch="step"), "jax:PPO"),
+        life(stream_of(TASK, OTHER, observes_phase=True), "jax:PPO"),
+        life(stream_of(TASK, deep), "jax:PPO"),
+        life(stream_of(deep, TASK), "jax:PPO"),
+        life(stream_of(TASK, OTHER.derive(k=2)), "jax:PPO"),
+        life(stream_of(TASK, steps=64), "jax:PPO"),
+        life(stream_of(TASK, steps=64), "jax:PPO").fresh[0],
+    ]
+    programs = Programs([base, *same, *others])
+    group = programs.group(base)
+    assert [programs.group(cell) == group for cell in same] == [True] * 2
+    assert len({programs.group(cell) for cell in (base, *others)}) == 1 + len(others)
+    assert programs.lanes(base) == 3
+    assert programs.program(others[3]).shape == (2, 2, 3, 8)
+
+
+# Kills itself at the end of the last visit, when the state before it has been written.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from sme_registry.studies.engine import lanes
+from tests.studies.engine import test_lives
+
+def kill(run, visit, weights, original=lanes._Run._on_visit):
+    original(run, visit, weights)
+    if visit == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+lanes.SECONDS_BETWEEN_STATES = 0.0
+lanes._Run._on_visit = kill
+test_lives.ran(Path(sys.argv[1]), test_lives.jax_file(), device="cpu")
+"""
+
+
+def jax_file() -> StudyFile:
+    """Two lives, on two draws of a stream."""
+    stream = {"name": "switch", "stream": stream_of(TASK, OTHER).to_dict(), "draws": [0, 1]}
+    return plan_file("jax:PPO", streams=[stream])
+
+
+def numbers(study: Path) -> dict[str, Any]:
+    """All results but their times, and the versions of what else this process has loaded."""
+    documents = {key: result.to_dict() for key, result in Ledger(study).results().items()}
+    for document in documents.values():
+        del document["timing"]
+        document.get("report", document.get("stream_report"))["versions"] = {}
+    return documents
+
+
+def test_after_kill_9_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_path: Path) -> None:
+    pytest.importorskip("jax")
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    ran(whole, jax_file(), device="cpu", keep_models=True)
+    process = subprocess.run(
+        [sys.executable, "-c", KILLED, str(killed)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    assert not Ledger(killed).results()
+    assert list((killed / "states").glob("*.npz"))
+    ended: list[int] = []
+    original = lanes._Run._on_visit
+
+    def on_visit(run: Any, visit: int, weights: Any) -> None:
+        ended.append(visit)
+        original(run, visit, weights)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lanes._Run, "_on_visit", on_visit)
+        status = ran(killed, jax_file(), device="cpu")
+    assert ended == [1]  # visit 0 had been saved
+    assert status.count("done") == 6
+    assert numbers(killed) == numbers(whole)
+    lives = [result for result in Ledger(whole).results().values() if result.cell.stream]
+    assert [len({*matrix(result.stream_report)[:, 0]}) for result in lives] == [2, 2]
+    for result in lives:
+        files = sorted(Ledger(whole).snapshots_path(result.key).iterdir())
+        initial, *visits = map(str, files)
+        again = evaluate_stream(visits, result.cell.document, PROTOCOL, initial=initial)
+        np.testing.assert_allclose(matrix(again), matrix(result.stream_report), atol=1e-6)
+        regret = result.stream_report and result.stream_report.dynamic_regret
+        assert regret is not None
+        assert [visit.steps for visit in regret.visits] == [32, 32]
+        assert regret.online_regret == pytest.approx(result.online_regret)
+        assert result.curve.steps == (16, 32, 48, 64)
