@@ -97,6 +97,14 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: P
     assert "--suite FILE" in refused("train", SMESpec(k=2, seed=8).digest)
 
 
+def test_train_refuses_what_a_stream_cannot_have() -> None:
+    stream = refused("train", "Switch5", "--set", "complexity=3")
+    assert "--set complexity: Switch5 is a stream." in stream
+    assert "make another stream in Python" in stream
+    assert "steps=100: must be 100,000" in refused("train", "Switch5", "-n", "100")
+    assert "num_envs=2: must be 1 on a stream" in refused("train", "Switch5", "--num-envs", "2")
+
+
 def test_train_takes_a_task_or_a_suite_and_refuses_options_of_the_other() -> None:
     assert "--suite" in refused("train")
     assert "TASK" in refused("train", "Default", "--suite", "smoke")
@@ -811,7 +819,6 @@ def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> N
 @pytest.mark.parametrize(
     "command",
     [
-        ("train", "Switch5"),
         ("evaluate", "optimal", "Switch5"),
         ("dataset", "make", "Switch5"),
         ("study", "new", "plan.json", "-t", "Switch5", "-a", "PPO"),

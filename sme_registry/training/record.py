@@ -109,11 +109,6 @@ class RunRecord(StrictModel):
           OptionError: the run has another plan, or has done more steps. Hyperparameters may be left
             out of this one.
         """
-        if self.steps < min(previous.steps, previous.steps_done):
-            raise OptionError(
-                f"steps={self.steps:,}: must be at least {previous.steps_done:,}, the steps that "
-                f"the run in {folder} has done. Choose more, or keep {previous.steps:,}."
-            )
         fields = (
             "stream_digest",
             "spec_digest",
@@ -134,6 +129,11 @@ class RunRecord(StrictModel):
                     f"{field}={now!r}: the run in {folder} has {before!r}{where}. Resume it with "
                     "the same value, or train into another folder."
                 )
+        if self.steps < min(previous.steps, previous.steps_done):
+            raise OptionError(
+                f"steps={self.steps:,}: must be at least {previous.steps_done:,}, the steps that "
+                f"the run in {folder} has done. Choose more, or keep {previous.steps:,}."
+            )
         return self.updated(
             hyperparameters=previous.hyperparameters,
             sessions=previous.sessions + 1,

@@ -1,0 +1,230 @@
+"""Runs on streams: snapshots, what is reported, resuming in mid-life, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, StreamSpec
+from sme_registry.errors import OptionError, SMEError
+from sme_registry.evaluation import StreamReport, evaluate_stream, load_sb3
+from sme_registry.training import RunRecord, TrainingResult, learn, train
+from sme_registry.training.episodes import read_episodes
+from tests.training.runs import PROTOCOL, TINY
+
+pytest.importorskip("stable_baselines3")
+
+# Nobody is rewarded in phase 1, so that every regret says in which phase it was.
+BARREN = TINY.derive(seed=6, r_min=0.999)
+STREAM = StreamSpec(phases=[{"spec": TINY, "steps": 60}, {"spec": BARREN, "steps": 40}], cycles=2)
+PPO = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+
+
+def life(folder: Path, stream: Any = STREAM, **changes: Any) -> TrainingResult:
+    settings: dict[str, Any] = {
+        "algorithm": "PPO",
+        "hyperparameters": PPO,
+        "protocol": PROTOCOL,
+        "checkpoint_every": 32,
+        "progress": False,
+    }
+    return train(stream, folder=folder, **{**settings, **changes})
+
+
+def weights(path: Path) -> dict[str, Any]:
+    return {k: v.numpy() for k, v in load_sb3(path).policy.state_dict().items()}
+
+
+def same_weights(one: Path, other: Path) -> bool:
+    a, b = weights(one), weights(other)
+    return all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def visit_files(folder: Path) -> list[Path]:
+    return [folder / "snapshots" / f"visit-0{visit}.zip" for visit in range(4)]
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory: pytest.TempPathFactory) -> TrainingResult:
+    return life(tmp_path_factory.mktemp("life") / "run")
+
+
+def test_a_life_writes_its_report_and_a_model_for_each_visit(lived: TrainingResult) -> None:
+    names = {path.name for path in lived.folder.iterdir()}
+    assert names >= {"run.json", "episodes.csv", "model.zip", "stream.json", "snapshots"}
+    assert "evaluation.json" not in names
+    assert {path.name for path in lived.figures if path.suffix == ".png"} == {
+        "training_curve.png", "retention_map.png", "performance_curve.png",
+        "dynamic_regret_curve.png",
+    }  # fmt: skip
+    snapshots = {path.name for path in (lived.folder / "snapshots").iterdir()}
+    assert snapshots == {"initial.zip", *(path.name for path in visit_files(lived.folder))}
+    record = RunRecord.read(lived.folder)
+    assert record == lived.record
+    assert (record.stream, record.stream_digest) == (STREAM, STREAM.digest)
+    assert (record.spec, record.steps, record.steps_done) == (TINY, 200, 224)
+
+
+def test_a_snapshot_has_learned_from_the_rollouts_that_were_over(lived: TrainingResult) -> None:
+    # Rollouts of 32 steps, two epochs each: one is over at 60, three at 100, five at 160. The last
+    # visit ends with the training, which finishes its last rollout.
+    updates = [load_sb3(path)._n_updates for path in visit_files(lived.folder)]
+    assert updates == [2, 6, 10, 14]
+    assert same_weights(visit_files(lived.folder)[-1], lived.model_path)
+    initial = lived.folder / "snapshots" / "initial.zip"
+    assert (load_sb3(initial)._n_updates, load_sb3(initial).num_timesteps) == (0, 0)
+
+
+def test_a_snapshot_of_td3_has_learned_from_every_step_of_the_visit(tmp_path: Path) -> None:
+    settings = {"learning_starts": 10, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    td3 = life(tmp_path / "run", algorithm="TD3", hyperparameters=settings)
+    updates = [load_sb3(path)._n_updates for path in visit_files(td3.folder)]
+    assert updates == [50, 90, 150, 190]
+    assert same_weights(visit_files(td3.folder)[-1], td3.model_path)
+
+
+def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(
+    lived: TrainingResult,
+) -> None:
+    report = StreamReport.read(lived.folder / "stream.json")
+    assert report == lived.report
+    snapshots = lived.folder / "snapshots"
+    again = evaluate_stream(
+        visit_files(lived.folder), STREAM, PROTOCOL, initial=snapshots / "initial.zip", name="PPO"
+    )
+    assert report.regions == again.regions
+    assert report.dynamic_regret is not None
+    total = sum(episode.regret * episode.length for episode in lived.episodes)
+    assert report.dynamic_regret.dynamic_regret == pytest.approx(total)
+    by_visit = [visit.online_regret for visit in report.dynamic_regret.visits]
+    assert by_visit[1] == by_visit[3] == 1.0
+    assert max(filter(None, by_visit[::2])) < 1.0
+    assert report.reference_regret.keys() >= {"frozen_optimum", "frozen_agent", "constant_half"}
+
+
+def killed(folder: Path, monkeypatch: pytest.MonkeyPatch, at_step: int) -> None:
+    """A life that ends right after the checkpoint of a step."""
+    save = learn._save_checkpoint
+
+    def save_and_end(model: Any, log: Any) -> None:
+        save(model, log)
+        if model.num_timesteps >= at_step:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learn, "_save_checkpoint", save_and_end)
+        with pytest.raises(KeyboardInterrupt):
+            life(folder)
+
+
+def test_a_resumed_life_goes_on_at_the_step_of_its_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    killed(folder, monkeypatch, at_step=96)
+    first, second, *_ = visit_files(folder)
+    assert [path.exists() for path in visit_files(folder)] == [True, False, False, False]
+    before = first.read_bytes()
+    second.write_bytes(b"of a visit that ended after the checkpoint")
+
+    resumed = life(folder, resume=True)
+    assert (resumed.record.sessions, resumed.record.steps_done) == (2, 224)
+    assert first.read_bytes() == before
+    assert [load_sb3(path)._n_updates for path in visit_files(folder)] == [2, 6, 10, 14]
+    # The episode that was cut at step 96 began again there, in phase 1, and those after it in the
+    # phases of their steps.
+    episodes = read_episodes(folder / "episodes.csv")
+    assert [e.step for e in episodes] == [20, 40, 60, 80, 116, 136, 156, 176, 196, 216]
+    barren = [e.step for e in episodes if e.regret == 1.0]
+    assert barren == [80, 116, 196, 216]
+
+
+def test_a_life_that_was_killed_after_its_last_step_ends_its_last_visit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    killed(folder, monkeypatch, at_step=224)
+    assert not visit_files(folder)[-1].exists()
+    resumed = life(folder, resume=True)
+    assert same_weights(visit_files(folder)[-1], resumed.model_path)
+
+
+def test_force_removes_the_snapshots_of_the_run_before(
+    lived: TrainingResult, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    (folder / "snapshots").mkdir(parents=True)
+    (folder / "snapshots" / "visit-09.zip").write_bytes(b"of another stream")
+    (folder / "run.json").write_bytes((lived.folder / "run.json").read_bytes())
+    with pytest.raises(OptionError, match="contains a finished run"):
+        life(folder)
+    replaced = life(folder, force=True)
+    assert not (replaced.folder / "snapshots" / "visit-09.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("other", "where"),
+    [
+        (STREAM.draw(1), r"phases\.0 differs"),
+        (STREAM.model_copy(update={"phases": STREAM.phases[::-1]}), r"phases\.0 differs"),
+        (StreamSpec(phases=STREAM.phases[:1], cycles=4), r"phases\.1 differs"),
+        (StreamSpec(phases=STREAM.phases), "cycles differs"),
+        (TINY, "has 'sha256:[0-9a-f]{64}'. Resume"),
+    ],
+)
+def test_a_life_is_not_resumed_on_another_stream(
+    other: Any, where: str, lived: TrainingResult, tmp_path: Path
+) -> None:
+    lived.record.updated(status="running").write(tmp_path)
+    with pytest.raises(OptionError, match=rf"^stream_digest='.*': the run in .*{where}"):
+        life(tmp_path, other, resume=True, steps=None if other is not TINY else 300)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_envs": 2}, "num_envs=2: must be 1 on a stream, since each environment would live"),
+        ({"num_envs": 2, "agents": "jax"}, "num_envs=2: must be 1"),
+        ({"steps": 100}, "steps=100: must be 200, since .* or make another stream"),
+        ({"steps": 0}, "steps=0: must be 200"),
+        ({"independent": True}, "independent=True: must be False"),
+        ({"algorithm": "TD4"}, "Did you mean 'TD3'"),
+        ({"stream": "Switch6"}, "'Switch6'.*Did you mean 'Switch5-v1'"),
+        ({"stream": {"phases": []}}, "phases"),
+        (
+            {"stream": {"phases": [{"spec": TINY, "steps": 50}, {"spec": TINY, "steps": 50}]},
+             "agents": "jax"},
+            r"phases\.1: begins .* step 50 of the cycle: must be a multiple of horizon=20",
+        ),
+        (
+            {"stream": {"phases": [{"spec": TINY, "steps": 60},
+                                   {"spec": TINY.derive(D=0.5), "steps": 60}]}, "agents": "jax"},
+            r"phases\.1\.spec: D=0\.5: must be 0, since agents in JAX",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_life_cannot_have_is_refused_and_creates_no_folder(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    if "agents" in change:
+        pytest.importorskip("jax")
+    with pytest.raises(SMEError, match=message):
+        life(tmp_path / "run", **change)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_life_that_is_given_its_own_steps_is_trained(lived: TrainingResult) -> None:
+    assert lived.record.steps == STREAM.steps  # without `steps`
+    assert json.loads((lived.folder / "run.json").read_text())["stream"] == STREAM.to_dict()
+
+
+def test_a_task_has_a_report_of_its_own_kind(tmp_path: Path) -> None:
+    spec = SMESpec(state_dim=1, action_dim=1, horizon=10)
+    result = life(tmp_path / "run", spec, steps=32)
+    assert not isinstance(result.report, StreamReport)
+    assert not (tmp_path / "run" / "snapshots").exists()
+    assert (result.record.stream, result.record.stream_digest) == (None, "")
