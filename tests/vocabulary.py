@@ -26,6 +26,8 @@ QUANTITIES = {
     # Performance in a stream, from the retention matrix of normalised regrets
     "initial_normalised_regret": "normalised regret of the initial policy on each phase",
     "fresh_normalised_regret": "that of an agent trained on that phase alone",
+    "visited_regret": "mean over visits of the normalised regret on the phase just visited",
+    "last_plasticity_ratio": "plasticity ratio of the last visit",
     "average_performance": "mean of 1 − normalised regret over the phases visited so far",
     "backward_transfer": "change of performance on a phase since it was last trained",
     "forgetting": "fall of performance on a phase below its best",
@@ -184,6 +186,8 @@ QUANTITIES = {
     "lanes": "runs in one program of JAX, with those that fill it up",
     "shape": "S, A, L and H to which the tasks of a program are padded",
     "agents": "number of agents",
+    "fresh_agents": "number of a life's fresh agents that have finished",
+    "without_fresh": "number of lives without all of their fresh agents",
     "attempts": "number of attempts at a cell",
     "runs": "number of runs of a class",
     "run": "index of a run",

@@ -176,6 +176,11 @@ class PlannedCell(StrictModel):
     phase: Integer | None = None
     cell: Cell
 
+    @property
+    def in_stream(self) -> bool:
+        """Whether its class is one of streams: a life, or a fresh agent."""
+        return self.phase is not None or self.cell.stream is not None
+
 
 class StudyPlan(Document):
     """A study.

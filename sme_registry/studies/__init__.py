@@ -2,6 +2,7 @@
 
     from sme_registry import studies
     results, curves = studies.load("runs/ablations")      # tidy pandas frames
+    lives = studies.load_streams("runs/continual").lives  # of agents in streams
     results[results.region == "OOD 5"].groupby("class_name").similarity.median()
 
 Names load on first use: running a study needs no pandas.
@@ -20,15 +21,18 @@ if TYPE_CHECKING:
     from sme_registry.studies.engine.status import CellStatus, StudyStatus, study_status
     from sme_registry.studies.report.compare import compare, write_comparison
     from sme_registry.studies.report.frames import StudyFrames, load
+    from sme_registry.studies.report.streams.frames import StreamFrames, load_streams
     from sme_registry.studies.report.write import write_report
 
 __all__ = [
     "CellResult",
     "CellStatus",
+    "StreamFrames",
     "StudyFrames",
     "StudyStatus",
     "compare",
     "load",
+    "load_streams",
     "run_cell",
     "run_study",
     "study_status",
@@ -40,10 +44,12 @@ __all__ = [
 _LAZY = {
     "CellResult": "studies.engine.result",
     "CellStatus": "studies.engine.status",
+    "StreamFrames": "studies.report.streams.frames",
     "StudyFrames": "studies.report.frames",
     "StudyStatus": "studies.engine.status",
     "compare": "studies.report.compare",
     "load": "studies.report.frames",
+    "load_streams": "studies.report.streams.frames",
     "run_cell": "studies.engine.cell",
     "run_study": "studies.engine.runner",
     "study_status": "studies.engine.status",

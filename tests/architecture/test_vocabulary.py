@@ -68,9 +68,10 @@ def columns() -> set[str]:
     """The columns of numbers in episodes.csv and in a study's data frames."""
     pytest.importorskip("pandas")
     from sme_registry.studies.report.frames import study_frames
+    from sme_registry.studies.report.streams.frames import stream_frames
     from sme_registry.training import episodes
 
-    frames = study_frames(catalogue.entries(StudyFile)[0].plan, {})
+    frames = [*study_frames(catalogue.entries(StudyFile)[0].plan, {}), *stream_frames([])]
     numeric = {name for frame in frames for name in frame.select_dtypes("number").columns}
     assert {"normalised_regret", "episode_return"} < numeric
     return numeric | set(episodes.COLUMNS)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.spec import StudyFile
+from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report import frames, offline_tables, tables
 from sme_registry.studies.report.classes import ClassInfo, Group, class_infos, groups
+from sme_registry.studies.report.streams.analysis import StreamAnalysis, analyse_streams
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +24,11 @@ class Analysis:
       file: the plan.
       cells: finished cells of the plan, by digest.
       classes: every class of the plan, by name; the first one first.
-      algorithms: those with a finished run, in the plan's order.
+      algorithms: those with a finished run on a single task, in the plan's order.
       learners: those of the algorithms that learn.
       groups: classes that are compared with each other.
+      streams: the lives in streams; None where the plan has no streams. All other fields are about
+        single tasks.
     """
 
     file: StudyFile
@@ -50,11 +53,29 @@ class Analysis:
     differences: pd.DataFrame
     offline_runs: pd.DataFrame
     offline: pd.DataFrame
+    streams: StreamAnalysis | None
 
     @property
     def base(self) -> str:
-        """The name of the first class."""
-        return next(iter(self.classes))
+        """The name of the first class; "" where the plan has none."""
+        return next(iter(self.classes), "")
+
+    @property
+    def seconds(self) -> float:
+        """CPU time of all finished runs."""
+        of_streams = self.streams.seconds if self.streams else 0.0
+        return float(self.runs.seconds.sum()) + of_streams
+
+    @property
+    def finished(self) -> int:
+        """How many runs have finished, lives and fresh agents included."""
+        return len(self.runs) + (self.streams.finished if self.streams else 0)
+
+    @property
+    def requested(self) -> int:
+        """How many runs have finished or are missing; `--only` may have left out others."""
+        of_streams = self.streams.requested if self.streams else 0
+        return len(self.runs) + len(self.missing) + of_streams
 
     @property
     def state_dims(self) -> list[int]:
@@ -101,7 +122,7 @@ def analyse(
     bootstrap = tables.Bootstrap(file.digest, draws)
     return Analysis(
         file=file,
-        cells={key: finished[key] for key in runs.key},
+        cells={key: finished[key] for key in _finished_keys(plan, runs, finished)},
         classes=classes,
         algorithms=names,
         learners=tuple(a.name for a in present if not a.uses.startswith("reference:")),
@@ -115,11 +136,22 @@ def analyse(
         regions=tables.regions(results),
         levels=tables.levels(results, bootstrap),
         agents=tables.agents(runs, bootstrap),
-        contrasts=tables.contrasts(runs, classes, bootstrap),
+        contrasts=tables.contrasts(runs, {n: c.axis for n, c in classes.items()}, bootstrap),
         aggregates=tables.aggregates(runs, compared, names, bootstrap),
         profiles=tables.profiles(runs, compared, names, bootstrap),
         improvements=tables.improvements(runs, compared, names, bootstrap),
         differences=tables.differences(runs, itertools.combinations(names, 2), draws=draws),
         offline_runs=offline_runs,
         offline=offline_tables.offline(offline_runs, bootstrap),
+        streams=analyse_streams(file, finished, errors or {}, requested=requested, draws=draws)
+        if plan.streams
+        else None,
     )
+
+
+def _finished_keys(
+    plan: StudyPlan, runs: pd.DataFrame, finished: Mapping[str, CellResult]
+) -> Iterable[str]:
+    """Digests of the finished cells: on single tasks in the order of the runs, then in streams."""
+    yield from runs.key
+    yield from (p.cell.digest for p in plan.cells if p.in_stream and p.cell.digest in finished)

@@ -73,8 +73,10 @@ def groups(
 ) -> tuple[Group, ...]:
     """All classes, then for each axis its classes together with the first one.
 
-    `done` are the (class, algorithm) pairs with a finished run.
+    `done` are the (class, algorithm) pairs with a finished run. There is no group without a class.
     """
+    if not classes:
+        return ()
     first, *others = classes.values()
     result = []
     unnamed = [c.axis for c in others if c.axis not in ("", *AXES, SEVERAL)]

@@ -17,9 +17,10 @@ from sme_registry.io import refuse_unwritable, to_json, write_atomically
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
-from sme_registry.studies.report.exports import TextTable, difference_table
+from sme_registry.studies.report.exports import difference_table
 from sme_registry.studies.report.frames import StudyFrames, load, plan_file, runs
 from sme_registry.studies.report.tables import METRICS, Metric, differences
+from sme_registry.studies.report.text import TextTable
 
 __all__ = ["compare", "comparison_tables", "implementation_caveats", "write_comparison"]
 

@@ -1,66 +1,57 @@
 """A study's frames as files: every number as CSV, and the tables that people read as LaTeX.
 
-A `TextTable` holds finished text, for a paper and for the report's page. `tables` documents the
-columns of the CSV files.
+`text` has the building blocks of the latter. `tables` documents the columns of the CSV files.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.latex import latex_table
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.streams.texts import stream_csv, stream_tables
 from sme_registry.studies.report.tables import AGENT_METRICS, ENOUGH_RUNS, METRICS, Metric
+from sme_registry.studies.report.text import (
+    TextTable,
+    change_text,
+    level_text,
+    slug,
+    wide,
+    with_interval,
+)
 from sme_registry.terminal.templates import fixed, signed
 
 CSV_TABLES = (
     "results", "curves", "counts", "missing", "contrasts", "levels", "regions", "aggregates",
     "profiles", "improvements", "differences", "learning_curves",
 )  # fmt: skip
-ABSENT = "–"
 _STATISTICS = {"iqm": "IQM", "median": "median", "optimality_gap": "optimality gap"}
 _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
-
-
-@dataclass(frozen=True, eq=False)
-class TextTable:
-    """A table for people, with the name of its files, a title, and a note on how to read it.
-
-    All columns of its frame are text; the first `names` of them name the rows.
-    """
-
-    name: str
-    title: str
-    note: str
-    frame: pd.DataFrame
-    names: int = 1
-    label: str = ""  # of LaTeX; by default the name
-
-    def latex(self) -> str:
-        """As a LaTeX `table` that fits a column of two; ASCII only."""
-        caption = f"{self.title}. {self.note}"
-        return latex_table(
-            self.frame, names=self.names, caption=caption, label=self.label or self.name
-        )
 
 
 def csv_tables(analysis: Analysis) -> dict[str, str]:
     """Every frame of the study as CSV, by name; floats read back as they are."""
     optional = {"offline": analysis.has_offline_runs, "agents": analysis.has_teams}
     names = [*CSV_TABLES, *(name for name, present in optional.items() if present)]
-    frames = {name: getattr(analysis, name) for name in names}
+    frames = {name: getattr(analysis, name) for name in names if analysis.classes}
+    if analysis.streams is not None:
+        frames |= stream_csv(analysis.streams)
     return {name: f.to_csv(index=False, lineterminator="\n") for name, f in frames.items()}
 
 
 def text_tables(analysis: Analysis) -> list[TextTable]:
     """What people read: settings down, algorithms across. Tables without rows are left out."""
     tables = [
+        *(_task_tables(analysis) if analysis.algorithms else ()),
+        *(stream_tables(analysis.streams) if analysis.streams is not None else ()),
+    ]
+    return [table for table in tables if not table.frame.empty]
+
+
+def _task_tables(analysis: Analysis) -> list[TextTable]:
+    return [
         *(offline_tables(analysis) if analysis.has_offline_runs else ()),
         *(_levels(analysis, metric) for metric in METRICS),
         *(_agents(analysis, metric) for metric in AGENT_METRICS),
@@ -71,14 +62,13 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
         _improvements(analysis),
         _counts(analysis),
     ]
-    return [table for table in tables if not table.frame.empty]
 
 
 def offline_tables(analysis: Analysis) -> list[TextTable]:
     """The behaviour policies next to the learners, and the differences."""
     rows = analysis.offline.assign(nu=analysis.offline.nu.map("{:g}".format))
     at = {"class_name": "class", "nu": "ν"}
-    similarity = _wide(
+    similarity = wide(
         rows, at, "learner", lambda row: _mean(row.similarity, row.similarity_sd, row.runs)
     )
     data = rows.drop_duplicates(["class_name", "nu"])
@@ -105,7 +95,7 @@ def offline_tables(analysis: Analysis) -> list[TextTable]:
             f"Mean over runs, with its 95 % bootstrap interval from {OFFLINE_INTERVAL} runs on. "
             "†: above its data, *: below, by an interval that excludes 0 and rests on at least "
             f"{ENOUGH_RUNS} runs.",
-            _wide(rows, at, "learner", _improvement),
+            wide(rows, at, "learner", _improvement),
             names=2,
         ),
     ]
@@ -118,8 +108,8 @@ def _levels(analysis: Analysis, metric: Metric) -> TextTable:
         f"levels-{metric.key.replace('_', '-')}",
         f"{metric.label[0].upper()}{metric.label[1:]} by class",
         "IQM over runs, with its 95 % bootstrap interval.",
-        _wide(
-            rows, {"class_name": "class"}, "algorithm", lambda row: _level(row, metric),
+        wide(
+            rows, {"class_name": "class"}, "algorithm", lambda row: level_text(row, metric),
             analysis.algorithms,
         ),
     )  # fmt: skip
@@ -133,9 +123,9 @@ def _agents(analysis: Analysis, metric: Metric) -> TextTable:
         f"{metric.label[0].upper()}{metric.label[1:]} of each agent",
         "IQM over runs, with its 95 % bootstrap interval, over the action channels that the agent "
         "owns.",
-        _wide(
+        wide(
             rows, {"class_name": "class", "agent": "agent"}, "algorithm",
-            lambda row: _level(row, metric), analysis.algorithms,
+            lambda row: level_text(row, metric), analysis.algorithms,
         ),
         names=2,
     )  # fmt: skip
@@ -156,9 +146,9 @@ def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False
     pairs = list(dict.fromkeys(rows.pair))
     between = pairs[0] if len(pairs) == 1 else f"{''.join(rows['first'][:1])} minus each other"
     name = f"differences-{metric.key.replace('_', '-')}"
-    frame = _wide(
+    frame = wide(
         rows, {"class_name": "class"}, "pair",
-        lambda row: _change(row, row.difference, metric.digits + 1),
+        lambda row: change_text(row, row.difference, metric.digits + 1),
     )  # fmt: skip
     for place, side in enumerate(("first", "second")) if levels else ():
         texts = [fixed(value, metric.digits + 1) for value in rows[f"{side}_level"]]
@@ -173,7 +163,7 @@ def difference_table(rows: pd.DataFrame, metric: Metric, *, levels: bool = False
         f"Difference of {metric.label}, {between}",
         " ".join([note, *difference_caveats(rows)]),
         frame,
-        label=f"{name}-{_slug(pairs[0])}" if levels else "",
+        label=f"{name}-{slug(pairs[0])}" if levels else "",
     )
 
 
@@ -195,9 +185,9 @@ def difference_caveats(rows: pd.DataFrame) -> list[str]:
 
 def _contrasts(analysis: Analysis, metric: Metric) -> TextTable:
     rows = analysis.contrasts[analysis.contrasts.metric == metric.key]
-    frame = _wide(
+    frame = wide(
         rows, {"class_name": "class"}, "algorithm",
-        lambda row: _change(row, row.change, metric.digits), analysis.algorithms,
+        lambda row: change_text(row, row.change, metric.digits), analysis.algorithms,
     )  # fmt: skip
     frame.insert(1, "setting", [analysis.classes[name].label for name in frame["class"]])
     return TextTable(
@@ -213,11 +203,11 @@ def _contrasts(analysis: Analysis, metric: Metric) -> TextTable:
 def _regions(analysis: Analysis, algorithm: str) -> TextTable:
     rows = analysis.regions[analysis.regions.algorithm == algorithm]
     return TextTable(
-        f"regions-{_slug(algorithm)}",
+        f"regions-{slug(algorithm)}",
         f"Similarity r̃ of {algorithm} by region",
         "IQM over runs; 1 is the optimum. In brackets the normalised regret: 0 for the optimum, 1 "
         "for the constant ½.",
-        _wide(
+        wide(
             rows,
             {"class_name": "class"},
             "region",
@@ -234,7 +224,7 @@ def _aggregates(analysis: Analysis) -> TextTable:
         "Aggregates of 1 − normalised regret",
         "Means over classes of a statistic over runs, with 95 % stratified bootstrap intervals. "
         "For the optimality gap less is better.",
-        _wide(rows, at, "algorithm", lambda row: _with_interval(row.value, row)),
+        wide(rows, at, "algorithm", lambda row: with_interval(row.value, row)),
         names=3,
     )
 
@@ -247,7 +237,7 @@ def _improvements(analysis: Analysis) -> TextTable:
         "improvements",
         "Probability of improvement",
         "That a run of the first algorithm beats one of the second, on a class drawn at random.",
-        _wide(rows, at, "metric", lambda row: _with_interval(row.probability, row)),
+        wide(rows, at, "metric", lambda row: with_interval(row.probability, row)),
         names=2,
     )
 
@@ -261,62 +251,14 @@ def _counts(analysis: Analysis) -> TextTable:
         "counts",
         "Finished runs",
         "Missing runs are part of no other number.",
-        _wide(analysis.counts, {"class_name": "class"}, "algorithm", entry),
+        wide(analysis.counts, {"class_name": "class"}, "algorithm", entry),
     )
-
-
-def _wide(
-    rows: pd.DataFrame,
-    index: dict[str, str],
-    across: str,
-    entry: Callable[[Any], str],
-    order: Sequence[str] = (),
-) -> pd.DataFrame:
-    """A long table as text: a column for each value of `across`, in the order of the rows.
-
-    `index` has the columns that name the rows, and their headings; `order` is of the new columns.
-    """
-    lines: dict[tuple[Any, ...], dict[str, str]] = {}
-    for row in rows.itertuples():
-        place = tuple(getattr(row, name) for name in index)
-        lines.setdefault(place, {})[getattr(row, across)] = entry(row)
-    names = [name for name in order or dict.fromkeys(rows[across]) if name in set(rows[across])]
-    wide = pd.DataFrame(
-        [dict(zip(index.values(), place, strict=True)) | line for place, line in lines.items()],
-        columns=[*index.values(), *names],
-    )
-    return wide.fillna(ABSENT)
-
-
-def _slug(name: str) -> str:
-    """A name with `-` for everything but letters and digits."""
-    return "".join(letter if letter.isalnum() else "-" for letter in name.replace(" − ", "-"))
-
-
-def _level(row: Any, metric: Metric) -> str:
-    count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
-    return _with_interval(row.iqm, row, metric.digits) + count
-
-
-def _change(row: Any, change: float, digits: int) -> str:
-    count = "" if row.enough_pairs else " (1 pair)" if row.pairs == 1 else f" (n = {row.pairs})"
-    mark = {"worse": " *", "better": " †"}.get(row.verdict, "") if row.enough_pairs else ""
-    return _with_interval(change, row, digits, signed) + count + mark
 
 
 def _improvement(row: Any) -> str:
     count = "" if row.runs >= ENOUGH_RUNS else f" (n = {row.runs})"
     mark = {"above": " †", "below": " *"}.get(row.verdict, "")
-    return _with_interval(row.improvement, row, 3, signed) + count + mark
-
-
-def _with_interval(
-    value: float, row: Any, digits: int = 2, text: Callable[[float, int], str] = fixed
-) -> str:
-    """A number with the row's interval; without it where it is unknown."""
-    if math.isnan(row.low):
-        return text(value, digits)
-    return f"{text(value, digits)} [{text(row.low, digits)}, {text(row.high, digits)}]"
+    return with_interval(row.improvement, row, 3, signed) + count + mark
 
 
 def _mean(value: float, sd: float, runs: int) -> str:

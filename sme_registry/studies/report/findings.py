@@ -11,13 +11,17 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
+from pydantic import SerializerFunctionWrapHandler, model_serializer
+
 from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel, TupleOf
+from sme_registry.studies.engine.result import without_empty
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.offline_findings import THRESHOLDS as OFFLINE
 from sme_registry.studies.report.offline_findings import OfflineFindings, offline_findings
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
+from sme_registry.studies.report.streams.findings import StreamFindings, stream_findings
 from sme_registry.studies.report.tables import ENOUGH_RUNS, training_data
 
 __all__ = [
@@ -150,13 +154,18 @@ class Findings(StrictModel):
     schema_version: SchemaVersion = 1
     study: str  # name and version of the plan
     digest: Digest  # of the plan
-    base: str  # the plan's first class, with which the others are contrasted
+    base: str  # the plan's first class, with which the others are contrasted; "" without classes
     thresholds: dict[str, Real]  # see `THRESHOLDS`
     algorithms: TupleOf[AlgorithmFinding]  # those that learn
     steps: dict[str, Integer]  # training steps of those compared, if they differ
     best: TupleOf[Best]  # one for each data set that algorithms share
     caveats: Caveats
     offline: OfflineFindings | None  # what learning from data adds; None without such runs
+    streams: StreamFindings | None = None  # None, and left out of the JSON, without streams
+
+    @model_serializer(mode="wrap")
+    def _omit_no_streams(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_empty(handler(self), "streams")
 
 
 def findings(analysis: Analysis) -> Findings:
@@ -174,6 +183,7 @@ def findings(analysis: Analysis) -> Findings:
         best=tuple(_best(analysis, compared)),
         caveats=_caveats(analysis),
         offline=offline_findings(analysis) if analysis.has_offline_runs else None,
+        streams=None if analysis.streams is None else stream_findings(analysis.streams),
     )
 
 
@@ -350,7 +360,8 @@ def _improvements(analysis: Analysis, best: str, among: set[str]) -> Iterable[Ri
 def _caveats(analysis: Analysis) -> Caveats:
     rows, missing = analysis.contrasts, analysis.missing
     rows = rows[rows.algorithm.isin(analysis.learners)]
-    policy_init = analysis.classes[analysis.base].setting["policy_init"]
+    base = analysis.classes.get(analysis.base)
+    policy_init = None if base is None else base.setting["policy_init"]
     intervals = int(((rows.metric == _WD) & rows.low.notna()).sum())
     return Caveats(
         planned=len(analysis.runs) + len(missing),

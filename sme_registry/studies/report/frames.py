@@ -67,7 +67,7 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 
 RUN = ["class_name", "algorithm", "run"]
-_PLACE = "class_name:str algorithm:str run:int64 "
+RUN_COLUMNS = "class_name:str algorithm:str run:int64 "  # columns of `RUN`, for `frame`
 _REGION = """region:str epsilon_low epsilon_high states:int64 similarity similarity_sd mae
     normalised_regret similarity_decay similarity_loss clipped_share linear_normalised_regret
     best_constant_normalised_regret random_normalised_regret constant_similarity """
@@ -76,7 +76,7 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
-_CURVES = _PLACE + "step:int64 episode_return regret similarity length"
+CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
 AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
 _RUN_OF_AGENT = tuple(f"{column}/" for column in AGENT_COLUMNS[1:])
@@ -143,15 +143,15 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
     finished = [
         (cell, result, result.report)
         for cell, result in planned
-        if result is not None and result.report is not None and cell.phase is None
+        if result is not None and result.report is not None and not cell.in_stream
     ]
     rows = [row for each in finished for row in _result_rows(*each)]
-    evaluations = [row for cell, result, _ in finished for row in _curve_rows(cell, result)]
+    evaluations = [row for cell, result, _ in finished for row in curve_rows(cell, result)]
     agents = list(dict.fromkeys(name for *_, report in finished for name in report.agents))
     by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
     regrets = " ".join(f" regret/{name}" for name in agents)
     return StudyFrames(
-        frame(rows, _PLACE + _REGION + _RUN + by_agent), frame(evaluations, _CURVES + regrets)
+        frame(rows, RUN_COLUMNS + _REGION + _RUN + by_agent), frame(evaluations, CURVES + regrets)
     )
 
 
@@ -189,7 +189,7 @@ def window(evaluations: int) -> int:
 def _result_rows(
     cell: PlannedCell, result: CellResult, report: EvaluationReport
 ) -> Iterator[dict[str, Any]]:
-    run = _place(cell) | _run_columns(result, report)
+    run = place(cell) | _run_columns(result, report)
     references = report.references
     for index, region in enumerate(report.regions):
         regrets = {c: references[name][index].normalised_regret for c, name in _REFERENCES.items()}
@@ -207,7 +207,8 @@ def _result_rows(
         }
 
 
-def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
+    """The rows of `curves` of one run."""
     curve = result.curve
     columns = {
         "step": curve.steps,
@@ -216,10 +217,11 @@ def _curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any
         **{f"regret/{name}": regrets for name, regrets in curve.agents_regret.items()},
     }
     for evaluation in zip(*columns.values(), strict=True):
-        yield _place(cell) | dict(zip(columns, evaluation, strict=True))
+        yield place(cell) | dict(zip(columns, evaluation, strict=True))
 
 
-def _place(cell: PlannedCell) -> dict[str, Any]:
+def place(cell: PlannedCell) -> dict[str, Any]:
+    """The columns `RUN` of a cell."""
     return {name: getattr(cell, name) for name in RUN}
 
 

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import base64
 import itertools
+import operator
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import pandas as pd
 from markupsafe import Markup
 
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL
-from sme_registry.studies.report.exports import TextTable
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import Findings
+from sme_registry.studies.report.text import TextTable
 from sme_registry.terminal import duration
 from sme_registry.terminal.templates import environment, plural
 
@@ -38,6 +40,7 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("aggregates", "profiles", "improvements", "differences"),
     ),
     "learning": ("Learning", ("learning-curves",)),
+    "streams": ("Lives in streams", ("stream-",)),
     "absent": ("Figures that could not be drawn", ()),
     "tables": ("Tables", ()),
     "origin": ("Origin of the numbers", ()),
@@ -57,22 +60,25 @@ def page(
     templates = environment(folder / "templates", autoescape=True)
     templates.filters |= {
         "base64": lambda data: base64.b64encode(data).decode("ascii"),
-        "by_class": lambda places: itertools.groupby(places, key=lambda place: place.class_name),
+        "by": lambda entries, name: itertools.groupby(entries, key=operator.attrgetter(name)),
     }
     by_section = {
         key: [figure for figure in figures if figure.name.startswith(prefixes)]
         for key, (_, prefixes) in _SECTIONS.items()
     }
-    required = {"findings", "tables", "origin"}
+    required = {"tables", "origin"}
+    required |= {"findings"} if analysis.classes else set()
     required |= {"offline"} if findings.offline else set()
+    required |= {"streams"} if findings.streams else set()
     required |= {"absent"} if absent else set()
     offline = [table for table in tables if table.name.startswith("offline")]
     return templates.get_template("page.html.jinja").render(
         file=analysis.file,
         plan=analysis.file.plan,
-        done=len(analysis.runs),
-        requested=_requested(analysis),
-        never_requested=len(analysis.file.plan.cells) - _requested(analysis),
+        kinds=_kinds(analysis),
+        done=analysis.finished,
+        requested=analysis.requested,
+        never_requested=_planned(analysis) - analysis.requested,
         style=Markup((folder / "page.css").read_text(encoding="utf-8")),
         sections={
             key: heading
@@ -87,21 +93,40 @@ def page(
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
         absent=absent,
         origin=_origin(analysis),
-        missing=list(analysis.missing.itertuples()),
+        missing=_missing(analysis),
         max_missing=_MAX_MISSING,
     )
 
 
-def _requested(analysis: Analysis) -> int:
-    """How many runs have finished or are missing; `--only` may have left out others."""
-    return len(analysis.runs) + len(analysis.missing)
+def _planned(analysis: Analysis) -> int:
+    """Runs of the plan: on single tasks all, in streams those that differ."""
+    of_tasks = sum(not cell.in_stream for cell in analysis.file.plan.cells)
+    return of_tasks + (analysis.streams.planned if analysis.streams else 0)
+
+
+def _kinds(analysis: Analysis) -> list[str]:
+    """`3 classes`, `2 streams`: what the plan has of each."""
+    plan = analysis.file.plan
+    classes = [plural(len(plan.classes), "class", "classes")] if plan.classes else []
+    return [*classes, plural(len(plan.streams), "stream")] if plan.streams else classes
+
+
+def _missing(analysis: Analysis) -> list[tuple[str, str]]:
+    """What each missing run is, and its error."""
+    rows = [(f"{r.algorithm} on {r.class_name}, run {r.run}", r.error)
+            for r in analysis.missing.itertuples()]  # fmt: skip
+    for r in () if analysis.streams is None else analysis.streams.missing.itertuples():
+        fresh = "" if pd.isna(r.phase) else f", fresh agent of phase {r.phase}"
+        rows.append((f"{r.algorithm} on {r.class_name}, run {r.run}{fresh}", r.error))
+    return rows
 
 
 def _in_jax(analysis: Analysis) -> list[str]:
     """The algorithms that run in JAX, if others beside them learn without it."""
     of_plan = {algorithm.name: algorithm.uses for algorithm in analysis.file.plan.algorithms}
-    ours = [name for name in analysis.learners if in_jax(of_plan[name])]
-    return ours if len(ours) < len(analysis.learners) else []
+    learners = {*analysis.learners, *(analysis.streams.algorithms if analysis.streams else ())}
+    ours = [name for name in of_plan if name in learners and in_jax(of_plan[name])]
+    return ours if len(ours) < len(learners) else []
 
 
 def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
@@ -110,14 +135,15 @@ def _origin(analysis: Analysis) -> Iterable[tuple[str, str, str]]:
     states = f"{plan.protocol.states_per_region:,} states per region"
     yield "plan", file.digest, file.versioned_name
     yield "protocol", plan.protocol.digest, states
-    runs = f"{len(analysis.runs):,} of {plural(_requested(analysis), 'run')}"
-    yield "runs", "", f"{runs} finished, in {duration(analysis.runs.seconds.sum())} of CPU time"
+    runs = f"{analysis.finished:,} of {plural(analysis.requested, 'run')}"
+    yield "runs", "", f"{runs} finished, in {duration(analysis.seconds)} of CPU time"
     episodes = plural(plan.evaluation_episodes, "episode")
     yield "evaluations", "", f"{plan.evaluations:,} during training, {episodes} each"
     for algorithm in plan.algorithms:
         steps = plan.steps if algorithm.steps is None else algorithm.steps
         settings = ", ".join(f"{k} = {v}" for k, v in sorted(algorithm.hyperparameters.items()))
-        text = f"{steps:,} steps, {algorithm.action_range} actions"
+        budget = f"{steps:,} steps, " if plan.classes else ""
+        text = f"{budget}{algorithm.action_range} actions"
         yield algorithm.name, algorithm.uses, f"{text}, {settings or 'default hyperparameters'}"
     programs = (result.program for result in analysis.cells.values())
     kinds = Counter((each.device, each.lanes) for each in programs if each is not None)

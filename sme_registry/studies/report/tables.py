@@ -37,7 +37,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +47,7 @@ import pandas as pd
 from sme_registry import statistics
 from sme_registry.spec import StudyPlan
 from sme_registry.statistics import Array, Statistic
-from sme_registry.studies.report.classes import ALL, ClassInfo, Group
+from sme_registry.studies.report.classes import ALL, Group
 from sme_registry.studies.report.frames import frame, ordered, runs, window
 
 # With fewer runs an interval is an indication only. Of normal, exponential and two-humped runs, a
@@ -120,7 +120,8 @@ def missing(
     rows = [
         (cell.class_name, cell.algorithm, cell.run, errors.get(cell.cell.digest, ""))
         for cell in plan.cells
-        if cell.cell.digest not in done
+        if not cell.in_stream
+        and cell.cell.digest not in done
         and (requested is None or cell.cell.digest in requested or cell.cell.digest in errors)
     ]
     return frame(rows, f"{_PLACE} run:int64 error:str")
@@ -186,16 +187,22 @@ def agents(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
 
 
 def contrasts(
-    runs: pd.DataFrame, classes: Mapping[str, ClassInfo], bootstrap: Bootstrap
+    runs: pd.DataFrame,
+    axes: Mapping[str, str],
+    bootstrap: Bootstrap,
+    metrics: Sequence[Metric] = METRICS,
 ) -> pd.DataFrame:
-    """What each class changes compared with the plan's first one, between runs of equal number."""
-    first = next(iter(classes))
-    keys = [metric.key for metric in METRICS]
+    """What each class changes compared with the plan's first one, between runs of equal number.
+
+    `axes` has the axis of every class, by name.
+    """
+    first = next(iter(axes), "")
+    keys = [metric.key for metric in metrics]
     base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
     pairs = runs[runs.class_name != first].merge(base, on=["algorithm", "run"], suffixes=("", "_0"))
     rows = []
     for place, group in by_place(pairs).items():
-        for metric in METRICS:
+        for metric in metrics:
             both = group[[metric.key, f"{metric.key}_0"]].dropna().to_numpy()
             if not len(both):
                 continue
@@ -205,7 +212,7 @@ def contrasts(
             middle = _iqm(change)
             verdict = contrast_verdict(middle * metric.worse, low, high)
             rows.append(
-                (*place, metric.key, classes[place[0]].axis, before, level, middle, low, high,
+                (*place, metric.key, axes[place[0]], before, level, middle, low, high,
                  len(both), len(both) >= ENOUGH_RUNS, verdict)
             )  # fmt: skip
     columns = "axis:str base level change low high pairs:int64 enough_pairs:bool verdict:str"
@@ -217,15 +224,17 @@ def differences(
     pairs: Iterable[tuple[str, str]],
     metrics: Sequence[Metric] = METRICS,
     draws: int = statistics.DRAWS,
+    instance: str = "spec_digest",
 ) -> pd.DataFrame:
     """How the first algorithm of each pair differs from the second, on each class and on all.
 
     Two runs of equal number on a class have the same instance and seed, and form a pair. The
     intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
+    `instance` is the column that says on which instance a run is.
     """
     rows = []
     for (first, second), metric in itertools.product(pairs, metrics):
-        paired = _paired(runs, first, second, metric.key)
+        paired = _paired(runs, first, second, metric.key, instance)
         classes = {name: both for name, (both, _) in paired.items()}
         bootstrap = Bootstrap(" ".join(("difference", *sorted((first, second)))), draws)
         instances = {name: count for name, (_, count) in paired.items()}
@@ -252,19 +261,19 @@ def differences(
 
 
 def _paired(
-    runs: pd.DataFrame, first: str, second: str, metric: str
+    runs: pd.DataFrame, first: str, second: str, metric: str, instance: str
 ) -> dict[str, tuple[Array, int]]:
     """By class, `[n, 2]` values of both algorithms in runs on the same instance with one seed.
 
     Next to them the number of different instances.
     """
-    on = ["class_name", "spec_digest", "seed"]
+    on = ["class_name", instance, "seed"]
     left, right = (runs.loc[runs.algorithm == name, [*on, metric]] for name in (first, second))
     both = left.merge(right, on=on, suffixes=("_1", "_2")).dropna()
     return {
         str(name): (
             group[[f"{metric}_1", f"{metric}_2"]].to_numpy(),
-            int(group.spec_digest.nunique()),
+            int(group[instance].nunique()),
         )
         for name, group in both.groupby("class_name", sort=False)
     }
@@ -354,8 +363,13 @@ def improvements(
     return frame(rows, f"group:str metric:str {columns}")
 
 
-def learning_curves(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
-    """Median and quartiles over runs, then the running median over a window of evaluations."""
+def learning_curves(
+    curves: pd.DataFrame, runs: pd.DataFrame, window: Callable[[int], int] = window
+) -> pd.DataFrame:
+    """Median and quartiles over runs, then the running median over a window of evaluations.
+
+    `window` is the number of evaluations in it, by their number in the shortest run.
+    """
     horizons = runs.groupby("class_name").horizon.first()
     columns = f"{_PLACE} measure:str step:int64 median q25 q75 runs:int64 window:int64"
     tables = [frame([], columns)]

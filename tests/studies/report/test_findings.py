@@ -327,7 +327,7 @@ def headline(finding: AlgorithmFinding, base: str = "hard") -> str:
 
     templates = environment(Path(module.__file__).parent / "templates", autoescape=True)
     templates.globals |= {"axes": AXES, "several": SEVERAL}
-    templates.filters["by_class"] = list
+    templates.filters["by"] = list
     words: Any = templates.get_template("findings.jinja").module
     return " ".join(str(words.headline(finding, base)).split())
 

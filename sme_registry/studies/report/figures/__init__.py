@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sme_registry.studies.report.analysis import Analysis
-from sme_registry.studies.report.figures import comparisons, curves, differences, maps
+from sme_registry.studies.report.figures import comparisons, curves, differences, maps, streams
 from sme_registry.studies.report.figures.panels import Picture
 
 __all__ = ["Picture", "draw_figures"]
@@ -44,6 +44,14 @@ def draw_figures(
     Raises:
       MissingDependencyError: Matplotlib is not installed.
     """
+    pictures, reasons = _draw_tasks(analysis, formats, models) if analysis.algorithms else ([], [])
+    return [*pictures, *streams.draw_streams(analysis, formats)], reasons
+
+
+def _draw_tasks(
+    analysis: Analysis, formats: Sequence[str], models: Mapping[str, Path]
+) -> tuple[list[Picture], list[str]]:
+    """The figures of runs on single tasks."""
     plane = maps.draw_maps(analysis, formats, models)
     pictures = [
         *comparisons.draw_contrasts(analysis, formats),

@@ -1,0 +1,261 @@
+"""Figures of the streams of a study: what lives cost and retain, and whether agents still learn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from sme_registry.evaluation.continual.report import Visit
+from sme_registry.plots.streams import (
+    MATRIX_SCALE,
+    draw_matrix,
+    performance_curve,
+    shade_visits,
+    tick_visits,
+)
+from sme_registry.plots.style import GREY, legend_below, literal
+from sme_registry.studies.report.analysis import Analysis
+from sme_registry.studies.report.figures import panels
+from sme_registry.studies.report.figures.comparisons import name_rows
+from sme_registry.studies.report.figures.curves import curves_caption, line_with_band, step_text
+from sme_registry.studies.report.figures.panels import Look, Picture
+from sme_registry.studies.report.streams.analysis import StreamAnalysis
+from sme_registry.studies.report.streams.tables import METRICS, WITHIN
+from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS
+from sme_registry.studies.report.text import slug
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SHOWN = ("average_performance", "forgetting", "plasticity_ratio", "learning_transfer")
+_NEUTRAL = {"plasticity_ratio": 1.0}  # of a metric; 0 for all others
+_MEASURE = "regret"
+_HEIGHTS = 0.9, 2.3  # inches: of the rest, and of a row of panels
+_INTERVAL = (
+    "IQM over lives with its 95 % bootstrap interval, within distribution. "
+    f"Hollow: fewer than {ENOUGH_RUNS} lives, so that the interval is an indication only."
+)
+_FRESH = Look(GREY, "", (0, (4, 2)))
+_QUARTILES = "Median over lives, with the interquartile range as a band."
+
+
+def draw_streams(analysis: Analysis, formats: Sequence[str]) -> Iterator[Picture]:
+    """Every figure of the finished lives; none without one."""
+    streams = analysis.streams
+    if streams is None or not streams.lives:
+        return
+    names = dict.fromkeys((*analysis.learners, *streams.algorithms))
+    looks = {a: look for a, look in panels.numbered_looks(names).items() if a in streams.algorithms}
+    yield _draw_metrics(streams, formats, looks)
+    yield _draw_regret(streams, formats, looks)
+    yield from _draw_plasticity(streams, formats, looks)
+    for name in _lived(streams):
+        yield _draw_retention(streams, formats, name)
+        yield _draw_performance(streams, formats, name)
+    yield from _draw_learning_curves(streams, formats, looks)
+
+
+def _draw_metrics(
+    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+) -> Picture:
+    """The metrics of whole lives, one panel a metric and one row a stream."""
+    rows = streams.metrics[streams.metrics.region == WITHIN]
+    metrics = [m for m in METRICS if m.key in _SHOWN and m.key in set(rows.metric)]
+    place = {name: float(i) for i, name in enumerate(_lived(streams))}
+    height = 1.3 + (0.09 * len(looks) + 0.12) * max(3, len(place))
+    with panels.panel_grid(len(metrics), formats, (0.0, height), most_across=4) as grid:
+        for axes, metric in zip(grid.panels, metrics, strict=True):
+            selected = rows[rows.metric == metric.key]
+            at, enough = selected.class_name.map(place), selected.runs >= ENOUGH_RUNS
+            panels.marks_by_algorithm(axes, selected, "iqm", at, enough, looks)
+            axes.axvline(_NEUTRAL.get(metric.key, 0.0), color="black", linewidth=0.9, zorder=1.5)
+            axes.set_xlabel(f"{metric.label}\n({'less' if metric.worse > 0 else 'more'} is better)")
+            axes.locator_params(axis="x", nbins=4)
+        name_rows(grid, place)
+        panels.legend(grid.figure, looks)
+    return Picture(
+        "stream-metrics",
+        "Performance, forgetting and plasticity of whole lives",
+        f"{_INTERVAL} Black lines: the constant ½, no forgetting, and as good as a fresh agent.",
+        grid.files,
+    )
+
+
+def _draw_regret(
+    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+) -> Picture:
+    """The dynamic regret over the lifetime, one panel a stream."""
+    looks = {algorithm: look._replace(dash="-") for algorithm, look in looks.items()}
+    with panels.panel_grid(len(_lived(streams)), formats, _HEIGHTS) as grid:
+        for axes, name in zip(grid.panels, _lived(streams), strict=True):
+            rows = streams.regret[streams.regret.class_name == name]
+            for algorithm, look in looks.items():
+                curve = rows[rows.algorithm == algorithm]
+                fresh = look._replace(marker="", dash=_FRESH.dash)
+                axes.plot(curve.lifetime, curve.fresh, **fresh.line, linewidth=1.1, zorder=2.5)
+            _draw_lines(axes, rows, "lifetime", looks)
+            _finish_lifetime(axes, streams, name)
+        grid.label_rows("dynamic regret  (Σ of 1 − r)")
+        any_fresh = streams.regret.fresh.notna().any()
+        fresh_look = {"fresh agents": _FRESH} if any_fresh else {}
+        panels.legend(grid.figure, {**looks, **fresh_look})
+    caption = (
+        f"{_QUARTILES} The regret of every step, summed over the lifetime; shades and numbers "
+    )
+    caption += "above are visits and their phases."
+    if any_fresh:
+        caption += (
+            " Dashed, in the colour of the algorithm: agents that start anew in each visit, spread "
+            "evenly over it. A life below its dashed line learns faster than fresh agents."
+        )
+    return Picture("stream-regret", "Dynamic regret", caption, grid.files)
+
+
+def _draw_plasticity(
+    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+) -> Iterator[Picture]:
+    """The plasticity ratio by visit, one panel a stream."""
+    rows = streams.visit_metrics
+    rows = rows[(rows.region == WITHIN) & (rows.metric == "plasticity_ratio")]
+    names = [name for name in _lived(streams) if name in set(rows.class_name)]
+    if not names:
+        return
+    with panels.panel_grid(len(names), formats, _HEIGHTS) as grid:
+        for axes, name in zip(grid.panels, names, strict=True):
+            selected = rows[rows.class_name == name]
+            for algorithm, look, shift in panels.side_by_side(looks, 0.4):
+                own = selected[selected.algorithm == algorithm]
+                enough = own.runs >= ENOUGH_RUNS
+                panels.marks(
+                    axes, own, "iqm", own.visit + shift, enough, look, upright=True, joined=True
+                )
+            axes.axhline(1.0, color="black", linewidth=0.9, zorder=1.5)
+            tick_visits(axes, _visits(streams, name))
+            axes.set_xlabel("visit of phase")
+            axes.set_title(literal(name))
+        grid.label_rows("plasticity ratio")
+        panels.legend(grid.figure, looks)
+    yield Picture(
+        "stream-plasticity",
+        "Plasticity by visit",
+        "Normalised regret on the phase just visited, divided by that of a fresh agent after as "
+        f"many steps on that phase alone: above 1, plasticity was lost. {_INTERVAL} In its first "
+        "visit a life is a fresh agent itself: other values than 1 are no matter of plasticity.",
+        grid.files,
+    )
+
+
+def _draw_retention(streams: StreamAnalysis, formats: Sequence[str], name: str) -> Picture:
+    """The retention matrices of one stream, one panel an algorithm."""
+    rows = streams.matrices
+    rows = rows[(rows.region == WITHIN) & (rows.class_name == name)]
+    names = [algorithm for algorithm in streams.algorithms if algorithm in set(rows.algorithm)]
+    visits, top = _visits(streams, name), max(1.0, rows.iqm.max())
+    initial = int(rows.visit.isna().any())
+    labels = [*["initial"] * initial, *(f"visit {visit.visit}" for visit in visits)]
+    visited = [(visit.visit + initial, visit.phase) for visit in visits]
+    height = 0.55 + 0.24 * min(len(labels), 30)
+    with panels.panel_grid(len(names), formats, (1.0, height), share_x=True) as grid:
+        for axes, algorithm in zip(grid.panels, names, strict=True):
+            own = rows[rows.algorithm == algorithm].assign(visit=lambda r: r.visit.fillna(-1))
+            M = own.pivot(index="visit", columns="phase", values="iqm").to_numpy()
+            image = draw_matrix(axes, M, visited, labels, top)
+            axes.set_title(literal(algorithm))
+        grid.label_rows("policy at the end of")
+        grid.label_columns("on the task of phase")
+        bar = grid.figure.colorbar(
+            image, ax=grid.panels, location="bottom", shrink=0.5, aspect=40, pad=0.02,
+            label=MATRIX_SCALE.replace("\n", " "),
+        )  # fmt: skip
+        bar.outline.set_visible(False)
+    return Picture(
+        f"stream-retention-{slug(name)}",
+        f"Retention in {name}",
+        "Normalised regret of the policy at the end of each visit (rows) on the task of each phase "
+        "(columns), within distribution: IQM over lives. The phase just visited is outlined: below "
+        "it one sees what is forgotten, above it what was known before.",
+        grid.files,
+        is_map=True,
+    )
+
+
+def _draw_performance(streams: StreamAnalysis, formats: Sequence[str], name: str) -> Picture:
+    """Performance on each phase over the visits of one stream, one panel an algorithm."""
+    reports = {
+        algorithm: [life.report for life in streams.lives
+                    if (life.planned.class_name, life.planned.algorithm) == (name, algorithm)]
+        for algorithm in streams.algorithms
+    }  # fmt: skip
+    reports = {algorithm: each for algorithm, each in reports.items() if each}
+    with panels.panel_grid(len(reports), formats, (0.9, 2.4), share_x=True) as grid:
+        for axes, (algorithm, each) in zip(grid.panels, reports.items(), strict=True):
+            performance_curve(each, ax=axes)
+            axes.set_ylabel("")
+            axes.set_title(literal(algorithm))
+        grid.label_rows("performance")
+        grid.label_columns("visit of phase")
+        handles, _ = grid.panels[0].get_legend_handles_labels()
+        legend_below(grid.figure, handles)
+    return Picture(
+        f"stream-performance-{slug(name)}",
+        f"Performance on each phase of {name}",
+        "1 − normalised regret within distribution on the task of each phase, after each visit: "
+        "IQM over lives with quartiles. Filled marks: the phase was just visited.",
+        grid.files,
+    )
+
+
+def _draw_learning_curves(
+    streams: StreamAnalysis, formats: Sequence[str], looks: Mapping[str, Look]
+) -> Iterator[Picture]:
+    """Regret per step over the lifetime, evaluated on the task in force, one panel a stream."""
+    rows = streams.learning_curves[streams.learning_curves.measure == _MEASURE]
+    names = [name for name in _lived(streams) if name in set(rows.class_name)]
+    if not names:
+        return
+    with panels.panel_grid(len(names), formats, _HEIGHTS) as grid:
+        for axes, name in zip(grid.panels, names, strict=True):
+            _draw_lines(axes, rows[rows.class_name == name], "step", looks)
+            _finish_lifetime(axes, streams, name)
+        grid.label_rows(CURVES[_MEASURE])
+        panels.legend(grid.figure, looks)
+    yield Picture(
+        "stream-learning-curves",
+        "Learning curves of lives",
+        f"{curves_caption(rows)} Mean exact regret per step in evaluations during training, on the "
+        "task in force. Shades and numbers above are visits and their phases.",
+        grid.files,
+    )
+
+
+def _draw_lines(axes: Axes, rows: pd.DataFrame, x: str, looks: Mapping[str, Look]) -> None:
+    """The median and quartiles of each algorithm along x."""
+    for index, (algorithm, look) in enumerate(looks.items()):
+        curve = rows[rows.algorithm == algorithm][[x, "q25", "median", "q75"]]
+        if not curve.empty:
+            every = max(1, len(curve) // 6)
+            line_with_band(axes, curve, look, (index * every // len(looks), every))
+
+
+def _finish_lifetime(axes: Axes, streams: StreamAnalysis, name: str) -> None:
+    """Visits as bands, the name of the stream above them, and ticks of steps."""
+    visits = _visits(streams, name)
+    axes.set_xlim(0.0, visits[-1].lifetime)
+    shade_visits(axes, visits)
+    axes.set_title(literal(name), pad=14.0)
+    axes.set_xlabel("lifetime (steps)")
+    axes.locator_params(axis="x", nbins=4)
+    axes.xaxis.set_major_formatter(step_text)
+
+
+def _lived(streams: StreamAnalysis) -> list[str]:
+    """The streams with a finished life, in the plan's order."""
+    present = {life.planned.class_name for life in streams.lives}
+    return [name for name in streams.classes if name in present]
+
+
+def _visits(streams: StreamAnalysis, name: str) -> Sequence[Visit]:
+    """The visits of a stream's lives."""
+    return next(life.report.visits for life in streams.lives if life.planned.class_name == name)

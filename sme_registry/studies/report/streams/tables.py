@@ -1,0 +1,265 @@
+"""Tables of the streams of a study: functions from finished lives and their frames to frames.
+
+The life is the unit: its visits, regions and phases are no further evidence. Each life may be in
+another draw of its stream, so intervals are over draws and seeds. Ends that are unknown are NaN.
+The number of runs of a metric is that of the lives that have it.
+
+Columns of each table, those that name the row first; class_name and algorithm are not repeated.
+Names of the CSV files begin with `stream_`.
+
+    metrics             region, metric: runs, iqm, low, high; of the whole life
+    visit_metrics       region, visit, phase, metric: runs, iqm, low, high; at the end of the visit
+    matrices            region, visit, phase: runs, iqm, low, high of normalised regret; visit is NA
+                        for the initial policy
+    contrasts           as in `report.tables`, in WD, from the plan's first stream; axis: `TASKS`
+                        where two streams differ in nothing else, or `SCHEDULE`
+    differences         as in `report.tables`, in WD
+    references          reference, region, metric: value, the median over the lives' streams
+    regret              lifetime: median, q25, q75 of the regret until then; fresh: the median of
+                        fresh agents', NaN without them; runs
+    learning_curves     as in `report.tables`, on the task in force, not smoothed
+    counts              lives, fresh_agents: finished; planned_lives, planned_fresh_agents; failed:
+                        of both; a fresh agent that several lives have counts for each
+    missing             run, phase: NA for a life; error: "" if it has not failed; key: its cell's
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sme_registry import statistics
+from sme_registry.evaluation.continual.report import METRICS as LABELS
+from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
+from sme_registry.statistics import Array
+from sme_registry.studies.engine.result import CellResult
+from sme_registry.studies.report.frames import frame, ordered
+from sme_registry.studies.report.streams.frames import Life, StreamFrames
+from sme_registry.studies.report.tables import PLACE, Bootstrap, Metric, by_place
+
+WITHIN, OUTSIDE = "WD", "OOD"
+TASKS, SCHEDULE = "tasks", "schedule"
+METRICS = (
+    Metric("average_performance", LABELS["average_performance"], -1),
+    Metric("visited_regret", "regret on the visited phase", 1),
+    Metric("forgetting", LABELS["forgetting"], 1),
+    Metric("backward_transfer", LABELS["backward_transfer"], -1),
+    Metric("forward_transfer", LABELS["forward_transfer"], -1),
+    Metric("relearning", LABELS["relearning"], -1),
+    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
+    Metric("plasticity_difference", "plasticity difference", 1),
+    Metric("learning_transfer", "learning transfer", -1),
+    Metric("online_regret", "online regret", 1, 3),
+)
+BY_VISIT = (
+    Metric("normalised_regret", "regret on the visited phase", 1),
+    Metric("average_performance", LABELS["average_performance"], -1),
+    Metric("forgetting", LABELS["forgetting"], 1),
+    Metric("backward_transfer", LABELS["backward_transfer"], -1),
+    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
+    Metric("plasticity_difference", "plasticity difference", 1),
+    Metric("online_regret", "online regret", 1, 3),
+    Metric("learning_transfer", "learning transfer", -1),
+)
+_PLACE = "class_name:str algorithm:str"
+_INTERVAL = "runs:int64 iqm low high"
+_POINTS = 201  # of a curve of regret
+_INITIAL = -1
+
+
+@dataclass(frozen=True)
+class StreamInfo:
+    """A class of streams of the plan.
+
+    Attributes:
+      name: in the plan.
+      stream: its first draw.
+      axis: what differs from the plan's first stream: "" for itself, `TASKS` or `SCHEDULE`.
+    """
+
+    name: str
+    stream: StreamSpec
+    axis: str
+
+    @property
+    def related(self) -> bool:
+        """Whether all phases are rotations of one task."""
+        return len({phase.spec.derive(rotation=0.0) for phase in self.stream.phases}) == 1
+
+    @property
+    def kinds(self) -> set[SMESpec]:
+        """The tasks of the phases, but for their seeds and rotations."""
+        return {phase.spec.derive(rotation=0.0, seed=0) for phase in self.stream.phases}
+
+
+def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
+    """Every class of streams of the plan, by name."""
+    first = plan.streams[0].instances[0] if plan.streams else None
+    infos: dict[str, StreamInfo] = {}
+    for member in plan.streams:
+        stream = member.instances[0]
+        axis = TASKS if _schedule(stream) == _schedule(first) else SCHEDULE
+        infos[member.name] = StreamInfo(member.name, stream, axis if infos else "")
+    return infos
+
+
+def _schedule(stream: StreamSpec | None) -> Any:
+    """What two streams have in common that differ in their tasks alone."""
+    assert stream is not None
+    steps = [(phase.steps, phase.drift and phase.drift.increments) for phase in stream.phases]
+    return steps, stream.cycles, stream.switch, stream.observes_phase
+
+
+def metrics(lives: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The IQM over lives of every metric, in each region."""
+    rows = _summary(lives, ["region"], METRICS, bootstrap)
+    return frame([*rows], f"{_PLACE} region:str metric:str {_INTERVAL}")
+
+
+def visit_metrics(visits: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The IQM over lives of every metric by visit, in each region."""
+    rows = _summary(visits, ["region", "visit", "phase"], BY_VISIT, bootstrap)
+    return frame([*rows], f"{_PLACE} region:str visit:int64 phase:int64 metric:str {_INTERVAL}")
+
+
+def matrices(retention: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
+    """The IQM over lives of the retention matrices."""
+    numbered = retention.assign(visit=retention.visit.fillna(_INITIAL).astype("int64"))
+    of = (Metric("normalised_regret", "normalised regret", 1),)
+    rows = _summary(numbered, ["region", "visit", "phase"], of, bootstrap)
+    columns = f"{_PLACE} region:str visit:int64 phase:int64 metric:str {_INTERVAL}"
+    table = frame([*rows], columns).drop(columns="metric")
+    return table.assign(visit=table.visit.astype("Int64").replace(_INITIAL, pd.NA))
+
+
+def _summary(
+    rows: pd.DataFrame, at: list[str], metrics: Sequence[Metric], bootstrap: Bootstrap
+) -> Iterator[tuple[Any, ...]]:
+    """Class, algorithm, the values of `at`, metric, lives, IQM and interval, in the rows' order."""
+    keys = [metric.key for metric in metrics]
+    for place, group in by_place(rows).items():
+        wide = group.pivot(index="run", columns=at, values=keys)
+        estimates = _estimates(wide, bootstrap, *reversed(place), *at)
+        for where in dict.fromkeys(group[at].itertuples(index=False, name=None)):
+            for key in keys:
+                found = estimates.get((key, *where))
+                if found is not None:
+                    yield (*place, *where, key, *found)
+
+
+def _estimates(
+    wide: pd.DataFrame, bootstrap: Bootstrap, *place: str
+) -> dict[Any, tuple[int, float, float, float]]:
+    """Lives, IQM and interval of each column that has values; lives without one do not count."""
+    alike: dict[tuple[bool, ...], list[Any]] = {}
+    for column in wide.columns:
+        alike.setdefault(tuple(wide[column].notna()), []).append(column)
+    found = {}
+    for known, columns in alike.items():
+        if any(known):
+            values = {"": wide.loc[list(known), columns].to_numpy(dtype=np.float64)}
+            ends = statistics.stratified_bootstrap(values, bootstrap.draws, bootstrap.seed(*place))
+            middle = statistics.iqm(values[""])
+            for column, *numbers in zip(columns, middle, *ends, strict=True):
+                value, low, high = map(float, numbers)
+                found[column] = (sum(known), value, low, high)
+    return found
+
+
+def references(lives: Sequence[Life]) -> pd.DataFrame:
+    """The reference agents on each stream, which need no training: medians over its draws."""
+    values: dict[tuple[str, ...], dict[str, float]] = {}
+    for life in lives:
+        report = life.report
+        for region in (*report.regions, report.ood):
+            for name, retention in region.references.items():
+                for metric in LABELS:
+                    value = retention.final(metric)
+                    if value is not None:
+                        at = life.planned.class_name, name, region.name, metric
+                        values.setdefault(at, {})[report.stream_digest] = value
+    rows = [(*at, float(np.median([*each.values()]))) for at, each in values.items()]
+    return frame(rows, "class_name:str reference:str region:str metric:str value")
+
+
+def regret(lives: Sequence[Life]) -> pd.DataFrame:
+    """The dynamic regret until points of the life, next to that of fresh agents."""
+    columns = f"{_PLACE} lifetime median q25 q75 fresh runs:int64"
+    tables = [frame([], columns)]
+    for place, group in _groups(lives).items():
+        logs = [life.report.dynamic_regret for life in group]
+        known = [log for log in logs if log is not None]
+        if not known:
+            continue
+        x = np.linspace(0.0, min(log.lifetime[-1] for log in known), _POINTS)
+        each = [np.interp(x, [0, *log.lifetime], [0.0, *log.cumulative_regret]) for log in known]
+        q25, median, q75 = np.quantile(each, [0.25, 0.5, 0.75], axis=0)
+        table = {
+            "class_name": place[0], "algorithm": place[1], "lifetime": x, "median": median,
+            "q25": q25, "q75": q75, "fresh": _fresh_regret(group, x), "runs": len(known),
+        }  # fmt: skip
+        tables.append(pd.DataFrame(table))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _fresh_regret(lives: Sequence[Life], lifetime: Array) -> Any:
+    """The median over lives of their fresh agents' regret, which grows evenly in each visit."""
+    each = []
+    for life in lives:
+        log = life.report.dynamic_regret
+        if log is not None and log.fresh_online_regret is not None:
+            ends = np.array([0, *(visit.lifetime for visit in life.report.visits)])
+            alone = [log.fresh_online_regret[visit.phase] for visit in life.report.visits]
+            each.append(np.interp(lifetime, ends, np.cumsum([0.0, *(alone * np.diff(ends))])))
+    return np.median(each, axis=0) if each else math.nan
+
+
+def counts(
+    plan: StudyPlan, finished: Mapping[str, CellResult], missing: pd.DataFrame
+) -> pd.DataFrame:
+    """How many lives and fresh agents have finished, are planned, and failed."""
+    tallies: dict[tuple[str, str], list[int]] = {}
+    for planned in ordered(plan):
+        if planned.in_stream:
+            tally = tallies.setdefault((planned.class_name, planned.algorithm), [0, 0, 0, 0])
+            kind = 0 if planned.phase is None else 1
+            tally[kind] += planned.cell.digest in finished
+            tally[2 + kind] += 1
+    failed = missing[missing.error != ""].groupby(PLACE).size()
+    rows = [(*place, *tally, failed.get(place, 0)) for place, tally in tallies.items()]
+    names = ("lives", "fresh_agents", "planned_lives", "planned_fresh_agents", "failed")
+    return frame(rows, " ".join([_PLACE, *(f"{name}:int64" for name in names)]))
+
+
+def missing(
+    plan: StudyPlan,
+    finished: Mapping[str, CellResult],
+    errors: Mapping[str, str],
+    requested: Collection[str] | None = None,
+) -> pd.DataFrame:
+    """The requested lives and fresh agents that have not finished; see `tables.missing`."""
+    rows = [
+        (each.class_name, each.algorithm, each.run, each.phase, errors.get(key, ""), key)
+        for each in plan.cells
+        if each.in_stream
+        and (key := each.cell.digest) not in finished
+        and (requested is None or key in requested or key in errors)
+    ]
+    return frame(rows, f"{_PLACE} run:int64 phase:Int64 error:str key:str")
+
+
+def within(frames: StreamFrames) -> pd.DataFrame:
+    """One row per life: its metrics in WD."""
+    return frames.lives[frames.lives.region == WITHIN].reset_index(drop=True)
+
+
+def _groups(lives: Sequence[Life]) -> dict[tuple[str, str], list[Life]]:
+    groups: dict[tuple[str, str], list[Life]] = {}
+    for life in lives:
+        groups.setdefault((life.planned.class_name, life.planned.algorithm), []).append(life)
+    return groups
