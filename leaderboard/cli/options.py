@@ -161,13 +161,15 @@ def find_suite(name: str) -> SuiteFile:
     """A suite by its name in the catalogue, its file's path, or a board that has it.
 
     Raises:
-      UnknownNameError, SpecError: there is none, or it is invalid.
+      UnknownNameError, SpecError: there is none, it is invalid, or it has streams.
       BoardError: the served board cannot be reached.
     """
     if is_url(name) or os.path.isfile(os.path.join(name, FILE)):
         return board_document(name).suite_file
     is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
-    return SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
+    file = SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
+    file.suite.refuse_streams("a leaderboard")
+    return file
 
 
 def board_document(board: str) -> BoardDocument:

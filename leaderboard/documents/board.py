@@ -19,13 +19,13 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
 
 from leaderboard.documents.keys import PublicKey, SigningKey
 from leaderboard.documents.reading import read_regular
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, SuiteReference, Track
 from leaderboard.errors import BoardError
-from sme_registry.errors import SMEError
+from sme_registry.errors import SMEError, SpecError
 from sme_registry.io import parse_json
 from sme_registry.spec import (
     Document,
@@ -103,6 +103,15 @@ class BoardDocument(Document):
     runs_to_rank: Annotated[Integer, Field(ge=1, le=1000)] = RUNS_TO_RANK
     draws: Annotated[Integer, Field(ge=100, le=10**6)] = 10_000
     limits: Limits = Limits()
+
+    @field_validator("suite")
+    @classmethod
+    def _of_single_tasks(cls, suite: Suite) -> Suite:
+        try:
+            suite.refuse_streams("a leaderboard")
+        except SpecError as error:
+            raise ValueError(str(error)) from None
+        return suite
 
     @model_serializer(mode="wrap")
     def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from sme_registry.spec import (
     ProtocolFile,
     SMESpec,
     StreamFile,
+    StreamSpec,
     StudyFile,
     SuiteFile,
     catalogue,
@@ -82,18 +83,27 @@ def _tasks(name: str) -> list[tuple[str, SMESpec]]:
         materialize(document.spec, document.fingerprint)
         return [(name, document.spec)]
     if isinstance(document, SuiteFile):
-        return [
+        tasks = [
             (f"{document.name}/{member.name} seed {spec.seed}", spec)
             for member in document.suite.classes
             for spec in member.instances
         ]
+        draws = [
+            (f"{document.name}/{member.name} draw {number}", stream)
+            for member in document.suite.streams
+            for number, stream in zip(member.draws, member.instances, strict=True)
+        ]
+        return tasks + [phase for label, stream in draws for phase in _phases(label, stream)]
     if isinstance(document, StreamFile):
         materialize_stream(document.stream, document.fingerprints)
-        phases = enumerate(document.stream.phases)
-        return [(f"{document.name} phase {index}", phase.spec) for index, phase in phases]
+        return _phases(document.name, document.stream)
     assert isinstance(document, ProtocolFile | StudyFile)
     kind = "protocol" if isinstance(document, ProtocolFile) else "study"
     raise UnknownNameError(f"{name!r}: is a {kind}. Give a task, a stream or a suite.")
+
+
+def _phases(label: str, stream: StreamSpec) -> list[tuple[str, SMESpec]]:
+    return [(f"{label} phase {index}", phase.spec) for index, phase in enumerate(stream.phases)]
 
 
 def _print_line(label: str, certificate: Certificate) -> None:

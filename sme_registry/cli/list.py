@@ -16,6 +16,7 @@ from sme_registry.spec import (
     ProtocolFile,
     StreamFile,
     StudyFile,
+    StudyPlan,
     SuiteFile,
     catalogue,
 )
@@ -110,8 +111,10 @@ def _stream_table(files: list[StreamFile]) -> Table:
 
 
 def _suite_table(files: list[SuiteFile]) -> Table:
-    columns = {"name": "name", "classes": "number", "tasks": "number", "description": "text"}
-    counts = ((len(file.suite.classes), len(file.suite.instances)) for file in files)
+    columns = {"name": "name", "classes": "number", "tasks": "number", "streams": "number"}
+    columns |= {"description": "text"}
+    suites = [file.suite for file in files]
+    counts = ((len(each.runs), len(each.instances), len(each.stream_instances)) for each in suites)
     return Table("Suites", columns, _rows(files, counts))
 
 
@@ -127,14 +130,21 @@ def study_table(files: list[StudyFile]) -> Table:
     columns |= {"seeds": "number", "cells": "number", "description": "text"}
     counts = (
         (
-            len(file.plan.classes),
+            len(file.plan.classes) + len(file.plan.streams),
             escape(", ".join(algorithm.name for algorithm in file.plan.algorithms)),
             file.plan.seeds,
-            len(file.plan.classes) * len(file.plan.algorithms) * file.plan.seeds,
+            number_of_cells(file.plan),
         )
         for file in files
     )
     return Table("Studies", columns, _rows(files, counts))
+
+
+def number_of_cells(plan: StudyPlan) -> int:
+    """How many cells run; streams may share fresh agents."""
+    if plan.streams:
+        return len({planned.cell.digest for planned in plan.cells})
+    return len(plan.classes) * len(plan.algorithms) * plan.seeds
 
 
 def _rows(

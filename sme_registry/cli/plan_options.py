@@ -12,14 +12,17 @@ from typing import Annotated, Any
 
 import typer
 
-from sme_registry import load
 from sme_registry.cli.arguments import Protocol, find_file, json_or_text
 from sme_registry.cli.study_plan import Agents, scaled_plan
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import integer_in, parse_json
 from sme_registry.spec import (
+    Document,
     EnvFile,
     SMESpec,
+    StreamClass,
+    StreamFile,
+    StreamSpec,
     StudyFile,
     StudyPlan,
     SuiteClass,
@@ -28,11 +31,12 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.study import INDEPENDENT
 from sme_registry.spec.sweep import sweep
+from sme_registry.task import load_document
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassOptions:
-    """Options of a command that describe classes of tasks, each with its help."""
+    """Options of a command that describe classes of tasks and streams, each with its help."""
 
     suite: Annotated[
         str | None,
@@ -45,8 +49,8 @@ class ClassOptions:
         typer.Option(
             "--task",
             "-t",
-            help="A task as a class of its own. Repeatable.",
-            autocompletion=catalogue.completion(EnvFile),
+            help="A task, or a stream, as a class of its own. Repeatable.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
         ),
     ] = None
     sweep: Annotated[
@@ -59,11 +63,19 @@ class ClassOptions:
         ),
     ] = None
     instances: Annotated[
-        int, typer.Option(help="Draws of each --task: its seed and those that follow.")
+        int,
+        typer.Option(
+            help="Draws of each --task: its seed and those that follow; of a stream, other tasks "
+            "for all of its phases."
+        ),
     ] = 1
 
-    def classes(self) -> tuple[SuiteClass, ...]:
-        """The classes of a suite, one for each task, or those of the sweeps."""
+    def members(self) -> dict[str, list[dict[str, Any]]]:
+        """The classes of a suite, one for each task or stream, or those of the sweeps.
+
+        Returns:
+          The fields `classes` and `streams` of a suite or a plan; no field that is empty.
+        """
         tasks = self.task or ()
         if self.sweep and (self.suite is not None or len(tasks) != 1):
             raise OptionError("--sweep: needs exactly one --task, and no --suite.")
@@ -72,12 +84,24 @@ class ClassOptions:
         instances = integer_in("instances", self.instances, 1, 10_000)
         axes = sweep_axes(self.sweep or ())
         classes: list[SuiteClass] = []
+        streams: list[StreamClass] = []
         if self.suite is not None:
-            classes += find_file(SuiteFile, self.suite).suite.classes
+            suite = find_file(SuiteFile, self.suite).suite
+            classes, streams = [*suite.classes], [*suite.streams]
         for task in tasks:
-            spec = load(task, SMESpec)
-            classes += sweep(spec, axes, name=_title(spec), instances=instances)
-        return tuple(classes)
+            document = load_document(task)
+            if isinstance(document, SMESpec):
+                classes += sweep(document, axes, name=_title(document), instances=instances)
+                continue
+            if axes:
+                raise OptionError(
+                    f"--sweep: varies a field of a task, and {task!r} is a stream. Make a stream "
+                    "for each value."
+                )
+            draws = tuple(range(instances))
+            streams.append(StreamClass(name=_title(document), stream=document, draws=draws))
+        kinds: dict[str, Sequence[Document]] = {"classes": classes, "streams": streams}
+        return {name: [each.to_dict() for each in some] for name, some in kinds.items() if some}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +145,7 @@ class PlanOptions(ClassOptions):
         from sme_registry.evaluation import resolve_protocol
 
         fields = {
-            "classes": [member.to_dict() for member in self.classes()],
+            **self.members(),
             "algorithms": self._algorithms(),
             "seeds": self.seeds,
             "evaluations": self.evaluations,
@@ -239,7 +263,7 @@ def _hyperparameters(
     return values
 
 
-def _title(spec: SMESpec) -> str:
-    """The name of a task's class: its title, as a document's name."""
-    title = catalogue.title(spec).rsplit("/", 1)[-1].removesuffix("-v1")
+def _title(document: SMESpec | StreamSpec) -> str:
+    """The name of a task's or a stream's class: its title, as a document's name."""
+    title = catalogue.title(document).rsplit("/", 1)[-1].removesuffix("-v1")
     return title.replace(" (", "-").removesuffix(")")

@@ -30,7 +30,7 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
-from sme_registry.spec.resolve import known_specs
+from sme_registry.spec.resolve import known_specs, known_streams
 from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
@@ -99,8 +99,8 @@ def show(
     if digests:
         if json or not isinstance(document, SuiteFile):
             raise OptionError("--digests: applies to suites, and not with --json. Leave one out.")
-        tasks = document.suite.instances
-        out().print("\n".join(spec.digest for spec in tasks), soft_wrap=True)
+        tasks = (*document.suite.instances, *document.suite.stream_instances)
+        out().print("\n".join(each.digest for each in tasks), soft_wrap=True)
     else:
         _show_document(name, document, json)
 
@@ -268,13 +268,35 @@ def _plain(value: Any) -> Any:
 
 def _show_suite(file: SuiteFile, json: bool) -> None:
     if json:
-        instances = [
+        instances: list[dict[str, Any]] = [
             {"class": member.name, "seed": spec.to_dict()["seed"], "digest": spec.digest}
             for member in file.suite.classes
             for spec in member.instances
         ]
+        instances += [
+            {"class": member.name, "draw": number, "digest": stream.digest}
+            for member in file.suite.streams
+            for number, stream in zip(member.draws, member.instances, strict=True)
+        ]
         print_json({**file.to_dict(), "derived": {"instances": instances}})
         return
+    suite = file.suite
+    tables = [make(suite) for make in (_tasks_table, _streams_table)]
+    shown = [table for table in tables if table.rows]
+    shown[0].title, shown[-1].caption = _title(file), file.digest
+    for index, table in enumerate(shown):
+        if index:
+            out().print()
+        out().print(table)
+    digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
+    kind = "task" if suite.classes else "stream"
+    if all(digest in known_specs() or digest in known_streams() for digest in digests):
+        out().print(f"To train on a {kind}: sme train {digests[0][:_SHORT]}", soft_wrap=True)
+    else:  # one outside the catalogue cannot be found by its digest
+        out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")
+
+
+def _tasks_table(suite: Suite) -> Table:
     columns = {"class": "name", "differs from the default in": "text", "seed": "number"}
     rows = [
         (
@@ -283,14 +305,25 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
             "\n".join(str(seed) for seed in member.seeds),
             "\n".join(spec.digest[:_SHORT] for spec in member.instances),
         )
-        for member in file.suite.classes
+        for member in suite.classes
     ]
-    out().print(Table(_title(file), {**columns, "task": "name"}, rows, caption=file.digest))
-    digests = [spec.digest for spec in file.suite.instances]
-    if all(digest in known_specs() for digest in digests):
-        out().print(f"To train on a task: sme train {digests[0][:_SHORT]}", soft_wrap=True)
-    else:  # a task outside the catalogue cannot be found by its digest
-        out().print("To train on these tasks: sme study new plan.json -a PPO --suite FILE")
+    return Table("", {**columns, "task": "name"}, rows)
+
+
+def _streams_table(suite: Suite) -> Table:
+    numbers = dict.fromkeys(("phases", "cycles", "steps", "draw"), "number")
+    rows = [
+        (
+            member.name,
+            str(len(member.stream.phases)),
+            str(member.stream.cycles),
+            f"{member.stream.steps:,}",
+            "\n".join(str(number) for number in member.draws),
+            "\n".join(stream.digest[:_SHORT] for stream in member.instances),
+        )
+        for member in suite.streams
+    ]
+    return Table("", {"class": "name", **numbers, "stream": "name"}, rows)
 
 
 def _changes(member: SuiteClass) -> str:

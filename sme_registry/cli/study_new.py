@@ -42,6 +42,8 @@ def new(
     """Write a plan: which algorithms run on which tasks, how often, and for how long.
 
     A plan is a file that a colleague can run. Reference policies learn nothing and take no steps.
+    In a stream an algorithm lives once, for the steps of the stream, and a fresh agent trains on
+    each phase alone.
     Settings without an option are edited in the file. Editing changes the digest, so the file is
     rejected until --from rewrites it.
 
@@ -58,6 +60,8 @@ def new(
       sme study new two.json --suite smoke -a PPO -a slow=PPO --set slow.learning_rate=0.0001
 
       sme study new teams.json --suite teams -a PPO -a independent:PPO --seeds 3 -n 20000
+
+      sme study new lives.json -t Switch5 -t Related5 -a PPO --seeds 3 --instances 3
 
       sme study new wider.json --from edited.json
     """

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import Json, find_file
-from sme_registry.cli.list import study_table, summary
+from sme_registry.cli.list import number_of_cells, study_table, summary
 from sme_registry.errors import OptionError, SMEError
 from sme_registry.spec import PlannedCell, StudyAlgorithm, StudyFile, catalogue
 from sme_registry.terminal import Table, duration_range, err, out, print_json
@@ -146,7 +146,7 @@ def plan(
 def _list_plans(json: bool) -> None:
     files = catalogue.entries(StudyFile)
     if json:
-        print_json([{**summary(file), "cells": len(file.plan.cells)} for file in files])
+        print_json([{**summary(file), "cells": number_of_cells(file.plan)} for file in files])
     else:
         out().print(study_table(files))
 
@@ -156,15 +156,17 @@ def _plan_table(file: StudyFile, planned: Sequence[PlannedCell], seconds: Any) -
     numbers = ("classes", "runs each", "steps", "evaluations", "cells", "time per run")
     rows = []
     for name in unique(cell.algorithm for cell in planned):
-        cells = [cell for cell in planned if cell.algorithm == name]
-        first = cells[0].cell
+        places = [place for place in planned if place.algorithm == name]
+        cells = {place.cell.digest: place for place in places}.values()
+        first = places[0].cell
+        steps = [each.cell.steps for each in cells]
         spans = [seconds(each.cell) for each in cells]
         rows.append(
             (
                 escape(name),
-                str(len({each.class_name for each in cells})),
-                str(len({each.run for each in cells})),
-                f"{first.steps:,}",
+                str(len({each.class_name for each in places})),
+                str(len({each.run for each in places})),
+                " to ".join(f"{bound:,}" for bound in sorted({min(steps), max(steps)})),
                 f"{first.evaluations:,} × {first.evaluation_episodes}",
                 f"{len(cells):,}",
                 duration_range(min(span.low for span in spans), max(span.high for span in spans)),

@@ -48,11 +48,11 @@ def new(
     description: Annotated[str, typer.Option(help="One or two sentences.")] = "",
     force: Force = False,
 ) -> None:
-    """Write a suite's file: classes of tasks, each with several instances.
+    """Write a suite's file: classes of tasks or streams, each with several instances.
 
     A class is one setting under several seeds, so that a method is judged on a kind of task and not
     on one draw. Studies, leaderboards and --suite accept the file like the name of a suite.
-    `sme suite FILE` is short for `sme suite new FILE`.
+    Leaderboards need single tasks. `sme suite FILE` is short for `sme suite new FILE`.
 
     Examples:
 
@@ -61,15 +61,17 @@ def new(
       sme suite new intervals.json -t Default --sweep k=1,5,25 --instances 3
 
       sme suite new more.json --suite smoke -t Complexity50
+
+      sme suite new lives.json -t Switch5 -t Related5 --instances 5
     """
     check_document_path(path, force=force)
-    members = Suite(classes=options.classes())
+    members = Suite.from_dict(options.members())
     file = SuiteFile(
         name=name or path.stem, description=description, digest=members.digest, suite=members
     )
     file.write(path)
-    classes = plural(len(members.classes), "class", "classes")
-    tasks = f"{classes}, {plural(len(members.instances), 'instance')}"
+    classes = plural(len(members.runs), "class", "classes")
+    tasks = f"{classes}, {plural(sum(members.runs.values()), 'instance')}"
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     hint = f"{tasks}. To train an algorithm on them: sme train --suite {path} -a PPO"
     err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)

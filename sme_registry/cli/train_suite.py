@@ -11,7 +11,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import find_file
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in
-from sme_registry.spec import StudyFile, Suite, SuiteFile
+from sme_registry.spec import StudyFile, StudyPlan, Suite, SuiteFile
 from sme_registry.terminal import err
 
 RUNS = 10
@@ -64,12 +64,16 @@ def train_suite(
     from sme_registry import training
     from sme_registry.cli.study import print_status
     from sme_registry.evaluation import resolve_protocol
-    from sme_registry.spec.study import INDEPENDENT, StudyPlan
+    from sme_registry.spec.study import INDEPENDENT
     from sme_registry.studies.engine.runner import run_study
 
     _refuse_options(context, _NOT_WITH_SUITE, "is for a single task. Leave it out, or --suite")
     file = find_file(SuiteFile, suite)
-    algorithm = algorithm or training.default_algorithm(file.suite.instances[0])
+    members = file.suite
+    if not members.classes:
+        _refuse_options(context, ("steps",), "is that of each stream here. Leave it out")
+    first = members.classes[0].instances[0] if members.classes else members.streams[0].stream
+    algorithm = algorithm or training.default_algorithm(first)
     uses = training.full_name(algorithm, agents)
     name = training.short_name(uses)
     if folder is None:
@@ -77,7 +81,11 @@ def train_suite(
         folder = Path("runs") / f"{file.name}-{'independent-' * independent}{label}"
     plan = StudyPlan.from_dict(
         {
-            "classes": [member.to_dict() for member in file.suite.classes],
+            **{
+                name: [member.to_dict() for member in kind]
+                for name, kind in (("classes", members.classes), ("streams", members.streams))
+                if kind
+            },
             "algorithms": [
                 {
                     "name": name,
@@ -86,7 +94,7 @@ def train_suite(
                     "action_range": action_range,
                 }
             ],
-            "seeds": equal_runs(file.suite) if seeds is None else integer_in("seeds", seeds, 1),
+            "seeds": equal_runs(members) if seeds is None else integer_in("seeds", seeds, 1),
             "steps": steps,
             "evaluations": _EVALUATIONS,
             "protocol": resolve_protocol(protocol).to_dict(),
@@ -99,16 +107,22 @@ def train_suite(
     if status.failed:
         raise typer.Exit(1)
     if not json:
-        instances = max(len(one.seeds) for one in file.suite.classes)
-        hint = f"To submit them: sme-leaderboard new BUNDLE --suite {suite} --runs {folder}"
-        if plan.seeds < instances:
-            hint = f"A leaderboard needs a run on every instance: use --seeds {instances} or more."
-        err().print(f"[dim]{escape(hint)}[/]", soft_wrap=True)
+        err().print(f"[dim]{escape(_next_step(suite, members, plan, folder))}[/]", soft_wrap=True)
+
+
+def _next_step(name: str, suite: Suite, plan: StudyPlan, folder: Path) -> str:
+    """What to do with the models of a suite."""
+    if suite.streams:
+        return f"To see what the agents retain: sme study report {folder}"
+    instances = max(suite.runs.values())
+    if plan.seeds < instances:
+        return f"A leaderboard needs a run on every instance: use --seeds {instances} or more."
+    return f"To submit them: sme-leaderboard new BUNDLE --suite {name} --runs {folder}"
 
 
 def equal_runs(suite: Suite) -> int:
     """At least `RUNS` on each class, and equally many on each instance of the largest class."""
-    return max(-(-RUNS // len(one.seeds)) * len(one.seeds) for one in suite.classes)
+    return max(-(-RUNS // instances) * instances for instances in suite.runs.values())
 
 
 def refuse_without_suite(context: typer.Context) -> None:

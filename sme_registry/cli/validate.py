@@ -68,7 +68,7 @@ def _check(path: Path) -> dict[str, Any]:
         elif isinstance(file, StreamFile):
             materialize_stream(file.stream, file.fingerprints)
         elif isinstance(file, SuiteFile):
-            _ = file.suite.instances
+            _ = file.suite.instances, file.suite.stream_instances
         elif isinstance(file, StudyFile):
             _ = file.plan.cells
         result["valid"] = True

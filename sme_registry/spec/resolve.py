@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import os
 import re
 from collections.abc import Mapping
@@ -231,11 +232,18 @@ def known_specs() -> dict[str, ResolvedSpec]:
 
 
 def known_streams() -> dict[str, ResolvedStream]:
-    """Digest → stream: of the catalogue, and of streams registered here."""
+    """Digest → stream: of the catalogue, of streams registered here, and of suites' instances."""
     known = {file.digest: _of_stream_file(file) for file in catalogue.entries(StreamFile)}
     for stream in registered_streams.values():
         known.setdefault(stream.digest, ResolvedStream(stream))
-    return known
+    return _draws_of_suites() | known
+
+
+@functools.cache
+def _draws_of_suites() -> dict[str, ResolvedStream]:
+    suites = catalogue.entries(SuiteFile)
+    streams = [stream for file in suites for stream in file.suite.stream_instances]
+    return {stream.digest: ResolvedStream(stream) for stream in streams}
 
 
 def _of_stream_file(file: StreamFile) -> ResolvedStream:

@@ -111,6 +111,30 @@ class Suite(Document):
         """Every spec of the suite, class by class; its streams are not among them."""
         return tuple(spec for member in self.classes for spec in member.instances)
 
+    @property
+    def stream_instances(self) -> tuple[StreamSpec, ...]:
+        """Every stream of the suite, class by class."""
+        return tuple(stream for member in self.streams for stream in member.instances)
+
+    @property
+    def runs(self) -> dict[str, int]:
+        """Class → number of its instances, of tasks and of streams."""
+        tasks = {member.name: len(member.seeds) for member in self.classes}
+        return tasks | {member.name: len(member.draws) for member in self.streams}
+
+    def refuse_streams(self, what: str) -> None:
+        """Raise SpecError if the suite has streams.
+
+        Args:
+          what: that needs single tasks, such as "a leaderboard".
+        """
+        if self.streams:
+            names = ", ".join(member.name for member in self.streams)
+            raise SpecError(
+                f"suite: has streams ({names}), and {what} needs single tasks. Choose a suite "
+                "without streams; studies run lives in streams: `sme study new --suite`."
+            )
+
 
 def refuse_no_class(classes: tuple[SuiteClass, ...], streams: tuple[StreamClass, ...]) -> None:
     """Raise ValueError, which Pydantic reports, without a class, or where names are equal."""

@@ -34,7 +34,14 @@ KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
 EVERY_FILE = [(kind, path) for kind in KINDS for path in catalogue.paths(kind)]
 
 
-JSON_TYPES = {"object": dict, "array": list, "string": str, "integer": int, "null": type(None)}
+JSON_TYPES = {
+    "object": dict,
+    "array": list,
+    "string": str,
+    "integer": int,
+    "boolean": bool,
+    "null": type(None),
+}
 CHECKS = {
     "const": lambda value, limit: value == limit,
     "enum": lambda value, limit: value in limit,
@@ -50,7 +57,8 @@ CHECKS = {
     "required": lambda value, limit: set(limit) <= set(value),
     "additionalProperties": lambda value, limit: limit is False,
     "type": lambda value, limit: (
-        isinstance(value, JSON_TYPES.get(limit, int | float)) and not isinstance(value, bool)
+        isinstance(value, JSON_TYPES.get(limit, int | float))
+        and isinstance(value, bool) == (limit == "boolean")
     ),
 }
 NOTES = {"title", "description", "default", "$defs"}

@@ -36,6 +36,10 @@ MADE_BY: dict[str, tuple[str, ...]] = {
         *("-t", "Plane1", "-t", "Plane10", "-t", "Plane50", *THREE, "--seeds", "3"),
         *("-n", "20000", "-n", "PPO=100000", "--evaluations", "100"),
     ),
+    "continual": (
+        *("-t", "Switch5", "-t", "Related5", "-t", "Cycle2", *THREE),
+        *("--seeds", "3", "--instances", "3", "--evaluations", "60"),
+    ),
 }  # fmt: skip
 OFFLINE = "offline-quality"
 

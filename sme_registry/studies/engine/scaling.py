@@ -34,7 +34,8 @@ def scaled(
 
     Args:
       file: the plan.
-      steps: of every algorithm that trains, including those with a budget of their own.
+      steps: of every algorithm that trains, including those with a budget of their own. A life in
+        a stream has the steps of the stream.
       steps_of: of single algorithms, by name; overrides `steps`.
       seeds: runs of each algorithm on each class.
       evaluations: during training.
@@ -44,6 +45,7 @@ def scaled(
 
     Raises:
       UnknownNameError: the plan has no algorithm of a name in `steps_of`.
+      OptionError: steps, where every class is of streams.
       SpecError: a number is outside its range.
     """
     steps_of = dict(steps_of or {})
@@ -54,6 +56,11 @@ def scaled(
                 f"steps={name}={steps_of[name]}: the plan has no such algorithm."
                 f"{did_you_mean(name, known)} Its algorithms: {', '.join(known)}."
             )
+    if (steps is not None or steps_of) and not file.plan.classes:
+        raise OptionError(
+            f"steps={steps or dict(steps_of)}: lives have the steps of their streams, and the plan "
+            "has no single tasks. Make streams with other steps, or leave it out."
+        )
     budgets = {"steps": steps, "seeds": seeds, "evaluations": evaluations}
     fields = file.plan.to_dict() | {k: v for k, v in budgets.items() if v is not None}
     for algorithm in fields["algorithms"]:
