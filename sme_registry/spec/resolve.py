@@ -83,8 +83,9 @@ def resolve(task: SpecLike) -> ResolvedSpec:
     raise StreamError(
         f"{label}: is a stream, and this needs a single task. Use that of one phase, in Python "
         "`sme_registry.load(STREAM).phases[0].spec`; for the command line, save it as a file, "
-        "`sme_registry.save(spec, 'phase0.json')`. Environments run streams: "
-        "`sme_registry.make(STREAM)`."
+        "`sme_registry.save(spec, 'phase0.json')`. On the whole stream, `sme train` trains an "
+        "agent, `sme_registry.evaluation.evaluate_stream` evaluates its policies, and "
+        "`sme_registry.make` makes an environment."
     )
 
 

@@ -29,7 +29,7 @@ from sme_registry.terminal.progress import Progress
 from sme_registry.training import episodes as episode_files
 from sme_registry.training import snapshots
 from sme_registry.training.algorithms import short_name
-from sme_registry.training.episodes import Episode
+from sme_registry.training.episodes import Episode, read_episodes
 from sme_registry.training.record import RunRecord
 
 EVALUATION = "evaluation.json"
@@ -68,7 +68,7 @@ def write_report(
             bar.update(done)
 
         if record.stream is not None:
-            report = _evaluate_life(record, record.stream, episodes, folder, on_batch)
+            report = _evaluate_life(record, record.stream, folder, on_batch)
             report.write(folder / STREAM)
             return report, _draw_life(report, episodes, folder)
         evaluated = evaluate(
@@ -84,11 +84,7 @@ def write_report(
 
 
 def _evaluate_life(
-    record: RunRecord,
-    stream: StreamSpec,
-    episodes: Sequence[Episode],
-    folder: Path,
-    on_batch: OnBatch,
+    record: RunRecord, stream: StreamSpec, folder: Path, on_batch: OnBatch
 ) -> StreamReport:
     files = snapshots.Snapshots(folder / snapshots.FOLDER, stream)
     report = evaluate_stream(
@@ -100,6 +96,7 @@ def _evaluate_life(
         name=short_name(record.algorithm),
         progress=on_batch,
     )
+    episodes = read_episodes(folder / episode_files.FILE)  # rounded alike in every session
     if not episodes:
         return report
     step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)

@@ -26,7 +26,7 @@ from sme_registry.errors import (
     PolicyError,
     SMEError,
 )
-from sme_registry.evaluation import load_sb3
+from sme_registry.evaluation import StreamReport, load_sb3
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.export import export_onnx
 from sme_registry.io import read_arrays, write_arrays
@@ -40,7 +40,7 @@ NARROW = {"policy_kwargs": {"net_arch": [8]}}
 PPO = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, **NARROW}
 
 
-def jax_run(folder: Path, **changes: Any) -> TrainingResult:
+def jax_run(folder: Path, document: Any = TINY, **changes: Any) -> TrainingResult:
     settings: dict[str, Any] = {
         "algorithm": "PPO",
         "agents": "jax",
@@ -50,7 +50,7 @@ def jax_run(folder: Path, **changes: Any) -> TrainingResult:
         "checkpoint_every": 50,
         "progress": False,
     }
-    return train(TINY, folder=folder, **{**settings, **changes})
+    return train(document, folder=folder, **{**settings, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -295,3 +295,31 @@ def test_the_record_is_strict_json_and_the_model_a_zip(run: TrainingResult) -> N
     assert json.loads((run.folder / "run.json").read_text())["algorithm"] == "jax:PPO"
     with zipfile.ZipFile(run.model_path) as archive:
         assert "policy.pth" in archive.namelist()
+
+
+def test_a_life_has_the_snapshots_of_sb3_and_its_resumption_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phases = [{"spec": TINY, "steps": 40}, {"spec": TINY.derive(seed=6), "steps": 40}]
+    stream = StreamSpec(phases=phases)
+    whole = jax_run(tmp_path / "whole", stream, steps=None)
+    assert isinstance(whole.report, StreamReport)
+    assert (whole.record.steps_done, whole.record.stream) == (96, stream)
+    assert [e.step for e in whole.episodes] == [20, 40, 60, 80]
+    files = ["initial.zip", "visit-00.zip", "visit-01.zip"]
+    models = [load_sb3(tmp_path / "whole" / "snapshots" / name) for name in files]
+    assert [model.num_timesteps for model in models] == [0, 64, 96]
+    last = load_sb3(whole.model_path).policy.state_dict()
+    assert all((last[k] == w).all() for k, w in models[-1].policy.state_dict().items())
+
+    # Ended after 64 steps, in phase 1, before the update that follows the second rollout.
+    interrupted(tmp_path / "cut", monkeypatch, document=stream, steps=None)
+    resumed = jax_run(tmp_path / "cut", stream, steps=None, resume=True)
+    same_bits(resumed, whole)
+    assert resumed.report.to_dict() == whole.report.to_dict()
+    # The policy of visit 0 has learned from the first rollout alone.
+    program = new_program("jax:PPO", [stream], [0], hyperparameters=PPO, steps=80)
+    program.advance(32)
+    program.finish()
+    for name, weight in models[1].policy.state_dict().items():
+        assert np.array_equal(weight.numpy(), program.weights(0)[name])
