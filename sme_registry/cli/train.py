@@ -138,6 +138,11 @@ def train(
     Stable-Baselines3 with the trained weights. Tasks of a new shape, or other hyperparameters, are
     compiled first, which takes some seconds.
 
+    On a stream, such as Switch5, the agent lives through all phases, in one environment and for as
+    many steps as the stream has. The folder contains stream.json instead of evaluation.json (what
+    the agent retains of each phase, and its dynamic regret beside that of reference agents), and in
+    snapshots the model before training and at the end of each visit of a phase.
+
     --suite trains on all instances of a suite at once, as `sme study run --keep-models` would, into
     runs/SUITE-ALGORITHM, a study's folder: the same command continues it, `sme study status` and
     `report` read it, and `sme-leaderboard new --runs` makes a submission of it.
@@ -145,7 +150,8 @@ def train(
     --resume continues an interrupted run from its last checkpoint with the same networks,
     optimisers, replay buffer, hyperparameters and step count; --steps may be larger. A finished run
     cannot be continued. The result differs from an uninterrupted run: random streams get new seeds,
-    and unfinished episodes start again. With --agents jax no bit differs.
+    and unfinished episodes start again, on a stream at the same step of its life. With --agents jax
+    no bit differs.
 
     Examples:
 
@@ -162,6 +168,8 @@ def train(
       sme train Team4 --steps 40000
 
       sme train Team4 --independent --steps 40000
+
+      sme train Switch5 -a PPO --agents jax
 
       sme train --suite mine.json -a PPO --out runs/mine
     """
