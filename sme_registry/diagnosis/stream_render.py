@@ -66,6 +66,7 @@ def terminal(diagnosis: StreamDiagnosis) -> Iterator[RenderableType]:
         style="dim italic",
     )
     for heading, rows in _answers(diagnosis).items():
+        yield ""
         yield Answers(heading, rows, COLOURS)
 
 
