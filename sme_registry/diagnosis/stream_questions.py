@@ -149,12 +149,11 @@ def _forgetting(case: StreamCase) -> Outcome:
     """Whether phases that were learnt are worse at the end of the life."""
     if len(case.visits) == 1:
         return Outcome("one_visit", {})
-    recent = case.visits[-1].phase
-    revisited = len(case.visits) > len(case.phases)
+    recent = case.visits[-1].phase  # retained if only because it was just visited
     learnt = [
         phase
         for phase in case.phases
-        if phase.outcome != "not_learnt" and (revisited or phase.phase != recent)
+        if phase.outcome == "forgotten" or (phase.outcome == "retained" and phase.phase != recent)
     ]
     if not learnt:
         return Outcome("nothing_to_forget", {}, ("unlearnt",))

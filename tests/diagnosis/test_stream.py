@@ -38,6 +38,7 @@ from sme_registry.evaluation.policies import Perceptron, saved_sb3
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
+from sme_registry.training import train
 from sme_registry.training.snapshots import Snapshots
 from tests.diagnosis.lives import (
     PROTOCOL,
@@ -133,6 +134,15 @@ def test_a_phase_that_was_never_learnt_is_a_failure_and_not_forgetting() -> None
     assert answer(found, "forgetting") == ("no", "phases_retained")
     nothing = diagnosis_of(report_of(["constant"] * 2, stream))
     assert answer(nothing, "forgetting") == ("cannot tell", "nothing_to_forget")
+    last = diagnosis_of(report_of(["constant", optima(stream)[1]], stream))
+    assert answer(last, "forgetting") == ("cannot tell", "nothing_to_forget")
+
+
+def test_a_phase_counts_as_learnt_only_after_a_visit_of_its_own() -> None:
+    stream = stream_of(2, cycles=2)
+    first = optima(stream)[0]
+    found = diagnosis_of(report_of(["constant", first, "constant", "constant"], stream))
+    assert found.phases[0].outcome == "not_learnt"
 
 
 def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure() -> None:
@@ -349,8 +359,13 @@ def test_the_networks_of_a_run_are_those_of_its_snapshots(tmp_path: Path, uses: 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short life of PPO, as `sme train` leaves it."""
     folder = tmp_path_factory.mktemp("runs") / "life"
-    write_run(folder, stream_of(3))
+    settings = {"n_steps": 50, "batch_size": 50, "policy_kwargs": {"net_arch": [12, 8]}}
+    train(
+        stream_of(3), algorithm="PPO", hyperparameters=settings, folder=folder, protocol=PROTOCOL,
+        progress=False,
+    )  # fmt: skip
     return folder
 
 
@@ -369,6 +384,8 @@ def test_the_command_writes_a_page_its_data_and_its_figures(
         assert_readable(figure)
     read = StreamDiagnosis.from_dict(json.loads((tmp_path / "d" / "diagnosis.json").read_text()))
     assert read.stream_digest == stream_of(3).digest
+    assert all(visit.online_regret is not None for visit in read.visits)
+    assert read.visits[2].network != read.visits[0].network != read.initial_network
     shown = sme("diagnose", run, "--states", "64", "--json")
     assert json.loads(shown.stdout) == read.to_dict()
 
