@@ -35,8 +35,9 @@ from sme_registry.diagnosis.stream_render import headline, markdown, stream_sent
 from sme_registry.errors import OptionError, UnknownNameError
 from sme_registry.evaluation import StreamReport, evaluate, fresh_per_phase
 from sme_registry.evaluation.policies import Perceptron, saved_sb3
-from sme_registry.spec import EvaluationProtocol
+from sme_registry.spec import EvaluationProtocol, StudyFile, StudyPlan
 from sme_registry.spec.study import Cell
+from sme_registry.studies import run_study
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.training import train
 from sme_registry.training.snapshots import Snapshots
@@ -55,6 +56,7 @@ from tests.diagnosis.lives import (
 from tests.diagnosis.policies import printed
 from tests.geometry import assert_readable
 
+SETTINGS = {"n_steps": 50, "batch_size": 50, "policy_kwargs": {"net_arch": [12, 8]}}
 UNIFORM = np.random.default_rng(0).random((500, 5)).astype(np.float32)
 
 
@@ -361,9 +363,8 @@ def test_the_networks_of_a_run_are_those_of_its_snapshots(tmp_path: Path, uses: 
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short life of PPO, as `sme train` leaves it."""
     folder = tmp_path_factory.mktemp("runs") / "life"
-    settings = {"n_steps": 50, "batch_size": 50, "policy_kwargs": {"net_arch": [12, 8]}}
     train(
-        stream_of(3), algorithm="PPO", hyperparameters=settings, folder=folder, protocol=PROTOCOL,
+        stream_of(3), algorithm="PPO", hyperparameters=SETTINGS, folder=folder, protocol=PROTOCOL,
         progress=False,
     )  # fmt: skip
     return folder
@@ -459,6 +460,27 @@ def test_a_cell_is_diagnosed_with_its_fresh_agents(tmp_path: Path) -> None:
     assert answer(found, "costly visits") == ("yes", "costlier_than_fresh")
     assert answer(found, "loss of plasticity") == ("yes", "below_fresh_agents")
     assert found.verdict("weight growth").evidence["against"] == "fresh_agents"
+
+
+def test_a_life_of_a_study_that_kept_its_models_is_diagnosed(tmp_path: Path) -> None:
+    algorithm = {"name": "PPO", "uses": "PPO", "hyperparameters": SETTINGS}
+    fields = {
+        "streams": [{"name": "two", "stream": stream_of(2).to_dict()}],
+        "algorithms": [algorithm],
+        "seeds": 1,
+        "evaluations": 0,
+        "protocol": PROTOCOL,
+    }
+    plan = StudyPlan.from_dict(fields)
+    file = StudyFile(name="tiny", digest=plan.digest, plan=plan)
+    run_study(file, tmp_path, executor="in-process", keep_models=True)
+    life = load_cell(tmp_path, plan.cells[0].cell.digest)
+    assert isinstance(life, StreamSubject)
+    found = diagnose(life, states=64)
+    assert all(visit.network is not None for visit in found.visits)
+    assert all(phase.fresh_network is not None for phase in found.phases)
+    assert None not in [phase.fresh_online_regret for phase in found.phases]
+    assert found.verdict("costly visits").reason.endswith("_than_fresh")
 
 
 def test_a_cell_whose_phase_observes_and_drifts_has_fresh_agents_of_that_phase(
