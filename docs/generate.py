@@ -36,7 +36,7 @@ def catalogue() -> str:
         lines.append(f"| `{env_id}` | {values} | {agents} | `{digest}` | {env.description} |")
     lines += ["", "## Suites", "", "| Name | classes | instances | digest | |", "|---" * 5 + "|"]
     for suite in entries(SuiteFile):
-        counts = f"{len(suite.suite.classes)} | {len(suite.suite.instances)}"
+        counts = f"{len(suite.suite.runs)} | {sum(suite.suite.runs.values())}"
         lines.append(
             f"| `{suite.versioned_name}` | {counts} | `{_short(suite.digest)}` "
             f"| {suite.description} |"
