@@ -39,6 +39,7 @@ MADE_BY: dict[str, tuple[str, ...]] = {
     "continual": (
         *("-t", "Switch5", "-t", "Related5", "-t", "Cycle2", *THREE),
         *("--seeds", "3", "--instances", "3", "--evaluations", "60"),
+        *("--set", "PPO.n_steps=2000", "--set", "PPO.batch_size=50"),  # whole rollouts in a phase
     ),
 }  # fmt: skip
 OFFLINE = "offline-quality"
