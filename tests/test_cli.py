@@ -16,8 +16,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sme_registry
-from sme_registry import EvaluationReport, SMESpec, load
+from sme_registry import EvaluationReport, SMESpec, StreamSpec, load, save
 from sme_registry.cli import app
+from sme_registry.evaluation import StreamReport
 from sme_registry.spec import (
     EnvFile,
     ProtocolFile,
@@ -516,6 +517,13 @@ class TestCertify:
 QUICK = ("--protocol", "quick-v1")
 
 
+def save_life() -> None:
+    """Write life.json, two phases in two cycles."""
+    spec = load("Plane1", SMESpec).derive(hidden_width=8, horizon=20)
+    phases = [{"spec": each, "steps": 60} for each in (spec, spec.derive(seed=1))]
+    save(StreamSpec(phases=phases, cycles=2), "life.json")
+
+
 class TestEvaluate:
     @pytest.mark.parametrize(
         ("policy", "reference"),
@@ -627,6 +635,54 @@ class TestEvaluate:
     ) -> None:
         assert message in refused("evaluate", *arguments, "--out", "ev")
         assert list(tmp_path.iterdir()) == []
+
+    def test_a_policy_for_a_whole_life_is_reported_with_its_dynamic_regret(
+        self, tmp_path: Path
+    ) -> None:
+        save_life()
+        result = good("evaluate", "constant", "life.json", *QUICK, "--out", "ev")
+        report = StreamReport.read(tmp_path / "ev/stream.json")
+        assert report.dynamic_regret == report.reference_regret["constant_half"]
+        assert report.region().agent.normalised_regret[3] == pytest.approx((1.0, 1.0))
+        regret = f"{report.dynamic_regret.dynamic_regret:,.1f}"
+        assert f"dynamic regret {regret} over 240 steps" in result.stdout
+        assert "visit 3: phase 1" in result.stdout
+        names = {path.stem for path in (tmp_path / "ev").iterdir()}
+        assert names == {"stream", "retention_map", "performance_curve", "dynamic_regret_curve"}
+        assert "--force" in refused("evaluate", "random", "life.json", *QUICK, "--out", "ev")
+
+    def test_a_life_has_a_policy_for_each_visit(self) -> None:
+        save_life()
+        life = ("evaluate", "optimal", "constant", "constant", "optimal", "life.json", *QUICK)
+        others = ("--initial", "constant", "--fresh", "linear", "--fresh", "constant")
+        report = json.loads(good(*life, *others, "--json").stdout)
+        agent = report["regions"][0]["agent"]
+        assert [row[0] for row in agent["normalised_regret"]] == pytest.approx([0, 1, 1, 0])
+        assert agent["initial_normalised_regret"] == pytest.approx([1.0, 1.0])
+        assert agent["fresh_normalised_regret"][1] == pytest.approx(1.0)
+        assert agent["fresh_normalised_regret"][0] < 0.5
+        assert report["dynamic_regret"] is None
+        assert report["reference_regret"].keys() > {"constant_half", "fresh_optimum"}
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("random", "random", "life.json"), "2 policies: must be one for the whole life, or 4"),
+            (("randm", "life.json"), "Did you mean 'random'"),
+            (("random", "life.json", "--set", "k=2"), "--set k: life.json is a stream. It is a"),
+            (("random", "life.json", "--fresh", "random"), "must be 2 policies, one for each"),
+            (("random", "Cycel2"), "Did you mean 'Cycle2-v1'"),
+            (("random", "random", "Default"), "2 policies: must be one for the task 'Default'"),
+            (("random", "Default", "--fresh", "random"), "--fresh: is for streams"),
+            (("random", "Default", "--initial", "random"), "--initial: is for streams"),
+        ],
+    )
+    def test_a_bad_life_writes_nothing(
+        self, arguments: tuple[str, ...], message: str, tmp_path: Path
+    ) -> None:
+        save_life()
+        assert message in refused("evaluate", *arguments, *QUICK, "--out", "ev")
+        assert [path.name for path in tmp_path.iterdir()] == ["life.json"]
 
     def test_a_zip_that_is_no_model_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "a.zip").write_bytes(b"not a zip")
@@ -819,7 +875,6 @@ def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> N
 @pytest.mark.parametrize(
     "command",
     [
-        ("evaluate", "optimal", "Switch5"),
         ("dataset", "make", "Switch5"),
         ("study", "new", "plan.json", "-t", "Switch5", "-a", "PPO"),
         ("diagnose", "optimal", "--task", "Switch5"),

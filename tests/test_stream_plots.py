@@ -7,7 +7,12 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.errors import SMEError, UnknownNameError
-from sme_registry.evaluation import dynamic_regret, evaluate_stream
+from sme_registry.evaluation import (
+    dynamic_regret,
+    evaluate_stream,
+    expected_regret,
+    reference_regret,
+)
 from sme_registry.spec import StreamSpec
 
 pytest.importorskip("matplotlib")
@@ -106,6 +111,24 @@ def test_a_dynamic_regret_curve_ends_at_the_sum_and_has_bands_for_visits(tmp_pat
     assert [text.get_text() for text in axes.texts[:-1]] == list("012012")
     labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
     assert labels[:2] == ["one", "two (n = 2)"]
+
+
+def test_a_dynamic_regret_curve_shows_reference_agents_in_grey(tmp_path, figures):
+    stream, log = stream_of(3, 2), report(0).dynamic_regret
+    known = reference_regret(stream, frozen="constant", training=log, episodes=20)
+    known["fresh_agents"] = expected_regret([0.25] * 6, stream)
+    lives = [report(seed).with_reference_regret(known) for seed in (0, 1)]
+    for runs in (lives, {"one": lives[0], "two": lives[1]}, [lives[0], report(1)]):
+        plots.dynamic_regret_curve(runs, tmp_path / "curve.png")
+    of_one, of_two, without = (
+        {line.get_label(): line.get_ydata()[-1] for line in figure.axes[0].lines}
+        for figure in figures
+    )
+    assert of_one["fresh agent in each phase"] == pytest.approx(0.25 * stream.steps)
+    assert of_one["constant ½"] == pytest.approx(known["constant_half"].dynamic_regret)
+    assert of_one.keys() >= {"optimum of phase 0", "frozen after visit 0"}
+    assert of_two.keys() == {"one", "two", "constant ½", "optimum of phase 0"}
+    assert len(without) == 1  # only one of the seeds has references
 
 
 def test_a_plasticity_curve_shows_the_ratio_of_each_visit(tmp_path, figures):

@@ -15,12 +15,16 @@ from sme_registry.cli.arguments import (
     Out,
     Protocol,
     SpecChanges,
-    TaskName,
     changes,
 )
+from sme_registry.cli.evaluate_stream import Life, evaluate_life
 from sme_registry.cli.files import can_draw, print_written
+from sme_registry.envs.arguments import another_stream
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import refuse_existing
+from sme_registry.spec import EnvFile, StreamFile, catalogue
+from sme_registry.spec.resolve import names_stream
 from sme_registry.terminal import Progress, err, out, print_json
 
 
@@ -29,15 +33,23 @@ def _complete_policy(incomplete: str) -> list[str]:
 
 
 def evaluate(
-    policy: Annotated[
-        str,
+    policies: Annotated[
+        list[str],
         typer.Argument(
             metavar="POLICY",
             autocompletion=_complete_policy,
-            help=f"A .zip, .onnx or .npz file, module:function, or {', '.join(POLICIES)}.",
+            help=f"A .zip, .onnx or .npz file, module:function, or {', '.join(POLICIES)}. "
+            "On a stream: one, or one for each visit.",
         ),
     ],
-    task: TaskName,
+    task: Annotated[
+        str,
+        typer.Argument(
+            metavar="TASK",
+            help="The task or stream: a name, a path or a digest.",
+            autocompletion=catalogue.completion(EnvFile, StreamFile),
+        ),
+    ],
     protocol: Protocol = "paper-v1",
     out_folder: Out = None,
     action_range: ActionRange = None,
@@ -49,12 +61,23 @@ def evaluate(
             help="Class of a model's .zip that does not tell it: PPO, or sb3_contrib:TQC.",
         ),
     ] = None,
+    initial: Annotated[
+        str | None,
+        typer.Option(metavar="POLICY", help="Of a stream: the policy before training."),
+    ] = None,
+    fresh: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="POLICY",
+            help="Of a stream: an agent trained on one phase alone. Repeat it for each phase.",
+        ),
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Evaluate a policy in and out of distribution, compared with reference policies.
 
-    With --out, it also writes evaluation.json and figures.
+    With --out, it also writes evaluation.json (of a stream stream.json) and figures.
 
     A function takes observations `[B, S + 2]` and returns actions `[B, A]`, in [0, 1] unless
     --action-range is symmetric; so does an .onnx network. A .zip of Stable-Baselines3 can run code
@@ -65,6 +88,10 @@ def evaluate(
     with the shared observation `[B, S + 2 + n]`: the state with unobserved channels set to 0, t/T,
     the agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that
     an agent owns. The report then includes each agent.
+
+    On a stream, give the policy at the end of each visit, or one policy for the whole life, which
+    then learns nothing: its dynamic regret is reported as well. A reference policy, such as linear,
+    is that of phase 0.
 
     Examples:
 
@@ -79,7 +106,16 @@ def evaluate(
       sme evaluate runs/Team4-PPO-seed0/model.zip Team4
 
       sme evaluate runs/Team4-independent-PPO-seed0/model Team4
+
+      sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
+    if names_stream(task):
+        for field in changes(set_):
+            raise OptionError(f"--set {field}: {task} is a stream. {another_stream(field)}")
+        life = Life(policies, initial, fresh, action_range, algorithm)
+        evaluate_life(life, task, protocol, out_folder, force=force, json=json)
+        return
+    policy = _alone(policies, initial, fresh, task)
     from sme_registry import evaluation
 
     spec = load(task, SMESpec).derive(**changes(set_))
@@ -97,6 +133,23 @@ def evaluate(
     else:
         out().print(report.table())
     print_written(files)
+
+
+def _alone(policies: list[str], initial: str | None, fresh: list[str] | None, task: str) -> str:
+    """The one policy for a single task.
+
+    Raises:
+      OptionError: several, or one that only a stream needs.
+    """
+    if len(policies) > 1:
+        raise OptionError(
+            f"{' '.join(policies):.80}: are {len(policies)} policies: must be one for the task "
+            f"{task!r}. Only a stream needs one for each visit."
+        )
+    for option, value in (("--initial", initial), ("--fresh", fresh)):
+        if value:
+            raise OptionError(f"{option}: is for streams, and {task!r} is a task. Leave it out.")
+    return policies[0]
 
 
 def _figures(report: Any, policy: Any, target: Path) -> list[Path]:

@@ -12,7 +12,8 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import StreamReport
-from sme_registry.evaluation.continual.report import Visit
+from sme_registry.evaluation.continual import DynamicRegret
+from sme_registry.evaluation.continual.report import LABELS, TRAINED, Visit
 from sme_registry.evaluation.continual.seeds import same_stream
 from sme_registry.plots.style import (
     COLOURS,
@@ -42,6 +43,12 @@ FILE = "stream.json"  # of a report, in the folder of a run
 _MOST_NUMBERS = 12  # of columns of a map whose cells show their values
 _SIZE = (6.2, 4.0)  # inches, of a figure of lines
 _POINTS = 400  # of a line; more would not be visible at this size
+_DASHES: dict[str, Any] = {
+    "constant_half": (0, (4, 4)),
+    "frozen_optimum": (0, (1, 1.5)),
+    "frozen_agent": (0, (6, 2, 1, 2)),
+    "fresh_agents": "-",
+}
 
 
 def retention_map(
@@ -150,6 +157,9 @@ def dynamic_regret_curve(
 ) -> Figure:
     """Draw the dynamic regret of training over the lifetime, with a band for each visit.
 
+    Reference agents of which the reports know the regret are grey, but not the optimum of each
+    phase, which has none; with several methods only those that need no training.
+
     Args:
       runs: as in `retention_map`, or a mapping from each agent's name to its runs; reports with a
         dynamic regret. Lines are the median of several seeds, and bands their quartiles.
@@ -166,8 +176,12 @@ def dynamic_regret_curve(
     methods = _methods(runs)
     first = next(iter(methods.values()))
     with _panel(ax, _SIZE, path, _title(first, title, named=len(methods) == 1)) as axes:
-        lines = {_label(name, reports): _curves(reports) for name, reports in methods.items()}
+        lines = {
+            _label(name, reports): _curves([_regret(report) for report in reports])
+            for name, reports in methods.items()
+        }
         _draw_lines(axes, lines, median, "median", linewidth=2, markersize=4.5, markevery=0.13)
+        _draw_references(axes, first, trained=len(methods) == 1)
         axes.set_xlim(0.0, max(x[-1] for x, _ in lines.values()))
         axes.set_ylim(bottom=0.0)
         shade_visits(axes, first[0].visits)
@@ -351,25 +365,34 @@ def _report(given: Any) -> StreamReport:
     return StreamReport.read(path / FILE if path.is_dir() else path)
 
 
-def _curves(reports: Sequence[StreamReport]) -> tuple[Array, Array]:
+def _draw_references(axes: Axes, reports: Sequence[StreamReport], *, trained: bool) -> None:
+    """The regret of the reference agents; of those that are `trained` only if they are this one."""
+    names = [name for name in _DASHES if trained or name not in TRAINED]
+    for name in names:
+        lives = [report.reference_regret.get(name) for report in reports]
+        known = [life for life in lives if life is not None]
+        if known and len(known) == len(lives):
+            x, values = _curves(known)
+            axes.plot(
+                x, median(values), color=GREY, linewidth=1.3, linestyle=_DASHES[name],
+                label=LABELS[name], zorder=1.8,
+            )  # fmt: skip
+
+
+def _curves(lives: Sequence[DynamicRegret]) -> tuple[Array, Array]:
     """`[X]` lifetimes that all lives have reached, and the `[n, X]` regret until then."""
-    curves = [_curve(report) for report in reports]
-    x = np.linspace(0.0, min(lifetime[-1] for lifetime, _ in curves), _POINTS)
-    return x, np.array([np.interp(x, *curve) for curve in curves])
+    x = np.linspace(0.0, min(life.lifetime[-1] for life in lives), _POINTS)
+    curves = [np.interp(x, [0, *life.lifetime], [0.0, *life.cumulative_regret]) for life in lives]
+    return x, np.array(curves)
 
 
-def _curve(report: StreamReport) -> tuple[Array, Array]:
-    regret = report.dynamic_regret
-    if regret is None:
+def _regret(report: StreamReport) -> DynamicRegret:
+    if report.dynamic_regret is None:
         raise OptionError(
             "runs: a report has no dynamic regret. Add it from the log of the training: "
             "report.with_dynamic_regret(dynamic_regret(…))."
         )
-    zero = np.zeros(1)
-    return (
-        np.concatenate([zero, np.array(regret.lifetime, dtype=float)]),
-        np.concatenate([zero, np.array(regret.cumulative_regret)]),
-    )
+    return report.dynamic_regret
 
 
 def _ratios(report: StreamReport, region: str) -> Array:

@@ -46,6 +46,7 @@ LABELS = {
 just visited (an agent that learns each phase perfectly and keeps nothing), and the constant ½. Two
 are known by their dynamic regret only: the agent itself if it stops learning at the end of its
 first visit, and agents that start anew in each visit."""
+TRAINED = ("frozen_agent", "fresh_agents")
 
 METRICS = {
     "average_performance": "average performance",
