@@ -49,8 +49,8 @@ def expected_regret(
         number, the online regret of an agent that learned in it.
       stream: a stream, its fields, an id, a digest or a path.
       episodes: run with each policy, over the pieces of one cycle; each has one or more. The
-        standard error of a policy's online regret is about 0.05/√episodes.
-      seed: of the initial states, which are the same for every policy and piece.
+        standard error of a policy's online regret is about 0.02/√episodes.
+      seed: of the initial states, which are the same for every policy.
       action_range: as in `evaluate`, of all policies.
       algorithm: as in `evaluate`.
       progress: called after the episodes of each piece with the number of pieces done, and of all.
@@ -77,7 +77,7 @@ def expected_regret(
     tasks = materialize_stream(stream) if acts else ()
     means: dict[tuple[int, int], float] = {}
     for which, piece in acts:
-        states = start_states(seed, 0, _share(episodes, steps, piece), stream.state_dim)
+        states = start_states(seed, piece, _share(episodes, steps, piece), stream.state_dim)
         policy = policies[which]
         if stream.observes_phase:
             policy = policy.in_phase(stream.pieces[piece].phase, P)
