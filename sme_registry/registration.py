@@ -139,13 +139,14 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
 
 def _document_of(name: str) -> SMESpec | StreamSpec:
     """The spec or the stream that a name stands for; draws nothing."""
-    from sme_registry.spec.resolve import names_stream, resolve, resolve_stream
+    from sme_registry.spec.resolve import ResolvedStream, resolve_document
 
-    return resolve_stream(name).stream if names_stream(name) else resolve(name).spec
+    found = resolve_document(name)
+    return found.stream if isinstance(found, ResolvedStream) else found.spec
 
 
 @overload
-def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec: ...
+def load(id_or_path_or_digest: str | os.PathLike[str]) -> SMESpec | StreamSpec: ...
 @overload
 def load(id_or_path_or_digest: str | os.PathLike[str], kind: type[_S]) -> _S: ...
 def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
@@ -155,8 +156,8 @@ def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
 
     Args:
       id_or_path_or_digest: the name.
-      kind: `SMESpec` or `StreamSpec`, to accept no other; None takes what the name stands for.
-        A type checker takes it for a spec then.
+      kind: `SMESpec` or `StreamSpec`, to accept no other and to tell a type checker which it is;
+        None takes what the name stands for.
 
     Raises:
       UnknownNameError: nothing has this name; the message suggests the nearest.

@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sme_registry.errors import MalformedDocumentError, SpecError, StreamError, UnknownNameError
 from sme_registry.io import read_json
@@ -94,8 +94,7 @@ def _resolve(task: SpecLike) -> ResolvedSpec:
         return ResolvedSpec(as_spec(task))
     name = str(task)
     if isinstance(task, os.PathLike) or is_path(name):
-        file = read_env_file(name)
-        return ResolvedSpec(file.spec.named(file.name), file.fingerprint)
+        return _of_env_data(read_json(name), name)
     short = _short(name)
     own = _registered(short, registered)
     if own is not None:
@@ -123,8 +122,7 @@ def resolve_stream(stream: StreamLike) -> ResolvedStream:
         return ResolvedStream(as_stream(stream))
     name = str(stream)
     if isinstance(stream, os.PathLike) or is_path(name):
-        file = StreamFile.read(name)
-        return ResolvedStream(file.stream.named(file.name), file.fingerprints)
+        return _of_stream_data(read_json(name), name)
     short = _short(name)
     own = _registered(short, registered_streams)
     if own is not None:
@@ -133,6 +131,17 @@ def resolve_stream(stream: StreamLike) -> ResolvedStream:
         return _by_content(short, known_streams())
     refuse_symmetric_name(short)
     return _of_stream_file(catalogue.find(StreamFile, short.removeprefix(catalogue.STREAM)))
+
+
+def resolve_document(name: SpecLike | StreamLike) -> ResolvedSpec | ResolvedStream:
+    """The stream of a name, or the spec; see `resolve_stream` and `resolve`. Reads a file once."""
+    if isinstance(name, os.PathLike) or (isinstance(name, str) and is_path(name)):
+        data, source = read_json(name), str(name)
+        of_data = _of_stream_data if _has_stream(data) else _of_env_data
+        return of_data(data, source)
+    if names_stream(name):
+        return resolve_stream(cast("StreamLike", name))
+    return resolve(cast("SpecLike", name))
 
 
 def names_stream(value: Any) -> bool:
@@ -144,8 +153,7 @@ def names_stream(value: Any) -> bool:
         return isinstance(value, StreamSpec) or (isinstance(value, dict) and "phases" in value)
     name = str(value)
     if isinstance(value, os.PathLike) or is_path(name):
-        data = read_json(name)
-        return isinstance(data, dict) and StreamFile.content in data
+        return _has_stream(read_json(name))
     short = _short(name)
     if _registered(short, registered_streams) is not None:
         return True
@@ -198,16 +206,19 @@ def is_path(name: str) -> bool:
     return name.endswith(".json") or (os.sep in name and Path(name).is_file())
 
 
-def read_env_file(path: str | os.PathLike[str]) -> EnvFile:
-    """Read a task's file.
+def _has_stream(data: Any) -> bool:
+    return isinstance(data, dict) and StreamFile.content in data
 
-    Raises:
-      MalformedDocumentError: not readable, not strict JSON, or a bare spec without an envelope.
-      SpecError, DigestMismatchError: see `EnvFile.from_dict`.
-    """
-    data = read_json(path)
-    refuse_bare_spec(data, str(path))
-    return EnvFile.from_dict(data, str(path))
+
+def _of_stream_data(data: Any, source: str) -> ResolvedStream:
+    file = StreamFile.from_dict(data, source)
+    return ResolvedStream(file.stream.named(file.name), file.fingerprints)
+
+
+def _of_env_data(data: Any, source: str) -> ResolvedSpec:
+    refuse_bare_spec(data, source)
+    file = EnvFile.from_dict(data, source)
+    return ResolvedSpec(file.spec.named(file.name), file.fingerprint)
 
 
 def refuse_bare_spec(data: Any, source: str) -> None:
