@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
+from sme_registry.envs.arguments import another_stream
 from sme_registry.errors import (
     MalformedDocumentError,
     OptionError,
@@ -21,6 +22,7 @@ from sme_registry.spec import (
     ProtocolFile,
     SMESpec,
     StreamFile,
+    StreamSpec,
     StudyFile,
     SuiteFile,
     catalogue,
@@ -155,6 +157,22 @@ def changes(pairs: list[str] | None) -> dict[str, Any]:
             raise OptionError(f"--set {pair!r}: {name} is set twice. Remove one.")
         fields[name] = json_or_text(text.strip())
     return fields
+
+
+def changed(
+    document: SMESpec | StreamSpec, name: str, fields: dict[str, Any]
+) -> SMESpec | StreamSpec:
+    """A task with some fields changed.
+
+    Raises:
+      OptionError: the document of this name is a stream, which has none to change.
+      SpecError: a field is out of range or unknown.
+    """
+    if isinstance(document, SMESpec):
+        return document.derive(**fields)
+    for field in fields:
+        raise OptionError(f"--set {field}: {name} is a stream. {another_stream(field)}")
+    return document
 
 
 def json_or_text(text: str) -> Any:

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from sme_registry import SMESpec, load
 from sme_registry.cli.arguments import (
     ActionRange,
     Force,
@@ -15,16 +14,16 @@ from sme_registry.cli.arguments import (
     Out,
     Protocol,
     SpecChanges,
+    changed,
     changes,
 )
 from sme_registry.cli.evaluate_stream import Life, evaluate_life
 from sme_registry.cli.files import can_draw, print_written
-from sme_registry.envs.arguments import another_stream
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import refuse_existing
-from sme_registry.spec import EnvFile, StreamFile, catalogue
-from sme_registry.spec.resolve import names_stream
+from sme_registry.spec import EnvFile, StreamFile, StreamSpec, catalogue
+from sme_registry.task import load_document
 from sme_registry.terminal import Progress, err, out, print_json
 
 
@@ -109,24 +108,24 @@ def evaluate(
 
       sme evaluate runs/life/snapshots/visit-*.zip Switch5 --initial runs/life/snapshots/initial.zip
     """
-    if names_stream(task):
-        for field in changes(set_):
-            raise OptionError(f"--set {field}: {task} is a stream. {another_stream(field)}")
+    document = changed(load_document(task), task, changes(set_))
+    if isinstance(document, StreamSpec):
         life = Life(policies, initial, fresh, action_range, algorithm)
-        evaluate_life(life, task, protocol, out_folder, force=force, json=json)
+        evaluate_life(life, document, protocol, out_folder, force=force, json=json)
         return
     policy = _alone(policies, initial, fresh, task)
     from sme_registry import evaluation
 
-    spec = load(task, SMESpec).derive(**changes(set_))
     resolved = evaluation.resolve_protocol(protocol)
     target = None if out_folder is None else out_folder / "evaluation.json"
     if target is not None:
         refuse_existing(target, force=force)
-    prepared = evaluation.as_policy(policy, spec, action_range=action_range, algorithm=algorithm)
+    prepared = evaluation.as_policy(
+        policy, document, action_range=action_range, algorithm=algorithm
+    )
     states = resolved.states_per_region * len(resolved.edges)
     with Progress("evaluating", states, unit="states", console=err()) as progress:
-        report = evaluation.evaluate(prepared, spec, resolved, progress=progress.update_of)
+        report = evaluation.evaluate(prepared, document, resolved, progress=progress.update_of)
     files = [] if target is None else [report.write(target), *_figures(report, prepared, target)]
     if json:
         print_json(report.to_dict())

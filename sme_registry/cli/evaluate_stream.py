@@ -9,7 +9,6 @@ from sme_registry.cli.files import can_draw, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
 from sme_registry.spec import EvaluationProtocol, StreamSpec
-from sme_registry.task import load_stream
 from sme_registry.terminal import Progress, err, out, print_json
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ class Life(NamedTuple):
 
 
 def evaluate_life(
-    life: Life, name: str, protocol: str, folder: Path | None, *, force: bool, json: bool
+    life: Life, stream: StreamSpec, protocol: str, folder: Path | None, *, force: bool, json: bool
 ) -> None:
     """Evaluate the policies of a life in a stream; print the report, and write it with figures.
 
@@ -45,7 +44,7 @@ def evaluate_life(
     from sme_registry.evaluation import resolve_protocol
     from sme_registry.plots.streams import FILE
 
-    stream, resolved = load_stream(name), resolve_protocol(protocol)
+    resolved = resolve_protocol(protocol)
     target = None if folder is None else folder / FILE
     if target is not None:
         refuse_existing(target, force=force)

@@ -7,11 +7,10 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from sme_registry.cli.arguments import Force, Json, Out, Protocol, changes
+from sme_registry.cli.arguments import Force, Json, Out, Protocol, changed, changes
 from sme_registry.cli.files import print_training
 from sme_registry.cli.study_plan import Jobs
 from sme_registry.cli.train_suite import refuse_fields, refuse_without_suite, train_suite
-from sme_registry.envs.arguments import another_stream
 from sme_registry.errors import OptionError
 from sme_registry.spec import EnvFile, SMESpec, StreamFile, StreamSpec, SuiteFile, catalogue
 from sme_registry.task import load_document
@@ -198,7 +197,7 @@ def train(
     refuse_without_suite(context)
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
-    document = _changed(load_document(task), task, overrides)
+    document = changed(load_document(task), task, overrides)
     algorithm = training.full_name(algorithm or training.default_algorithm(document), agents)
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:
@@ -240,17 +239,6 @@ def _split(values: dict[str, Any], path: Path | None) -> tuple[dict[str, Any], d
     for name in settings.keys() & from_file.keys():
         raise OptionError(f"--set {name}: {path} sets it, too. Remove one.")
     return fields, {**from_file, **settings}
-
-
-def _changed(
-    document: SMESpec | StreamSpec, name: str, overrides: dict[str, Any]
-) -> SMESpec | StreamSpec:
-    """A task with some fields changed; a stream has none to change."""
-    if isinstance(document, SMESpec):
-        return document.derive(**overrides)
-    for field in overrides:
-        raise OptionError(f"--set {field}: {name} is a stream. {another_stream(field)}")
-    return document
 
 
 def _label(task: str, document: SMESpec | StreamSpec, *, changed: bool) -> str:

@@ -9,11 +9,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 from sme_registry.errors import FingerprintMismatchError
 from sme_registry.spec import Fingerprint, SMESpec, SpecLike, StreamLike, StreamSpec, as_spec
-from sme_registry.spec.resolve import names_stream, resolve, resolve_stream
+from sme_registry.spec.resolve import (
+    ResolvedSpec,
+    ResolvedStream,
+    resolve,
+    resolve_document,
+    resolve_stream,
+)
 from sme_registry.task import draw, memory
 from sme_registry.task.fingerprint import check_fingerprint
 from sme_registry.task.task import Task
@@ -76,10 +82,7 @@ def load_spec(task: SpecLike) -> SMESpec:
       UnknownNameError, SpecError: no such task, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize`.
     """
-    resolved = resolve(task)
-    if resolved.fingerprint is not None:
-        materialize(resolved.spec, resolved.fingerprint)
-    return resolved.spec
+    return _checked_spec(resolve(task))
 
 
 def materialize_stream(
@@ -132,17 +135,25 @@ def load_stream(stream: StreamLike) -> StreamSpec:
       UnknownNameError, SpecError: no such stream, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize_stream`.
     """
-    resolved = resolve_stream(stream)
-    if resolved.fingerprints:
-        materialize_stream(resolved.stream, resolved.fingerprints)
-    return resolved.stream
+    return _checked_stream(resolve_stream(stream))
 
 
 def load_document(name: SpecLike | StreamLike) -> SMESpec | StreamSpec:
     """The stream of a name, or the spec; see `load_stream` and `load_spec` for errors."""
-    if names_stream(name):
-        return load_stream(cast("StreamLike", name))
-    return load_spec(cast("SpecLike", name))
+    found = resolve_document(name)
+    return _checked_stream(found) if isinstance(found, ResolvedStream) else _checked_spec(found)
+
+
+def _checked_spec(resolved: ResolvedSpec) -> SMESpec:
+    if resolved.fingerprint is not None:
+        materialize(resolved.spec, resolved.fingerprint)
+    return resolved.spec
+
+
+def _checked_stream(resolved: ResolvedStream) -> StreamSpec:
+    if resolved.fingerprints:
+        materialize_stream(resolved.stream, resolved.fingerprints)
+    return resolved.stream
 
 
 def _draw(spec: SMESpec) -> Task:

@@ -5,8 +5,8 @@ import shutil
 import pytest
 
 from sme_registry.errors import MalformedDocumentError, SMEError, SpecError, UnknownNameError
-from sme_registry.spec import EnvFile, SMESpec, catalogue
-from sme_registry.spec.resolve import resolve
+from sme_registry.spec import EnvFile, SMESpec, StreamFile, StreamSpec, catalogue
+from sme_registry.spec.resolve import resolve, resolve_document
 
 DEFAULT = catalogue.find(EnvFile, "Default-v1")
 
@@ -34,6 +34,35 @@ DEFAULT = catalogue.find(EnvFile, "Default-v1")
 )
 def test_every_name_of_the_default_task_leads_to_it(name):
     assert resolve(name).spec == SMESpec()
+
+
+STREAM = catalogue.find(StreamFile, "Cycle2-v1")
+
+
+@pytest.mark.parametrize(
+    ("name", "document"),
+    [
+        ("Default", SMESpec()),
+        ({"complexity": 1}, SMESpec()),
+        (catalogue.spec_folder() / "envs" / "Default-v1.json", SMESpec()),
+        ("Cycle2", STREAM.stream),
+        (STREAM.digest, STREAM.stream),
+        (STREAM.stream, STREAM.stream),
+        (STREAM.stream.to_dict(), STREAM.stream),
+        (str(catalogue.spec_folder() / "streams" / "Cycle2-v1.json"), STREAM.stream),
+    ],
+    ids=str,
+)
+def test_a_name_leads_to_a_task_or_a_stream(name, document):
+    found = resolve_document(name)
+    assert document == (found.stream if isinstance(document, StreamSpec) else found.spec)
+
+
+def test_a_file_of_neither_a_task_nor_a_stream_is_refused(tmp_path):
+    path = tmp_path / "bare.json"
+    path.write_text('{"complexity": 1}')
+    with pytest.raises(MalformedDocumentError, match=r"bare\.json: is a bare spec"):
+        resolve_document(path)
 
 
 def test_specs_of_named_files_carry_their_fingerprint_and_others_none():
