@@ -876,7 +876,6 @@ def test_a_reader_that_leaves_early_is_no_error(arguments: tuple[str, ...]) -> N
     "command",
     [
         ("dataset", "make", "Switch5"),
-        ("study", "new", "plan.json", "-t", "Switch5", "-a", "PPO"),
         ("diagnose", "optimal", "--task", "Switch5"),
         ("new", "mine.json", "--from", "Switch5"),
     ],
