@@ -22,10 +22,14 @@ STATES: tuple[State, ...] = ("done", "running", "failed", "waiting")
 
 
 def label(planned: PlannedCell) -> str:
-    """A cell's name for people: `PPO on k-25, run 3`, `PPO on phase 2 of Switch5 alone, run 3`."""
-    alone = "" if planned.phase is None else f"phase {planned.phase} of "
-    where = f"{alone}{planned.class_name}{alone and ' alone'}"
-    return f"{planned.algorithm} on {where}, run {planned.run}"
+    """A cell's name for people; see `run_label`."""
+    return run_label(planned.class_name, planned.algorithm, planned.run, planned.phase)
+
+
+def run_label(class_name: str, algorithm: str, run: int, phase: int | None = None) -> str:
+    """`PPO on k-25, run 3`, or of a fresh agent `PPO on phase 2 of Switch5 alone, run 3`."""
+    alone = "" if phase is None else f"phase {phase} of "
+    return f"{algorithm} on {alone}{class_name}{alone and ' alone'}, run {run}"
 
 
 @dataclass(frozen=True)

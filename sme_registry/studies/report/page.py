@@ -18,6 +18,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from sme_registry.spec.study import in_jax
+from sme_registry.studies.engine.status import run_label
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL
 from sme_registry.studies.report.figures import Picture
@@ -113,12 +114,14 @@ def _kinds(analysis: Analysis) -> list[str]:
 
 def _missing(analysis: Analysis) -> list[tuple[str, str]]:
     """What each missing run is, and its error."""
-    rows = [(f"{r.algorithm} on {r.class_name}, run {r.run}", r.error)
-            for r in analysis.missing.itertuples()]  # fmt: skip
-    for r in () if analysis.streams is None else analysis.streams.missing.itertuples():
-        fresh = "" if pd.isna(r.phase) else f", fresh agent of phase {r.phase}"
-        rows.append((f"{r.algorithm} on {r.class_name}, run {r.run}{fresh}", r.error))
-    return rows
+    streams = analysis.streams
+    in_streams = () if streams is None else streams.missing.itertuples()
+    return [
+        *((run_label(r.class_name, r.algorithm, r.run), r.error)
+          for r in analysis.missing.itertuples()),
+        *((run_label(r.class_name, r.algorithm, r.run, None if pd.isna(r.phase) else r.phase),
+           r.error) for r in in_streams),
+    ]  # fmt: skip
 
 
 def _in_jax(analysis: Analysis) -> list[str]:

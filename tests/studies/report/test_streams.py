@@ -292,7 +292,7 @@ def test_findings_say_what_fresh_agents_are_missing(gaps: Path) -> None:
     assert "its plasticity is unknown, since no life has all of its fresh agents" in text
     assert "5 lives have not all of their fresh agents yet" in text
     assert "138 of 150 runs have finished" in text
-    assert "Tired on Switch, run 0, fresh agent of phase 0" in text
+    assert "Tired on phase 0 of Switch alone, run 0" in text
     assert "Stubborn on Switch, run 3: failed: ValueError: <b>bad</b>" in text
 
 

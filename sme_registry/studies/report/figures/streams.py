@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from sme_registry.evaluation.continual.report import Visit
+from sme_registry.evaluation.continual.report import LABELS, Visit
 from sme_registry.plots.streams import (
     MATRIX_SCALE,
     draw_matrix,
@@ -20,7 +20,7 @@ from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.figures import panels
 from sme_registry.studies.report.figures.comparisons import name_rows
 from sme_registry.studies.report.figures.curves import curves_caption, line_with_band, step_text
-from sme_registry.studies.report.figures.panels import Look, Picture
+from sme_registry.studies.report.figures.panels import CONSTANT, Look, Picture
 from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.tables import METRICS, WITHIN
 from sme_registry.studies.report.tables import CURVES, ENOUGH_RUNS
@@ -37,7 +37,11 @@ _INTERVAL = (
     "IQM over lives with its 95 % bootstrap interval, within distribution. "
     f"Hollow: fewer than {ENOUGH_RUNS} lives, so that the interval is an indication only."
 )
-_FRESH = Look(GREY, "", (0, (4, 2)))
+_FRESH = Look(GREY, "", (0, (5, 1.5)))
+_REFERENCES = {
+    "frozen_optimum": Look(GREY, "", (0, (1, 1.2))),
+    "constant_half": CONSTANT,
+}
 _QUARTILES = "Median over lives, with the interquartile range as a band."
 
 
@@ -88,6 +92,7 @@ def _draw_regret(
 ) -> Picture:
     """The dynamic regret over the lifetime, one panel a stream."""
     looks = {algorithm: look._replace(dash="-") for algorithm, look in looks.items()}
+    references = streams.reference_regret
     with panels.panel_grid(len(_lived(streams)), formats, _HEIGHTS) as grid:
         for axes, name in zip(grid.panels, _lived(streams), strict=True):
             rows = streams.regret[streams.regret.class_name == name]
@@ -96,15 +101,20 @@ def _draw_regret(
                 fresh = look._replace(marker="", dash=_FRESH.dash)
                 axes.plot(curve.lifetime, curve.fresh, **fresh.line, linewidth=1.1, zorder=2.5)
             _draw_lines(axes, rows, "lifetime", looks)
+            for reference, curve in references[references.class_name == name].groupby("reference"):
+                look = _REFERENCES[str(reference)]
+                axes.plot(curve.lifetime, curve["median"], **look.line, linewidth=1.1, zorder=1.5)
             _finish_lifetime(axes, streams, name)
         grid.label_rows("dynamic regret  (Σ of 1 − r)")
         any_fresh = streams.regret.fresh.notna().any()
         fresh_look = {"fresh agents": _FRESH} if any_fresh else {}
-        panels.legend(grid.figure, {**looks, **fresh_look})
+        drawn = {LABELS[name]: look for name, look in _REFERENCES.items()
+                 if name in set(references.reference)}  # fmt: skip
+        panels.legend(grid.figure, {**looks, **fresh_look, **drawn})
     caption = (
         f"{_QUARTILES} The regret of every step, summed over the lifetime; shades and numbers "
     )
-    caption += "above are visits and their phases."
+    caption += "above are visits and their phases. Grey: agents that need no training."
     if any_fresh:
         caption += (
             " Dashed, in the colour of the algorithm: agents that start anew in each visit, spread "

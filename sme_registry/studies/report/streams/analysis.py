@@ -44,6 +44,7 @@ class StreamAnalysis:
     differences: pd.DataFrame
     references: pd.DataFrame
     regret: pd.DataFrame
+    reference_regret: pd.DataFrame
     learning_curves: pd.DataFrame
     counts: pd.DataFrame
     missing: pd.DataFrame
@@ -65,7 +66,7 @@ def analyse_streams(
     """Every table of a study's streams; arguments as of `analysis.analyse`."""
     plan, bootstrap = file.plan, Bootstrap(file.digest, draws)
     lives = frames.lives(plan, finished)
-    found = frames.stream_frames(lives)
+    found, costs = frames.stream_frames(lives), tables.reference_costs(lives)
     within = tables.within(found)
     classes = tables.stream_infos(plan)
     names = tuple(each.name for each in plan.algorithms if each.name in set(within.algorithm))
@@ -89,8 +90,9 @@ def analyse_streams(
         differences=differences(
             within, itertools.combinations(names, 2), tables.METRICS, draws, "stream_digest"
         ),
-        references=tables.references(lives),
+        references=tables.references(lives, costs),
         regret=tables.regret(lives),
+        reference_regret=tables.reference_curves(costs),
         learning_curves=learning_curves(found.curves, within, lambda evaluations: 1),
         counts=tables.counts(plan, finished, missing),
         missing=missing,

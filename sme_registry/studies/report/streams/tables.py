@@ -17,6 +17,7 @@ Names of the CSV files begin with `stream_`.
     references          reference, region, metric: value, the median over the lives' streams
     regret              lifetime: median, q25, q75 of the regret until then; fresh: the median of
                         fresh agents', NaN without them; runs
+    reference_regret    reference, lifetime: median over the lives' streams, in expectation
     learning_curves     as in `report.tables`, on the task in force, not smoothed
     counts              lives, fresh_agents: finished; planned_lives, planned_fresh_agents; failed:
                         of both; a fresh agent that several lives have counts for each
@@ -34,6 +35,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
+from sme_registry.evaluation.continual import DynamicRegret, reference_regret
 from sme_registry.evaluation.continual.report import METRICS as LABELS
 from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
 from sme_registry.statistics import Array
@@ -69,7 +71,11 @@ BY_VISIT = (
 _PLACE = "class_name:str algorithm:str"
 _INTERVAL = "runs:int64 iqm low high"
 _POINTS = 201  # of a curve of regret
+_EPISODES = 1000  # in which the reference agents act, over all draws of a stream
 _INITIAL = -1
+
+Costs = Mapping[tuple[str, str], Sequence[DynamicRegret]]
+"""(class, reference) → the expected dynamic regret of a reference agent in each draw."""
 
 
 @dataclass(frozen=True)
@@ -99,20 +105,14 @@ class StreamInfo:
 
 def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
     """Every class of streams of the plan, by name."""
-    first = plan.streams[0].instances[0] if plan.streams else None
     infos: dict[str, StreamInfo] = {}
     for member in plan.streams:
         stream = member.instances[0]
-        axis = TASKS if _schedule(stream) == _schedule(first) else SCHEDULE
-        infos[member.name] = StreamInfo(member.name, stream, axis if infos else "")
+        base = next(iter(infos.values()), None)
+        alike = base is not None and stream.switches == base.stream.switches
+        axis = "" if base is None else TASKS if alike else SCHEDULE
+        infos[member.name] = StreamInfo(member.name, stream, axis)
     return infos
-
-
-def _schedule(stream: StreamSpec | None) -> Any:
-    """What two streams have in common that differ in their tasks alone."""
-    assert stream is not None
-    steps = [(phase.steps, phase.drift and phase.drift.increments) for phase in stream.phases]
-    return steps, stream.cycles, stream.switch, stream.observes_phase
 
 
 def metrics(lives: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
@@ -171,8 +171,27 @@ def _estimates(
     return found
 
 
-def references(lives: Sequence[Life]) -> pd.DataFrame:
-    """The reference agents on each stream, which need no training: medians over its draws."""
+def reference_costs(lives: Sequence[Life]) -> Costs:
+    """The expected dynamic regret of the reference agents in the streams of these lives."""
+    streams: dict[str, dict[str, StreamSpec]] = {}
+    for life in lives:
+        of_class = streams.setdefault(life.planned.class_name, {})
+        of_class[life.report.stream_digest] = life.report.stream
+    return {
+        (class_name, reference): [log[reference] for log in logs]
+        for class_name, of_class in streams.items()
+        if (
+            logs := [
+                reference_regret(stream, episodes=-(-_EPISODES // len(of_class)))
+                for stream in of_class.values()
+            ]
+        )
+        for reference in logs[0]
+    }
+
+
+def references(lives: Sequence[Life], costs: Costs) -> pd.DataFrame:
+    """The reference agents in each stream, which need no training: medians over its draws."""
     values: dict[tuple[str, ...], dict[str, float]] = {}
     for life in lives:
         report = life.report
@@ -184,6 +203,10 @@ def references(lives: Sequence[Life]) -> pd.DataFrame:
                         at = life.planned.class_name, name, region.name, metric
                         values.setdefault(at, {})[report.stream_digest] = value
     rows = [(*at, float(np.median([*each.values()]))) for at, each in values.items()]
+    rows += [
+        (*place, WITHIN, "online_regret", float(np.median([log.online_regret for log in logs])))
+        for place, logs in costs.items()
+    ]
     return frame(rows, "class_name:str reference:str region:str metric:str value")
 
 
@@ -192,31 +215,39 @@ def regret(lives: Sequence[Life]) -> pd.DataFrame:
     columns = f"{_PLACE} lifetime median q25 q75 fresh runs:int64"
     tables = [frame([], columns)]
     for place, group in _groups(lives).items():
-        logs = [life.report.dynamic_regret for life in group]
-        known = [log for log in logs if log is not None]
-        if not known:
+        logs = [log for life in group if (log := life.report.dynamic_regret) is not None]
+        if not logs:
             continue
-        x = np.linspace(0.0, min(log.lifetime[-1] for log in known), _POINTS)
-        each = [np.interp(x, [0, *log.lifetime], [0.0, *log.cumulative_regret]) for log in known]
-        q25, median, q75 = np.quantile(each, [0.25, 0.5, 0.75], axis=0)
+        references = [life.report.reference_regret for life in group]
+        alone = [log for each in references if (log := each.get("fresh_agents")) is not None]
+        x = np.linspace(0.0, min(log.lifetime[-1] for log in logs), _POINTS)
+        q25, median, q75 = np.quantile(_until(logs, x), [0.25, 0.5, 0.75], axis=0)
+        fresh: Any = np.median(_until(alone, x), axis=0) if alone else math.nan
         table = {
             "class_name": place[0], "algorithm": place[1], "lifetime": x, "median": median,
-            "q25": q25, "q75": q75, "fresh": _fresh_regret(group, x), "runs": len(known),
+            "q25": q25, "q75": q75, "fresh": fresh, "runs": len(logs),
         }  # fmt: skip
         tables.append(pd.DataFrame(table))
     return pd.concat(tables, ignore_index=True)
 
 
-def _fresh_regret(lives: Sequence[Life], lifetime: Array) -> Any:
-    """The median over lives of their fresh agents' regret, which grows evenly in each visit."""
-    each = []
-    for life in lives:
-        log = life.report.dynamic_regret
-        if log is not None and log.fresh_online_regret is not None:
-            ends = np.array([0, *(visit.lifetime for visit in life.report.visits)])
-            alone = [log.fresh_online_regret[visit.phase] for visit in life.report.visits]
-            each.append(np.interp(lifetime, ends, np.cumsum([0.0, *(alone * np.diff(ends))])))
-    return np.median(each, axis=0) if each else math.nan
+def reference_curves(costs: Costs) -> pd.DataFrame:
+    """The dynamic regret of reference agents until points of the life, if there is any."""
+    tables = [frame([], "class_name:str reference:str lifetime median")]
+    for (class_name, reference), logs in costs.items():
+        if max(log.dynamic_regret for log in logs) > 0.0:
+            x = np.linspace(0.0, logs[0].lifetime[-1], _POINTS)
+            median = np.median(_until(logs, x), axis=0)
+            at = {"class_name": class_name, "reference": reference}
+            tables.append(pd.DataFrame({**at, "lifetime": x, "median": median}))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _until(logs: Sequence[DynamicRegret], lifetime: Array) -> Array:
+    """`[n, X]` regret of each life until these lifetimes."""
+    return np.array(
+        [np.interp(lifetime, [0, *log.lifetime], [0.0, *log.cumulative_regret]) for log in logs]
+    )
 
 
 def counts(

@@ -28,9 +28,11 @@ from sme_registry.terminal.templates import fixed
 
 CSV_TABLES = (
     "metrics", "visit_metrics", "matrices", "contrasts", "differences", "references", "regret",
+    "reference_regret",
     "learning_curves", "counts", "missing",
 )  # fmt: skip
 _METRIC = {metric.key: metric for metric in (*METRICS, *BY_VISIT)}
+_OF_TRAINING = ("learning_transfer", "online_regret")  # the same numbers in all regions
 _SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", "online_regret")
 
 
@@ -56,7 +58,7 @@ def stream_tables(streams: StreamAnalysis) -> Iterator[TextTable]:
 def _metrics(streams: StreamAnalysis, name: str) -> TextTable:
     rows = streams.metrics
     rows = rows[(rows.class_name == name) & rows.region.isin((WITHIN, OUTSIDE))]
-    everywhere = rows.metric.isin(("learning_transfer", "online_regret"))
+    everywhere = rows.metric.isin(_OF_TRAINING)
     rows = rows[~everywhere | (rows.region == WITHIN)]
     rows = rows.assign(region=rows.region.mask(everywhere, ""))
     order = list(_METRIC)
@@ -67,11 +69,17 @@ def _metrics(streams: StreamAnalysis, name: str) -> TextTable:
         "algorithm", lambda row: level_text(row, _METRIC[row.metric]), streams.algorithms,
     )  # fmt: skip
     found = streams.references[streams.references.class_name == name]
-    values = {(labels[r.metric], r.region, r.reference): r.value for r in found.itertuples()}
+    cells = {
+        (
+            labels[row.metric],
+            "" if row.metric in _OF_TRAINING else row.region,
+            row.reference,
+        ): fixed(row.value, _METRIC[row.metric].digits)
+        for row in found.itertuples()
+    }
     for reference in dict.fromkeys(found.reference):
         places = zip(frame["metric"], frame["region"], strict=True)
-        cells = [values.get((*place, reference)) for place in places]
-        frame[LABELS[reference]] = ["" if cell is None else fixed(cell) for cell in cells]
+        frame[LABELS[reference]] = [cells.get((*place, reference), "") for place in places]
     return TextTable(
         f"stream-metrics-{slug(name)}",
         f"Lives in {name}",
