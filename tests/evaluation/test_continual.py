@@ -143,6 +143,12 @@ def test_reference_agents_are_exact():
         assert M["frozen_optimum"][0, j] == pytest.approx(single.wd_regret, abs=1e-12)
 
 
+def test_a_life_is_named_after_its_policies_if_they_share_a_name():
+    lives = [["constant"] * 3, ["constant", "constant", "random"]]
+    reports = [evaluate_stream(life, THREE, PROTOCOL) for life in lives]
+    assert [each.policy for each in reports] == ["constant", "3 policies"]
+
+
 def test_lives_of_agents_that_are_frozen_or_start_anew():
     assert frozen_after_first(TWICE, ["a", "b"]) == ["a"] * 4
     assert fresh_per_phase(TWICE, ["a", "b"]) == ["a", "b", "a", "b"]

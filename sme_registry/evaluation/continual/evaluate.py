@@ -54,7 +54,7 @@ def evaluate_stream(
       fresh: for each phase the policy of an agent trained for as many steps on that phase alone,
         for the plasticity.
       action_range: as in `evaluate`, of all policies.
-      name: what the report calls the agent; None takes the name of the last policy.
+      name: what the report calls the agent; None takes the name of its policies, if they share it.
       algorithm: as in `evaluate`.
       progress: called after each batch with the number of states done, and of all states.
 
@@ -103,11 +103,13 @@ def evaluate_stream(
         measured[alone + np.arange(P), np.arange(P)] if fresh is not None else None,
         _references(measured[:P], V),
     )
-    last = subjects[life[-1]].acts
+    acting = [subjects[row].acts for row in life]
+    names = {policy.name for policy in acting if isinstance(policy, Policy)}
+    last = acting[-1]
     assert isinstance(last, Policy)
     digests = [each.digest for each in final_specs(stream)]
     return StreamReport(
-        policy=name or last.name,
+        policy=name or (last.name if len(names) == 1 else f"{V} policies"),
         action_range=last.action_range,
         stream=stream,
         stream_digest=stream.digest,
