@@ -203,3 +203,8 @@ def test_bad_input_is_refused(life, fields, error, message):
 def test_a_frozen_agent_needs_its_training():
     with pytest.raises(OptionError, match="frozen, training: must be given together"):
         reference_regret(TWICE, frozen="linear")
+    late, whole = (dynamic_regret(TWICE, [end], [0.5], 10) for end in (60, 10))
+    with pytest.raises(OptionError, match="training: has no steps in visit 0"):
+        reference_regret(TWICE, frozen="linear", training=late)
+    with pytest.raises(UnknownNameError, match=r"frozen: .*'linear'"):
+        reference_regret(TWICE, frozen="linaer", training=whole)

@@ -130,7 +130,13 @@ def reference_regret(
         "constant_half": [reference_policy("constant_half", first)] * V,
     }
     if training is not None:
-        lives["frozen_agent"] = [training.visits[0].online_regret, *[frozen] * (V - 1)]
+        learned = training.visits[0].online_regret
+        if learned is None:
+            raise OptionError(
+                "training: has no steps in visit 0. Give the dynamic regret of a whole life."
+            )
+        acting = prepared(frozen, stream, "frozen")
+        lives["frozen_agent"] = [learned, *[acting] * (V - 1)]
     return {
         name: expected_regret(life, stream, episodes=episodes, seed=seed)
         for name, life in lives.items()
