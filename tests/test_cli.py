@@ -693,6 +693,24 @@ SHORT = ("train", "Plane1", "-n", "120", *QUICK)
 
 
 class TestTrain:
+    def test_it_trains_on_a_stream_and_shows_what_was_retained_and_what_it_cost(
+        self, tmp_path: Path
+    ) -> None:
+        pytest.importorskip("stable_baselines3")
+        task = SMESpec(state_dim=2, action_dim=2, horizon=20)
+        phases = [{"spec": task, "steps": 40}, {"spec": task.derive(seed=1), "steps": 40}]
+        save(StreamSpec(phases=phases), tmp_path / "mine.json")
+        ppo = ("-a", "PPO", "--set", "n_steps=40", "--set", "batch_size=40", *QUICK)
+        result = good("train", "mine.json", *ppo)
+        assert "PPO on mine (S=2, A=2, 2 phases, 2 visits)" in result.stdout
+        assert "\n\nNormalised regret in WD on the task of each phase" in result.stdout
+        assert "\n\nOnline regret" in result.stdout
+        assert "frozen after visit 0" in result.stdout
+        assert "phase 1, mean regret" in result.stderr
+        folder = tmp_path / "runs" / "mine-PPO-seed0"
+        assert (folder / "snapshots" / "visit-01.zip").exists()
+        assert "All files are in runs/mine-PPO-seed0/" in result.stdout
+
     def test_it_trains_reports_and_says_where(self, tmp_path: Path) -> None:
         pytest.importorskip("stable_baselines3")
         result = good(*SHORT, "--json")

@@ -44,7 +44,11 @@ def print_training(
         record, report = result.record.to_dict(), result.report.to_dict()
         print_json({"folder": str(folder), "run": record, "evaluation": report})
         return
-    for each in (*tables, *result.report.tables()):
+    for each in tables:
+        out().print(each)
+    for index, each in enumerate(result.report.tables()):
+        if index:
+            out().print()
         out().print(each)
     out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
 
