@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 
-from sme_registry.errors import OptionError, PolicyError
+from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
 from sme_registry.jax import run as jax_run
@@ -24,7 +24,7 @@ from sme_registry.sb3 import EpisodeRegret
 from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.training import checkpoint
 from sme_registry.training.episodes import Episode
-from sme_registry.training.learn import RunLog
+from sme_registry.training.learn import RunLog, not_finite
 from sme_registry.training.record import MODEL, TENSORBOARD, RunRecord
 from sme_registry.training.sb3_models import new_sb3_model, set_weights
 from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
@@ -144,18 +144,8 @@ def _on_visit(agent: Agent, record: RunRecord, folder: Path) -> Any:
 
 
 def _check_finite(program: Program, folder: Path) -> None:
-    if not program.failed()[0]:
-        return
-    failure = f"the weights are not finite any longer at step {program.steps:,}"
-    record = RunRecord.read(folder)  # of its last checkpoint
-    if record is not None:
-        record.updated(status="failed", failure=failure).write(folder)
-    path = folder / checkpoint.FILE
-    kept = f"{path} is its last checkpoint" if path.exists() else "it has no checkpoint"
-    raise PolicyError(
-        f"training: {failure}. The run stays in {folder}; {kept}. Train into another folder with "
-        "other hyperparameters, such as a lower learning_rate."
-    )
+    if program.failed()[0]:
+        raise not_finite(program.steps, folder)
 
 
 class _PresentEpisode:

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor
 
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, write_atomically
 from sme_registry.sb3 import EpisodeRegret, EpisodeSums, RegretCallback, SMETeamVecEnv, SMEVecEnv
@@ -82,7 +83,8 @@ def learn(
       independent learners a dict of each agent's.
 
     Raises:
-      PolicyError: the checkpoint cannot be loaded.
+      PolicyError: the checkpoint cannot be loaded; or the weights are not finite any longer, and
+        the last checkpoint stays.
       OptionError: a file cannot be written.
     """
     env = model.env
@@ -94,10 +96,14 @@ def learn(
     visits = _visits(model, record, folder, first_step)
     with RunLog(record, folder, first_step, total, progress, console) as log:
         if first_step < record.steps:
-            if record.independent:
-                _train_independent(model, record, first_step, log)
-            else:
-                _train(model, record, first_step, log, visits)
+            try:
+                if record.independent:
+                    _train_independent(model, record, first_step, log)
+                else:
+                    _train(model, record, first_step, log, visits)
+            except ValueError:  # of our environments or of PyTorch, where actions are NaN
+                _check_finite(model, log)
+                raise
             _save_checkpoint(model, log)
     for each in _models(model):
         each.logger.close()
@@ -151,9 +157,36 @@ def _visits(model: Any, record: RunRecord, folder: Path, first_step: int) -> Vis
 
 
 def _save_checkpoint(model: Any, log: RunLog) -> None:
+    _check_finite(model, log)
     independent = isinstance(model, IndependentLearners)
     log.save_checkpoint(
         model.save_checkpoint if independent else lambda path: checkpoint.save(model, path)
+    )
+
+
+def _check_finite(model: Any, log: RunLog) -> None:
+    parameters = (each for one in _models(model) for each in one.policy.parameters())
+    # Squared: products of weights that are finite and huge are not, and nor are the actions.
+    if not all(bool(torch.isfinite(each.square()).all()) for each in parameters):
+        raise log.not_finite()
+
+
+def not_finite(steps: int, folder: Path) -> PolicyError:
+    """The error for a run whose weights are NaN or infinite; its record says that it failed.
+
+    Args:
+      steps: that it has done.
+      folder: of the run.
+    """
+    failure = f"the weights are not finite any longer at step {steps:,}"
+    record = RunRecord.read(folder)  # of its last checkpoint
+    if record is not None:
+        record.updated(status="failed", failure=failure).write(folder)
+    path = folder / checkpoint.FILE
+    kept = f"{path} is its last checkpoint" if path.exists() else "it has no checkpoint"
+    return PolicyError(
+        f"training: {failure}. The run stays in {folder}; {kept}. Train into another folder with "
+        "other hyperparameters, such as a lower learning_rate."
     )
 
 
@@ -267,6 +300,10 @@ class RunLog:
             save(self._folder / checkpoint.FILE)
             self.record().write(self._folder)
         self._last_checkpoint = self._steps
+
+    def not_finite(self) -> PolicyError:
+        """The error for weights that are not finite; see the function."""
+        return not_finite(self._steps, self._folder)
 
     @property
     def _wall_seconds(self) -> float:

@@ -169,7 +169,7 @@ def train(
         or a stream that agents in JAX cannot live through.
       OptionError: another argument is out of range; or the folder contains another run, a finished
         run, no run to resume or other files, is in use by another process, or is not writable.
-      PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer (JAX).
+      PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer.
       ResourceLimitError: the task would not fit in memory.
       MissingDependencyError: Stable-Baselines3, PyTorch or JAX is not installed.
     """

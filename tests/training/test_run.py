@@ -20,6 +20,7 @@ from sme_registry import EvaluationReport, SMESpec, evaluate
 from sme_registry.errors import (
     MissingDependencyError,
     OptionError,
+    PolicyError,
     ResourceLimitError,
     SMEError,
     SpecError,
@@ -113,6 +114,19 @@ def test_on_policy_algorithms_finish_their_rollout_over_all_lanes(tmp_path: Path
     assert result.record.algorithm == "A2C"
     assert result.record.steps_done == 45  # rollouts of 5 steps in 3 lanes
     assert [episode.step for episode in result.episodes] == []
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "TD3"])
+def test_weights_that_are_not_finite_end_the_run(algorithm: str, tmp_path: Path) -> None:
+    own = {"n_steps": 32, "batch_size": 32} if algorithm == "PPO" else {"learning_starts": 10}
+    settings = {"learning_rate": 1e30, "policy_kwargs": {"net_arch": [8]}, **own}
+    with pytest.raises(PolicyError, match=r"the weights are not finite any longer at step \d+\. "):
+        short(tmp_path, algorithm=algorithm, hyperparameters=settings, checkpoint_every=10)
+    record = RunRecord.read(tmp_path)
+    assert record is not None
+    assert (record.status, record.failure[:11]) == ("failed", "the weights")
+    with pytest.raises(OptionError, match="contains a failed run of"):
+        short(tmp_path, algorithm=algorithm, resume=True)
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "DDPG"])
