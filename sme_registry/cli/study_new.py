@@ -11,7 +11,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Force, find_file
 from sme_registry.cli.files import check_document_path
 from sme_registry.cli.plan_options import PlanOptions, with_options
-from sme_registry.cli.study_plan import check_algorithms
+from sme_registry.cli.study_plan import check_algorithms, warn_of_uneven_rollouts
 from sme_registry.errors import MissingDependencyError, OptionError
 from sme_registry.io import read_json
 from sme_registry.spec import StudyFile
@@ -79,6 +79,7 @@ def new(
         file = StudyFile.with_digest(data, source, **({} if named else default_name) | about)
     # A package that is not installed here may be installed where the plan runs.
     check_algorithms(file.plan.algorithms, MissingDependencyError)
+    warn_of_uneven_rollouts(file.plan)
     file.write(path)
     out().print(f"{escape(str(path))}  {file.digest}", soft_wrap=True)
     err().print(f"[dim]To see its runs and times: sme study plan {escape(str(path))}[/]")

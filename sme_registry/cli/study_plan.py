@@ -12,7 +12,7 @@ from rich.markup import escape
 from sme_registry.cli.arguments import Json, find_file
 from sme_registry.cli.list import number_of_cells, study_table, summary
 from sme_registry.errors import OptionError, SMEError
-from sme_registry.spec import PlannedCell, StudyAlgorithm, StudyFile, catalogue
+from sme_registry.spec import PlannedCell, StudyAlgorithm, StudyFile, StudyPlan, catalogue
 from sme_registry.terminal import Table, duration_range, err, out, print_json
 
 Steps = Annotated[
@@ -100,6 +100,7 @@ def plan(
     results = {} if folder is None else Ledger(folder).results()
     names = {cell.algorithm for cell in planned}
     check_algorithms((a for a in file.plan.algorithms if a.name in names), SMEError)
+    warn_of_uneven_rollouts(file.plan)
     estimator = Estimator(results.values())
     waiting = [cell for key, cell in cells.items() if key not in results]
     spans = [estimator.seconds(cell) for cell in waiting]
@@ -231,6 +232,22 @@ def check_algorithms(algorithms: Iterable[StudyAlgorithm], errors: type[SMEError
             checks.check_hyperparameters(algorithm)
     for message in unique(messages):  # several algorithms may lack the same package
         err().print(f"[yellow]cannot run here:[/] {escape(message)}", soft_wrap=True)
+
+
+def warn_of_uneven_rollouts(plan: StudyPlan) -> None:
+    """Print which rollouts do not end where the phases of streams do."""
+    from sme_registry.studies.engine import checks
+
+    for uneven in checks.uneven_rollouts(plan):
+        err().print(
+            f"[yellow]uneven rollouts:[/] {escape(uneven.algorithm)} on "
+            f"{escape(', '.join(uneven.streams))}: its rollouts of {uneven.n_steps:,} steps do not "
+            "end where phases do. At the end of a visit it has learned from fewer steps than a "
+            "fresh agent, which counts as lost plasticity. Use "
+            f"--set {escape(uneven.algorithm)}.n_steps={uneven.better}, and a batch_size that "
+            "divides it.",
+            soft_wrap=True,
+        )
 
 
 def unique(values: Iterable[str]) -> list[str]:

@@ -63,6 +63,7 @@ def train_suite(
     """
     from sme_registry import training
     from sme_registry.cli.study import print_status
+    from sme_registry.cli.study_plan import warn_of_uneven_rollouts
     from sme_registry.evaluation import resolve_protocol
     from sme_registry.spec.study import INDEPENDENT
     from sme_registry.studies.engine.runner import run_study
@@ -101,6 +102,7 @@ def train_suite(
         },
         "options",
     )
+    warn_of_uneven_rollouts(plan)
     study = StudyFile(name=file.name, digest=plan.digest, plan=plan)
     status = run_study(study, folder, jobs=jobs, keep_models=True, device=device, console=err())
     print_status(status, json)

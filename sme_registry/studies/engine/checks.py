@@ -7,12 +7,14 @@ plan runs, so its algorithms cannot be checked here: `MissingDependencyError`, o
 
 from __future__ import annotations
 
+import inspect
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple, cast
 
-from sme_registry.errors import OptionError, SpecError
+from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.offline.hyperparameters import resolve_hyperparameters
-from sme_registry.spec import Cell, StudyAlgorithm
+from sme_registry.spec import Cell, StudyAlgorithm, StudyPlan
 from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
 from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
@@ -20,7 +22,7 @@ from sme_registry.training import ALGORITHMS
 from sme_registry.training.algorithms import is_on_policy, require_sb3
 from sme_registry.training.hyperparameters import refuse_unknown
 
-__all__ = ["check_hyperparameters", "check_task", "find"]
+__all__ = ["check_hyperparameters", "check_task", "find", "uneven_rollouts"]
 
 
 def find(uses: str) -> None:
@@ -91,6 +93,59 @@ def check_task(cell: Cell) -> None:
         except SpecError as error:
             raise SpecError(f"phases.{index}.spec: {error}") from None
     check_switches(cell.stream)
+
+
+class UnevenRollouts(NamedTuple):
+    """An on-policy algorithm whose rollouts do not end where phases of streams do.
+
+    The policy at the end of a visit has then learned from fewer steps than a fresh agent, which
+    finishes its last rollout, and that counts as lost plasticity.
+
+    Attributes:
+      algorithm: its name in the plan.
+      n_steps: of a rollout.
+      streams: the names of the classes.
+      better: the longest shorter rollout that ends where their phases do.
+    """
+
+    algorithm: str
+    n_steps: int
+    streams: tuple[str, ...]
+    better: int
+
+
+def uneven_rollouts(plan: StudyPlan) -> list[UnevenRollouts]:
+    """The algorithms of a plan that can be found here and learn from such rollouts."""
+    uneven = []
+    for algorithm in plan.algorithms if plan.streams else ():
+        try:
+            n = _rollout_steps(algorithm)
+        except SMEError:
+            continue
+        phases = {
+            member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
+            for member in plan.streams
+        }
+        uneven_on = {name: steps for name, steps in phases.items() if steps % n}
+        if uneven_on:
+            together = math.gcd(*uneven_on.values())
+            better = max(m for m in range(1, min(n, together) + 1) if together % m == 0)
+            uneven.append(UnevenRollouts(algorithm.name, n, tuple(uneven_on), better))
+    return uneven
+
+
+def _rollout_steps(algorithm: StudyAlgorithm) -> int:
+    """Steps between two updates of an on-policy algorithm; 1 for any other."""
+    uses, chosen = algorithm.uses, algorithm.hyperparameters
+    if in_jax(uses):
+        from sme_registry.jax.run import settings_of
+
+        return int(getattr(settings_of(uses, chosen), "n_steps", 1))
+    learner = find_algorithm(uses)
+    if not is_on_policy(learner):
+        return 1
+    parameter = inspect.signature(learner).parameters.get("n_steps")
+    return 1 if parameter is None else int(cast(Any, chosen.get("n_steps", parameter.default)))
 
 
 def refuse_of_reference(uses: str, hyperparameters: Mapping[str, Any]) -> None:

@@ -1,0 +1,236 @@
+"""Suites and plans with streams, by command: what they hold, what they run, who refuses them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from leaderboard.documents.board import BoardDocument
+from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import BoardError
+from sme_registry import SMESpec, StreamSpec, load, save
+from sme_registry.cli import app
+from sme_registry.errors import SpecError
+from sme_registry.spec import StreamFile, StudyFile, Suite, SuiteFile, catalogue
+from sme_registry.spec.study import Cell
+from sme_registry.studies.engine.checks import uneven_rollouts
+
+TASK = SMESpec(state_dim=2, action_dim=2, horizon=8)
+STREAM = StreamSpec(
+    phases=[{"spec": TASK, "steps": 40}, {"spec": TASK.derive(seed=1), "steps": 24}], cycles=2
+)
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    save(STREAM, "mine.json")
+
+
+def sme(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [*map(str, arguments)])
+
+
+def good(*arguments: str | Path) -> str:
+    result = sme(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refused(*arguments: str | Path) -> str:
+    result = sme(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ")
+    assert len(result.stderr.splitlines()) == 1
+    return result.stderr
+
+
+def new_suite(*others: str) -> Suite:
+    good("suite", "new", "lives.json", "-t", "mine.json", "--instances", "3", *others)
+    return SuiteFile.read("lives.json").suite
+
+
+def new_plan(*arguments: str) -> StudyFile:
+    good("study", "new", "plan.json", "--force", *arguments)
+    return StudyFile.read("plan.json")
+
+
+def test_the_suite_of_the_catalogue_has_ten_draws_of_each_of_its_streams() -> None:
+    suite = catalogue.find(SuiteFile, "continual").suite
+    streams = {file.name: file.stream for file in catalogue.entries(StreamFile)}
+    assert not suite.classes
+    assert {member.name: member.stream for member in suite.streams} == streams
+    assert suite.runs == dict.fromkeys(streams, 10)
+    assert len({stream.digest for stream in suite.stream_instances}) == 60
+
+
+def test_a_suite_has_a_class_for_a_stream_beside_tasks() -> None:
+    suite = new_suite("-t", "Default")
+    assert suite.stream_instances == tuple(STREAM.draw(number) for number in range(3))
+    assert [member.name for member in suite.classes] == ["Default"]
+    assert suite.runs == {"Default": 3, "mine": 3}
+    wider = sme("suite", "new", "wider.json", "--suite", "lives.json", "-t", "Switch5")
+    assert "3 classes, 7 instances" in wider.stderr
+    assert [member.name for member in SuiteFile.read("wider.json").suite.streams] == [
+        "mine",
+        "Switch5",
+    ]
+    good("validate", "lives.json", "wider.json")
+    assert "appears twice" in refused(
+        "suite", "new", "x.json", "-t", "mine.json", "-t", "mine.json"
+    )
+
+
+def test_a_suite_of_streams_is_shown_with_names_to_train_by() -> None:
+    shown = good("show", "continual")
+    assert "Cycle2" in shown
+    assert "120,000" in shown
+    assert "To train on a stream: sme train sha256:" in shown
+    lines = good("show", "continual", "--digests").split()
+    instances = catalogue.find(SuiteFile, "continual").suite.stream_instances
+    assert lines == [stream.digest for stream in instances]
+    assert load(lines[1], StreamSpec) == instances[1]
+    suite = new_suite("-t", "Default")
+    entries = json.loads(good("show", "lives.json", "--json"))["derived"]["instances"]
+    assert entries[-1] == {"class": "mine", "draw": 2, "digest": suite.stream_instances[2].digest}
+    assert "To train on these tasks: sme study new" in good("show", "lives.json")
+    listed = good("list", "--kind", "suite").splitlines()
+    assert next(line for line in listed if line.startswith("continual")).split()[1:4] == [
+        "6",
+        "0",
+        "60",
+    ]
+
+
+def test_every_phase_of_every_draw_is_certified() -> None:
+    new_suite()
+    certified = json.loads(good("certify", "lives.json", "--json"))
+    labels = [entry["task"] for entry in certified]
+    assert labels == [
+        f"lives/mine draw {draw} phase {phase}" for draw in range(3) for phase in (0, 1)
+    ]
+
+
+def test_a_plan_has_a_life_and_fresh_agents_for_each_run() -> None:
+    arguments = ("--instances", "2", "-a", "TD3", "--seeds", "2", "--evaluations", "8")
+    plan = new_plan("-t", "mine.json", *arguments).plan
+    assert not plan.classes
+    places = [
+        (place.run, place.phase, place.cell.steps, place.cell.evaluations) for place in plan.cells
+    ]
+    of_a_run = [(None, 128, 8), (0, 40, 2), (1, 24, 2)]
+    assert places == [(run, *each) for run in (0, 1) for each in of_a_run]
+    assert plan.cells[3].cell.stream == STREAM.draw(1)
+    assert plan.cells[5].cell == plan.cells[3].cell.fresh[1]
+    from_suite = new_plan("--suite", "continual", "-a", "TD3").plan
+    assert from_suite.streams == catalogue.find(SuiteFile, "continual").suite.streams
+
+
+def test_cells_that_streams_share_count_once() -> None:
+    file = catalogue.find(StudyFile, "continual")
+    assert len(file.plan.cells) == 135
+    entry = json.loads(good("study", "plan", "continual", "--json"))
+    assert entry["cells"] == 126
+    assert "20,000 to 120,000" in good("study", "plan", "continual")
+    (listed,) = (
+        one for one in json.loads(good("study", "plan", "--json")) if one["name"] == "continual-v1"
+    )
+    assert listed["cells"] == 126
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-n", "100"), "steps=100: lives have the steps of their streams"),
+        (("-n", "TD3=100"), r"steps={'TD3': 100}: lives have the steps of their streams"),
+        (("--sweep", "k=1,2"), "--sweep: varies a field of a task, and 'mine.json' is a stream"),
+        (("-a", "offline:bc"), "algorithms.1.uses='offline:bc': cannot live in a stream"),
+        (("-a", "reference:linear"), "uses='reference:linear': cannot live in a stream"),
+        (("-a", "independent:PPO"), "uses='independent:PPO': cannot live in a stream"),
+        (("--instances", "0"), "instances=0: must be"),
+    ],
+)
+def test_what_a_plan_of_streams_cannot_have_is_refused(
+    arguments: tuple[str, ...], message: str
+) -> None:
+    assert message in refused(
+        "study", "new", "plan.json", "-t", "mine.json", "-a", "TD3", *arguments
+    )
+    assert not Path("plan.json").exists()
+
+
+def test_steps_are_those_of_single_tasks_beside_streams() -> None:
+    plan = new_plan(
+        "-t", "Default", "-t", "mine.json", "-a", "TD3", "-n", "77", "--seeds", "1"
+    ).plan
+    assert [place.cell.steps for place in plan.cells] == [77, 128, 40, 24]
+
+
+def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length() -> None:
+    chosen = ("-a", "PPO", "-a", "TD3", "-a", "short=PPO", "--set", "short.n_steps=8")
+    chosen += ("--set", "short.batch_size=8")
+    result = sme("study", "new", "plan.json", "-t", "mine.json", "-t", "Switch5", *chosen)
+    assert result.exit_code == 0, result.output
+    plan = StudyFile.read("plan.json").plan
+    (uneven,) = uneven_rollouts(plan)
+    assert (uneven.algorithm, uneven.n_steps, uneven.better) == ("PPO", 2048, 8)
+    assert uneven.streams == ("mine", "Switch5")
+    assert "uneven rollouts: PPO on mine, Switch5: its rollouts of 2,048 steps" in result.stderr
+    assert "--set PPO.n_steps=8" in result.stderr
+    assert uneven_rollouts(catalogue.find(StudyFile, "continual").plan) == []
+
+
+def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams() -> None:
+    new_suite()
+    message = refused("train", "--suite", "lives.json", "-n", "100")
+    assert "--steps: is that of each stream here. Leave it out" in message
+    message = refused("train", "--suite", "lives.json", "-a", "TD3", "--device", "cpu")
+    assert "device='cpu': is for agents in JAX" in message  # the plan was accepted
+    assert "cannot live in a stream" in refused("train", "--suite", "lives.json", "--independent")
+
+
+def test_leaderboards_refuse_streams() -> None:
+    suite = new_suite()
+    with pytest.raises(SpecError, match=r"has streams \(mine\), and a leaderboard needs single"):
+        suite.refuse_streams("a leaderboard")
+    from leaderboard.cli import app as leaderboard
+
+    for command in (
+        ["init", "board"],
+        ["new", "bundle", "--runs", "x", "--method", "m", "--submitter", "s"],
+    ):
+        result = CliRunner().invoke(leaderboard, [*command, "--suite", "lives.json"])
+        assert result.exit_code == 2, result.output
+        assert "suite: has streams (mine)" in result.stderr
+    fields = {"title": "x", "suite_name": "lives-v1", "protocol_name": "quick-v1", "protocol": {}}
+    key = SigningKey.generate().public
+    with pytest.raises((SpecError, BoardError), match=r"suite: has streams \(mine\)"):
+        BoardDocument.from_dict({**fields, "suite": suite, "key": key})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"draws": [0, 0]}, r"streams.0.draws=\[0, 0\]: must be distinct"),
+        ({"draws": [-1]}, "streams.0.draws.0=-1: must be"),
+        ({"draw": [1]}, "streams.0.draw=.*unknown field. Did you mean 'draws'"),
+        ({"stream": "Swich5"}, "Did you mean"),
+        ({"name": "default"}, "the name 'default' appears twice"),
+    ],
+)
+def test_a_wrong_class_of_streams_is_named(change: dict[str, object], message: str) -> None:
+    classes = [{"name": "default", "setting": {}, "seeds": [0]}]
+    member = {"name": "s", "stream": "Switch5", **change}
+    with pytest.raises(SpecError, match=message):
+        Suite.from_dict({"classes": classes, "streams": [member]})
+
+
+def test_a_cell_whose_steps_are_not_those_of_its_stream_is_refused() -> None:
+    fields = new_plan("-t", "mine.json", "-a", "TD3").plan.cells[0].cell.to_dict()
+    with pytest.raises(SpecError, match="stream: its first phase and its steps must be the cell's"):
+        Cell.from_dict(fields | {"steps": 127})
+    assert "stream" not in new_plan("-t", "Default", "-a", "TD3").plan.cells[0].cell.to_dict()
