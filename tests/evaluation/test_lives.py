@@ -65,7 +65,7 @@ def test_expected_regret_is_the_mean_regret_of_lives(stream):
     policies = [network(v, stream.observation_dim) for v in range(visits_of(stream))]
     expected = expected_regret(policies, stream, episodes=4000)
     env = sme_registry.make(stream)
-    lives = np.array([regret_by_visit(env, policies, seed) for seed in range(25)])
+    lives = np.array([by_visit(env, policies, seed)[0] for seed in range(25)])
     errors = lives.std(axis=0, ddof=1) / 5
     found = [visit.dynamic_regret for visit in expected.visits]
     assert (np.abs(found - lives.mean(axis=0)) < 4 * errors).all()
@@ -78,10 +78,10 @@ def visits_of(stream):
     return stream.cycles * len(stream.phases)
 
 
-def regret_by_visit(env, policies, seed):
-    """The regret of one life in the environment, in which the policy of each visit acts."""
+def by_visit(env, policies, seed):
+    """Regret and steps, `[2, V]`, of a life in the environment, each visit with its policy."""
     stream = env.unwrapped.stream
-    found = np.zeros(len(policies))
+    found = np.zeros((2, len(policies)))
     observation, _ = env.reset(seed=seed)
     visit, ended = 0, False
     for lifetime in range(stream.steps):
@@ -90,10 +90,25 @@ def regret_by_visit(env, policies, seed):
             visit = lifetime // stream.cycle_steps * len(stream.phases) + phase
         action = policies[visit](observation[None])[0].astype(np.float32)
         observation, _, terminated, truncated, info = env.step(action)
-        found[visit] += info["regret"]
+        found[:, visit] += info["regret"], 1
+        assert info["phase"] == visit % len(stream.phases)
         if ended := terminated or truncated:
             observation, _ = env.reset()
     return found
+
+
+@pytest.mark.parametrize("switch", ["episode", "step"])
+@pytest.mark.parametrize("steps", [4, 14, 20])
+def test_a_visit_has_the_steps_in_which_its_phase_is_in_force(steps, switch):
+    specs = [SPEC.derive(seed=seed) for seed in range(3)]
+    stream = stream_of(*specs, steps=steps, cycles=2, switch=switch)
+    life = expected_regret([0.5] * 6, stream)
+    found = np.zeros(6)
+    found[: len(life.visits)] = [visit.steps for visit in life.visits]
+    half = reference_policy("constant", SPEC)
+    _, counted = by_visit(sme_registry.make(stream), [half] * 6, 0)
+    assert (found == counted).all()
+    assert life.steps == stream.steps
 
 
 def test_a_number_is_the_online_regret_of_a_visit():

@@ -3,10 +3,10 @@
     E D = Σ over the pieces of the life of  n · E[Σ_i (1 − r_i)] / E[length]     n: steps of a piece
 
 The expectations are over episodes of a policy on the piece's task, from uniform states. They run in
-parallel, so a life costs as much as a few thousand steps. Where pieces are of whole episodes, as in
-the catalogue, E D is exact but for the sampling error; a seed makes it repeatable. With early
-termination, or a switch within an episode, what differs is the episode at a switch: the piece after
-it begins in a state that the episode before left, or a few steps later.
+parallel, so a life costs as much as a few thousand steps. Where a switch waits for a reset and no
+episode ends early, as in the catalogue, E D is exact but for the sampling error; a seed makes it
+repeatable. With early termination, or a switch within an episode, what differs is the episode at a
+switch: the piece after it begins in a state that the episode before left, or a few steps later.
 """
 
 from __future__ import annotations
@@ -85,9 +85,11 @@ def expected_regret(
         means[which, piece] = ran.per_step(ran.regret)
         if progress is not None:
             progress(len(means), len(acts))
-    lengths = steps[[piece for _, piece in parts]]
-    regret = [means.get((id(each), piece), each) for each, piece in parts]
-    return dynamic_regret(stream, np.cumsum(lengths), regret, lengths)
+    ends = _ends(stream, np.cumsum(steps[[piece for _, piece in parts]]))
+    lengths = np.diff(ends, prepend=0)
+    regret = np.array([means.get((id(each), piece), each) for each, piece in parts])
+    lived = lengths > 0
+    return dynamic_regret(stream, ends[lived], regret[lived], lengths[lived])
 
 
 def reference_regret(
@@ -155,6 +157,17 @@ def _policies(
         elif id(each) not in policies:
             policies[id(each)] = prepared(each, stream, f"life[{v}]", action_range, algorithm)
     return policies
+
+
+def _ends(stream: StreamSpec, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """When pieces are left: where a switch waits for a reset, at the end of an episode.
+
+    Only where all episodes are of T steps is this known in advance.
+    """
+    if stream.switch == "step" or any(phase.spec.D for phase in stream.phases):
+        return ends
+    T = stream.horizon
+    return np.minimum(-(-ends // T) * T, stream.steps)
 
 
 def _share(episodes: int, steps: npt.NDArray[np.int64], piece: int) -> int:
