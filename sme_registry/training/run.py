@@ -71,6 +71,7 @@ _FILES = (
 
 _LOCK = ".lock"  # held by the process that trains; the file stays
 MAX_STEPS = 10**10
+MAX_VISITS = 1_000
 DEFAULT_STEPS = 20_000
 _CHECKPOINTS = 20
 _MIN_STEPS_BETWEEN_CHECKPOINTS = 1_000
@@ -262,7 +263,11 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
             f"stream {catalogue.title(document)}. Leave it out, or make another stream, whose "
             "phases have other steps."
         )
-    return integer_in("steps", document.steps, 1, MAX_STEPS, advice="Make a shorter stream.")
+    advice = "Make a stream with fewer cycles or phases, or with shorter ones."
+    visits = document.cycles * len(document.phases)
+    # The model at the end of each of them is kept, and evaluated on every phase.
+    integer_in("cycles × phases", visits, 1, MAX_VISITS, advice=advice)
+    return integer_in("steps", document.steps, 1, MAX_STEPS, advice=advice)
 
 
 def _with_algorithm(

@@ -196,6 +196,10 @@ def test_a_life_is_not_resumed_on_another_stream(
         ({"stream": "Switch6"}, "'Switch6'.*Did you mean 'Switch5-v1'"),
         ({"stream": {"phases": []}}, "phases"),
         (
+            {"stream": {"phases": STREAM.phases, "cycles": 501}},
+            r"cycles × phases=1002: must be an integer in \[1, 1,000\]\. Make a stream with fewer",
+        ),
+        (
             {"stream": {"phases": [{"spec": TINY, "steps": 50}, {"spec": TINY, "steps": 50}]},
              "agents": "jax"},
             r"phases\.1: begins .* step 50 of the cycle: must be a multiple of horizon=20",
