@@ -27,6 +27,10 @@ from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
 from sme_registry.spec.validation_errors import short_repr
 
 MAX_PIECES = 10_000  # of one cycle
+MAX_VISITS = 1_000
+"""Of a life that is evaluated: the model at the end of each visit is kept, and evaluated on every
+phase."""
+
 BETWEEN_DRAWS = 10**6  # of the seeds of a stream, so that its draws have no task in common
 _SHARED = ("state_dim", "action_dim", "horizon")
 
@@ -219,6 +223,11 @@ class StreamSpec(NamedDocument):
     def cycle_steps(self) -> int:
         """Environment steps of one cycle."""
         return sum(phase.steps for phase in self.phases)
+
+    @property
+    def visits(self) -> int:
+        """How often the stream visits a phase: phases times cycles."""
+        return self.cycles * len(self.phases)
 
     @property
     def steps(self) -> int:

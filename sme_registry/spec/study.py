@@ -25,7 +25,7 @@ from sme_registry.spec.document import (
 )
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
-from sme_registry.spec.stream import Phase, StreamSpec
+from sme_registry.spec.stream import MAX_VISITS, Phase, StreamSpec
 from sme_registry.spec.suite import Classes, StreamClasses, refuse_no_class
 
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
@@ -142,7 +142,7 @@ class Cell(Document):
         """Of a life: for each phase the run of an agent that trains on that phase alone."""
         if self.stream is None:
             return ()
-        evaluations = self.evaluations // (self.stream.cycles * len(self.stream.phases))
+        evaluations = self.evaluations // self.stream.visits
         return tuple(
             Cell(
                 **dict(self)
@@ -220,6 +220,13 @@ class StudyPlan(Document):
                 _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
             if self.streams:
                 _check_stream(algorithm.uses, f"algorithms.{i}.uses")
+        for i, lived in enumerate(self.streams):
+            if lived.stream.visits > MAX_VISITS:
+                raise ValueError(
+                    f"streams.{i}.stream: has {lived.stream.visits:,} visits of phases: must be at "
+                    f"most {MAX_VISITS:,}, since each is evaluated on every phase. Use fewer "
+                    "cycles or phases."
+                )
         return self
 
     @property

@@ -45,6 +45,7 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
+from sme_registry.spec.stream import MAX_VISITS
 from sme_registry.spec.study import in_jax
 from sme_registry.task import load_document, materialize, materialize_stream
 from sme_registry.training import checkpoint, reports
@@ -71,7 +72,6 @@ _FILES = (
 
 _LOCK = ".lock"  # held by the process that trains; the file stays
 MAX_STEPS = 10**10
-MAX_VISITS = 1_000
 DEFAULT_STEPS = 20_000
 _CHECKPOINTS = 20
 _MIN_STEPS_BETWEEN_CHECKPOINTS = 1_000
@@ -264,9 +264,7 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
             "phases have other steps."
         )
     advice = "Make a stream with fewer cycles or phases, or with shorter ones."
-    visits = document.cycles * len(document.phases)
-    # The model at the end of each of them is kept, and evaluated on every phase.
-    integer_in("cycles × phases", visits, 1, MAX_VISITS, advice=advice)
+    integer_in("cycles × phases", document.visits, 1, MAX_VISITS, advice=advice)
     return integer_in("steps", document.steps, 1, MAX_STEPS, advice=advice)
 
 

@@ -32,7 +32,7 @@ class Snapshots:
     """
 
     def __init__(self, folder: Path, stream: StreamSpec) -> None:
-        count = stream.cycles * len(stream.phases)
+        count = stream.visits
         digits = max(2, len(str(count - 1)))
         self.initial = folder / "initial.zip"
         self.visits = [folder / f"visit-{visit:0{digits}}.zip" for visit in range(count)]

@@ -28,7 +28,7 @@ class VisitEnds:
     def __init__(
         self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0
     ) -> None:
-        *ends, end = visit_ends(stream, stream.cycles * len(stream.phases)).tolist()
+        *ends, end = visit_ends(stream, stream.visits).tolist()
         self._upcoming = [(visit, end) for visit, end in enumerate(ends) if end >= steps]
         self._last, self._on_visit = (len(ends), end), on_visit
 

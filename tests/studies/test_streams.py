@@ -16,7 +16,7 @@ from leaderboard.errors import BoardError
 from sme_registry import SMESpec, StreamSpec, load, save
 from sme_registry.cli import app
 from sme_registry.errors import SpecError
-from sme_registry.spec import StreamFile, StudyFile, Suite, SuiteFile, catalogue
+from sme_registry.spec import StreamFile, StudyFile, StudyPlan, Suite, SuiteFile, catalogue
 from sme_registry.spec.study import Cell
 from sme_registry.studies.engine.checks import uneven_rollouts
 
@@ -225,6 +225,14 @@ def test_a_wrong_class_of_streams_is_named(change: dict[str, object], message: s
     member = {"name": "s", "stream": "Switch5", **change}
     with pytest.raises(SpecError, match=message):
         Suite.from_dict({"classes": classes, "streams": [member]})
+
+
+def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> None:
+    stream = StreamSpec(phases=STREAM.phases, cycles=501)
+    fields = new_plan("-t", "mine.json", "-a", "TD3").plan.to_dict()
+    fields["streams"].append({"name": "long", "stream": stream.to_dict()})
+    with pytest.raises(SpecError, match=r"streams.1.stream: has 1,002 visits .* at most 1,000"):
+        StudyPlan.from_dict(fields)
 
 
 def test_a_cell_whose_steps_are_not_those_of_its_stream_is_refused() -> None:

@@ -133,7 +133,7 @@ def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_An
       stream: the stream.
       policies: the agent's policies at the ends of the visits, or the first of them alone.
     """
-    return [policies[0]] * (stream.cycles * len(stream.phases))
+    return [policies[0]] * stream.visits
 
 
 def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:

@@ -119,7 +119,7 @@ def reference_regret(
             "frozen, training: must be given together or both left out. Give the policy at the "
             "end of the first visit and the dynamic regret of the training."
         )
-    V = stream.cycles * len(stream.phases)
+    V = stream.visits
     first = final_specs(stream)[0]
     # No regret in the task of which it is the optimum, also where this rounds observations.
     optimum = reference_policy("optimal", first)

@@ -38,7 +38,7 @@ class RegretBlocks:
     """
 
     def __init__(self, stream: StreamSpec, lives: int = 1) -> None:
-        visits = stream.cycles * len(stream.phases)
+        visits = stream.visits
         ends = visit_ends(stream, visits)
         begins = np.concatenate([[0], ends[:-1]])
         each = np.minimum(ends - begins, max(1, _BLOCKS // visits))

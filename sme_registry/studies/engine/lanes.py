@@ -209,7 +209,7 @@ class _Run:
         if stream is None or self._blocks is None:
             return
         self._records |= {"block_steps": self._blocks.steps, "block_regret": self._blocks.regret}
-        snapshots = stream.cycles * len(stream.phases) + 1
+        snapshots = stream.visits + 1
         for lane in range(len(self._cells)):
             for name, weight in self._program.weights(lane).items():
                 kept = np.zeros((snapshots, *weight.shape), weight.dtype)
