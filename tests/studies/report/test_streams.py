@@ -402,6 +402,8 @@ def test_every_figure_is_readable_and_shows_every_agent(study: Path, figures: li
 def test_lives_of_a_single_seed_have_no_intervals(tmp_path: Path) -> None:
     live(stream_study(seeds=1), tmp_path)
     text = text_of(analysed(tmp_path))
+    assert "nothing can be said about forgetting: a single life has no interval" in text
+    assert "a single life shows nothing certain" in text
     assert "(a single life, no interval)" in text
     assert "nan" not in text
     assert {each.forgetting for each in found_in(tmp_path).streams} == {"open"}

@@ -37,7 +37,7 @@ _INTERVAL = (
     "IQM over lives with its 95 % bootstrap interval, within distribution. "
     f"Hollow: fewer than {ENOUGH_RUNS} lives, so that the interval is an indication only."
 )
-_FRESH = Look(GREY, "", (0, (5, 1.5)))
+_FRESH = Look(GREY, "", (0, (5, 1.2, 1, 1.2)))
 _REFERENCES = {
     "frozen_optimum": Look(GREY, "", (0, (1, 1.2))),
     "constant_half": CONSTANT,
@@ -105,6 +105,7 @@ def _draw_regret(
                 look = _REFERENCES[str(reference)]
                 axes.plot(curve.lifetime, curve["median"], **look.line, linewidth=1.1, zorder=1.5)
             _finish_lifetime(axes, streams, name)
+            axes.yaxis.set_major_formatter(step_text)
         grid.label_rows("dynamic regret  (Σ of 1 − r)")
         any_fresh = streams.regret.fresh.notna().any()
         fresh_look = {"fresh agents": _FRESH} if any_fresh else {}
@@ -117,8 +118,8 @@ def _draw_regret(
     caption += "above are visits and their phases. Grey: agents that need no training."
     if any_fresh:
         caption += (
-            " Dashed, in the colour of the algorithm: agents that start anew in each visit, spread "
-            "evenly over it. A life below its dashed line learns faster than fresh agents."
+            " Dash-dotted, in the colour of the algorithm: agents that start anew in each visit, "
+            "spread evenly over it. A life below that line learns faster than fresh agents."
         )
     return Picture("stream-regret", "Dynamic regret", caption, grid.files)
 
