@@ -51,10 +51,13 @@ def compare(
 
     Raises:
       UnknownNameError: the study has no finished run of such an algorithm, or no such metric.
-      OptionError: both are the same, no class has a pair, or the folder holds no study.
+      OptionError: both are the same, no class has a pair, or the folder holds no study, or one of
+        streams alone.
     """
-    frames = study if isinstance(study, StudyFrames) else load(study)
-    finished = runs(frames.results)
+    if not isinstance(study, StudyFrames):
+        _refuse_streams_alone(study)
+        study = load(study)
+    finished = runs(study.results)
     _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
     chosen = [_metric(name) for name in metrics]
     table = differences(finished, [(first, second)], chosen)
@@ -140,6 +143,14 @@ def _analysis(folder: str | os.PathLike[str], first: str, second: str) -> Analys
     plan = file.plan.model_copy(update={"algorithms": (of[first], of[second])})
     results = ledger.results(cell.cell.digest for cell in plan.cells)
     return analyse(file.model_copy(update={"plan": plan}), results)
+
+
+def _refuse_streams_alone(folder: str | os.PathLike[str]) -> None:
+    if not plan_file(Ledger(folder)).plan.classes:
+        raise OptionError(
+            f"folder={str(folder)!r}: its plan has streams alone, and runs on single tasks are "
+            "compared. `sme study report` has the differences between algorithms in streams."
+        )
 
 
 def _check_names(first: str, second: str, known: Sequence[str]) -> None:

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import trim_mean
 
 from sme_registry import studies
+from sme_registry.errors import OptionError
 from sme_registry.io import read_json
 from sme_registry.spec import StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
@@ -190,6 +191,13 @@ def test_a_study_without_lives_has_the_same_columns(study: Path, tmp_path: Path)
 def test_the_documentation_names_every_column(study: Path) -> None:
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
     assert not {name for frame in studies.load_streams(study) for name in frame} - documented
+
+
+def test_a_comparison_of_streams_alone_is_refused_with_the_place_of_its_numbers(
+    study: Path,
+) -> None:
+    with pytest.raises(OptionError, match=r"has streams alone.*sme study report"):
+        studies.compare(study, "Tired", "Stubborn")
 
 
 # Tables
