@@ -70,7 +70,7 @@ def write_report(
         if record.stream is not None:
             report = _evaluate_life(record, record.stream, folder, on_batch)
             report.write(folder / STREAM)
-            return report, _draw_life(report, episodes, folder)
+            return report, _draw(report, episodes, folder, model)
         evaluated = evaluate(
             model,
             record.spec,
@@ -101,27 +101,23 @@ def _evaluate_life(
         return report
     step, regret, length = zip(*((e.step, e.regret, e.length) for e in episodes), strict=True)
     log = dynamic_regret(stream, step, regret, length)
-    references = reference_regret(stream, frozen=files.visits[0], training=log)
+    frozen: dict[str, Any] = {"frozen": files.visits[0], "training": log}
+    if log.visits[0].online_regret is None:  # where no episode of the first visit is in the log
+        frozen = {}
+    references = reference_regret(stream, **frozen)
     return report.with_dynamic_regret(log).with_reference_regret(references)
 
 
 def _draw(
-    report: EvaluationReport, episodes: Sequence[Episode], folder: Path, model: Any
+    report: EvaluationReport | StreamReport, episodes: Sequence[Episode], folder: Path, model: Any
 ) -> tuple[Path, ...]:
     if not is_installed("matplotlib"):
         return ()
     figures: list[Path] = []
     if episodes:
         title = f"{report.policy} on {report.title}"
-        figures += plot_files.write_training(folder / episode_files.FILE, folder, title)
+        visits = report.visits if isinstance(report, StreamReport) else ()
+        figures += plot_files.write_training(folder / episode_files.FILE, folder, title, visits)
+    if isinstance(report, StreamReport):
+        return (*figures, *plot_files.write_stream(report, folder))
     return (*figures, *plot_files.write_evaluation(report, folder, model))
-
-
-def _draw_life(report: StreamReport, episodes: Sequence[Episode], folder: Path) -> tuple[Path, ...]:
-    if not is_installed("matplotlib"):
-        return ()
-    figures: list[Path] = []
-    if episodes:
-        title, log = f"{report.policy} on {report.title}", folder / episode_files.FILE
-        figures += plot_files.write_training(log, folder, title, report.visits)
-    return (*figures, *plot_files.write_stream(report, folder))

@@ -185,8 +185,10 @@ def train(
     )
     with quiet():
         plan = _with_algorithm(plan, algorithm, agents, num_envs, hyperparameters or {}, device)
-    # Fails before the folder is created.
-    materialize(plan.spec) if plan.stream is None else materialize_stream(plan.stream)
+    if plan.stream is not None:  # both fail before the folder is created
+        materialize_stream(plan.stream)
+    else:
+        materialize(plan.spec)
     folder = Path(folder)
     record = _new_or_continued(folder, plan, resume=resume, force=force)
     with quiet(), one_thread():

@@ -106,7 +106,9 @@ def test_the_report_of_a_life_is_about_its_snapshots_and_its_episodes(
     assert report.reference_regret.keys() >= {"frozen_optimum", "frozen_agent", "constant_half"}
 
 
-def killed(folder: Path, monkeypatch: pytest.MonkeyPatch, at_step: int) -> None:
+def killed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, at_step: int, stream: StreamSpec = STREAM
+) -> None:
     """A life that ends right after the checkpoint of a step."""
     save = learn._save_checkpoint
 
@@ -118,7 +120,7 @@ def killed(folder: Path, monkeypatch: pytest.MonkeyPatch, at_step: int) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(learn, "_save_checkpoint", save_and_end)
         with pytest.raises(KeyboardInterrupt):
-            life(folder)
+            life(folder, stream)
 
 
 def test_a_resumed_life_goes_on_at_the_step_of_its_checkpoint(
@@ -151,6 +153,21 @@ def test_a_life_that_was_killed_after_its_last_step_ends_its_last_visit(
     assert not visit_files(folder)[-1].exists()
     resumed = life(folder, resume=True)
     assert same_weights(visit_files(folder)[-1], resumed.model_path)
+
+
+def test_a_life_whose_first_visit_is_in_no_finished_episode_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = TINY.derive(horizon=50)
+    phases = [{"spec": task, "steps": 10}, {"spec": task.derive(seed=6), "steps": 90}]
+    stream = StreamSpec(phases=phases, switch="step")
+    killed(tmp_path / "run", monkeypatch, at_step=32, stream=stream)
+    resumed = life(tmp_path / "run", stream, resume=True)
+    assert [(e.step, e.length) for e in resumed.episodes] == [(82, 50)]
+    assert isinstance(resumed.report, StreamReport)
+    assert resumed.report.dynamic_regret is not None
+    assert resumed.report.dynamic_regret.visits[0].online_regret is None
+    assert "frozen_agent" not in resumed.report.reference_regret
 
 
 def test_force_removes_the_snapshots_of_the_run_before(
