@@ -329,7 +329,11 @@ def test_plasticity_is_judged_by_the_interval_of_the_ratio_against_1(
     [
         ((0.2, -0.1, 0.5), "open", "no algorithm was shown to forget"),
         ((-0.2, -0.3, -0.1), "none", "no algorithm forgets"),
-        ((0.4, 0.2, 0.6), "forgets", "is 0.40 below its best (95 % interval 0.20 to 0.60)"),
+        (
+            (0.4, 0.2, 0.6),
+            "forgets",
+            "is 0.40 below its best (95 % interval 0.20 to 0.60, 5 lives)",
+        ),
     ],
 )
 def test_forgetting_is_judged_by_its_interval_against_0(
