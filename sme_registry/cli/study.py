@@ -196,6 +196,8 @@ def report(
 ) -> None:
     """Report which property of the task breaks an algorithm, and how certain that is.
 
+    Of streams it reports what is forgotten, whether plasticity is lost, and what relatedness does.
+
     It writes a self-contained page index.html, the figures as PNG and PDF, every number as CSV, and
     LaTeX tables, by default to FOLDER/report. It uses the cells finished so far, so it may be run
     during the study.

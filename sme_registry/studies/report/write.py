@@ -61,7 +61,7 @@ def write_report(
         raise OptionError(f"format={','.join(unknown)!r}: must be of {', '.join(FORMATS)}.")
     ledger = Ledger(folder)
     file = plan_file(ledger)
-    keys = [planned.cell.digest for planned in file.plan.cells]
+    keys = list(dict.fromkeys(planned.cell.digest for planned in file.plan.cells))
     results = ledger.results(keys)
     if not results:
         raise OptionError(
