@@ -274,6 +274,10 @@ def test_findings_name_what_each_agent_was_made_to_do(study: Path) -> None:
     related = of_stream(found, "Related")
     assert (related.lives[0].algorithm, related.forgetting) == ("Tired", "forgets")
     assert [rival.verdict for rival in related.rivals] == ["more", "more"]
+    for rival in related.rivals:
+        assert rival.low is not None
+        assert rival.high is not None
+        assert 0.0 < rival.low <= rival.change <= rival.high
     switch = of_stream(found, "Switch")
     assert (switch.lives[0].algorithm, switch.forgetting) == ("Forgetful", "forgets")
     assert {rival.algorithm: rival.verdict for rival in switch.rivals} == {

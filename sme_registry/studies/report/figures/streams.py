@@ -167,7 +167,7 @@ def _draw_retention(streams: StreamAnalysis, formats: Sequence[str], name: str) 
     initial = int(rows.visit.isna().any())
     labels = [*["initial"] * initial, *(f"visit {visit.visit}" for visit in visits)]
     visited = [(visit.visit + initial, visit.phase) for visit in visits]
-    height = 0.55 + 0.24 * min(len(labels), 30)
+    height = 0.55 + 0.24 * max(4, min(len(labels), 30))
     with panels.panel_grid(len(names), formats, (1.0, height), share_x=True) as grid:
         for axes, algorithm in zip(grid.panels, names, strict=True):
             own = rows[rows.algorithm == algorithm].assign(visit=lambda r: r.visit.fillna(-1))

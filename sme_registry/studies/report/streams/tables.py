@@ -46,28 +46,23 @@ from sme_registry.studies.report.tables import PLACE, Bootstrap, Metric, by_plac
 
 WITHIN, OUTSIDE = "WD", "OOD"
 TASKS, SCHEDULE = "tasks", "schedule"
-METRICS = (
+_VISITED = "regret on the visited phase"
+_EACH = (
     Metric("average_performance", LABELS["average_performance"], -1),
-    Metric("visited_regret", "regret on the visited phase", 1),
     Metric("forgetting", LABELS["forgetting"], 1),
     Metric("backward_transfer", LABELS["backward_transfer"], -1),
+    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
+    Metric("plasticity_difference", "plasticity difference", 1),
+    Metric("learning_transfer", "learning transfer", -1),
+    Metric("online_regret", "online regret", 1, 3),
+)
+METRICS = (
+    Metric("visited_regret", _VISITED, 1),
+    *_EACH,
     Metric("forward_transfer", LABELS["forward_transfer"], -1),
     Metric("relearning", LABELS["relearning"], -1),
-    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
-    Metric("plasticity_difference", "plasticity difference", 1),
-    Metric("learning_transfer", "learning transfer", -1),
-    Metric("online_regret", "online regret", 1, 3),
 )
-BY_VISIT = (
-    Metric("normalised_regret", "regret on the visited phase", 1),
-    Metric("average_performance", LABELS["average_performance"], -1),
-    Metric("forgetting", LABELS["forgetting"], 1),
-    Metric("backward_transfer", LABELS["backward_transfer"], -1),
-    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
-    Metric("plasticity_difference", "plasticity difference", 1),
-    Metric("online_regret", "online regret", 1, 3),
-    Metric("learning_transfer", "learning transfer", -1),
-)
+BY_VISIT = (Metric("normalised_regret", _VISITED, 1), *_EACH)
 _PLACE = "class_name:str algorithm:str"
 _INTERVAL = "runs:int64 iqm low high"
 _POINTS = 201  # of a curve of regret

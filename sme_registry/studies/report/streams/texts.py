@@ -28,12 +28,11 @@ from sme_registry.terminal.templates import fixed
 
 CSV_TABLES = (
     "metrics", "visit_metrics", "matrices", "contrasts", "differences", "references", "regret",
-    "reference_regret",
-    "learning_curves", "counts", "missing",
+    "reference_regret", "learning_curves", "counts", "missing",
 )  # fmt: skip
 _METRIC = {metric.key: metric for metric in (*METRICS, *BY_VISIT)}
 _OF_TRAINING = ("learning_transfer", "online_regret")  # the same numbers in all regions
-_SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", "online_regret")
+_SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING)
 
 
 def stream_csv(streams: StreamAnalysis) -> dict[str, pd.DataFrame]:
@@ -120,7 +119,7 @@ def _by_visit(streams: StreamAnalysis, metric: Metric) -> TextTable:
         f"stream-visits-{metric.key.replace('_', '-')}",
         f"{metric.label[0].upper()}{metric.label[1:]} by visit",
         "IQM over lives, with its 95 % bootstrap interval"
-        + ("." if metric.key == "online_regret" else ", within distribution."),
+        + ("." if metric.key in _OF_TRAINING else ", within distribution."),
         wide(
             rows.assign(at=at), {"class_name": "stream", "at": "visit"}, "algorithm",
             lambda row: level_text(row, metric), streams.algorithms,
