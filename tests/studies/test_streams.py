@@ -108,12 +108,14 @@ def test_a_suite_of_streams_is_shown_with_names_to_train_by() -> None:
     ]
 
 
-def test_every_phase_of_every_draw_is_certified() -> None:
-    new_suite()
+def test_every_task_and_every_phase_of_every_draw_is_certified() -> None:
+    save(TASK, "task.json")
+    new_suite("-t", "task.json")
     certified = json.loads(good("certify", "lives.json", "--json"))
-    labels = [entry["task"] for entry in certified]
-    assert labels == [
-        f"lives/mine draw {draw} phase {phase}" for draw in range(3) for phase in (0, 1)
+    phases = [f"lives/mine draw {draw} phase {phase}" for draw in range(3) for phase in (0, 1)]
+    assert [entry["task"] for entry in certified] == [
+        *(f"lives/task seed {seed}" for seed in range(3)),
+        *phases,
     ]
 
 
