@@ -30,6 +30,7 @@ from tests.studies.lives import AGENTS, STREAMS, live, stream_study
 
 pytest.importorskip("matplotlib")
 
+from sme_registry.plots.style import COLOURS
 from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.page import page
 from sme_registry.studies.report.write import write_report
@@ -407,6 +408,9 @@ def test_every_figure_is_readable_and_shows_every_agent(study: Path, figures: li
     for name in ("stream-metrics", "stream-regret", "stream-plasticity"):
         labels = [text.get_text() for text in drawn[name].legends[0].get_texts()]
         assert labels[:3] == [*AGENTS]
+    for name in ("stream-metrics", "stream-regret", "stream-plasticity", "stream-learning-curves"):
+        lines = [line for line in drawn[name].axes[0].lines if len(line.get_xdata())]
+        assert {line.get_color() for line in lines} >= set(COLOURS[: len(AGENTS)]), name
     for name in ("stream-retention-Cycle", "stream-performance-Cycle"):
         titles = [axes.get_title() for axes in drawn[name].axes if axes.get_title()]
         assert titles == [*AGENTS]
