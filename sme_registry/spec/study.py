@@ -28,6 +28,7 @@ from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
 from sme_registry.spec.stream import MAX_VISITS, Phase, StreamSpec
 from sme_registry.spec.suite import Classes, StreamClasses, refuse_no_class
 
+FRESH_EVALUATIONS = 10  # at most, of a fresh agent
 Steps = Annotated[Integer, Field(ge=0, le=10**10)]
 
 
@@ -142,7 +143,8 @@ class Cell(Document):
         """Of a life: for each phase the run of an agent that trains on that phase alone."""
         if self.stream is None:
             return ()
-        evaluations = self.evaluations // self.stream.visits
+        # A number that depends on the stream would give streams that share a phase different cells.
+        evaluations = min(self.evaluations, FRESH_EVALUATIONS)
         return tuple(
             Cell(
                 **dict(self)

@@ -120,13 +120,13 @@ def test_every_task_and_every_phase_of_every_draw_is_certified() -> None:
 
 
 def test_a_plan_has_a_life_and_fresh_agents_for_each_run() -> None:
-    arguments = ("--instances", "2", "-a", "TD3", "--seeds", "2", "--evaluations", "8")
+    arguments = ("--instances", "2", "-a", "TD3", "--seeds", "2", "--evaluations", "12")
     plan = new_plan("-t", "mine.json", *arguments).plan
     assert not plan.classes
     places = [
         (place.run, place.phase, place.cell.steps, place.cell.evaluations) for place in plan.cells
     ]
-    of_a_run = [(None, 128, 8), (0, 40, 2), (1, 24, 2)]
+    of_a_run = [(None, 128, 12), (0, 40, 10), (1, 24, 10)]
     assert places == [(run, *each) for run in (0, 1) for each in of_a_run]
     assert plan.cells[3].cell.stream == STREAM.draw(1)
     assert plan.cells[5].cell == plan.cells[3].cell.fresh[1]
@@ -138,12 +138,12 @@ def test_cells_that_streams_share_count_once() -> None:
     file = catalogue.find(StudyFile, "continual")
     assert len(file.plan.cells) == 135
     entry = json.loads(good("study", "plan", "continual", "--json"))
-    assert entry["cells"] == 126
+    assert entry["cells"] == 108
     assert "20,000 to 120,000" in good("study", "plan", "continual")
     (listed,) = (
         one for one in json.loads(good("study", "plan", "--json")) if one["name"] == "continual-v1"
     )
-    assert listed["cells"] == 126
+    assert listed["cells"] == 108
 
 
 @pytest.mark.parametrize(
