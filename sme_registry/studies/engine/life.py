@@ -15,7 +15,8 @@ import numpy as np
 
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import Perceptron, Policy, StreamReport, evaluate_stream
-from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
+from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks, reference_regret
+from sme_registry.evaluation.continual.retention import prepared
 from sme_registry.evaluation.policies.sb3 import torch_policy
 from sme_registry.spec import Cell, SMESpec, StreamSpec
 from sme_registry.studies.engine.training import Training
@@ -132,7 +133,7 @@ def lasting_policy(cell: Cell, run: Training) -> Policy:
 def life_report(
     cell: Cell, policies: Sequence[Any], initial: Any, regret: DynamicRegret
 ) -> StreamReport:
-    """The report of a cell's life, still without fresh agents.
+    """The report of a cell's life with the reference agents, still without fresh agents.
 
     Args:
       cell: of the life.
@@ -144,12 +145,10 @@ def life_report(
       PolicyError: a policy's actions are invalid.
     """
     assert cell.stream is not None
+    stream, range_ = cell.stream, cell.action_range
     report = evaluate_stream(
-        policies,
-        cell.stream,
-        cell.protocol,
-        initial=initial,
-        action_range=cell.action_range,
-        name=cell.uses,
+        policies, stream, cell.protocol, initial=initial, action_range=range_, name=cell.uses
     )
-    return report.with_dynamic_regret(regret)
+    frozen = prepared(policies[0], stream, "visit 0", range_)
+    references = reference_regret(stream, frozen=frozen, training=regret)
+    return report.with_dynamic_regret(regret).with_reference_regret(references)

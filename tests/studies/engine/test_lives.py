@@ -17,7 +17,7 @@ from rich.console import Console
 
 from sme_registry import SMESpec, StreamSpec, materialize
 from sme_registry.errors import PolicyError, SMEError, SpecError
-from sme_registry.evaluation import evaluate_stream
+from sme_registry.evaluation import evaluate_stream, expected_regret
 from sme_registry.spec import Cell, StudyFile, StudyPlan
 from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.cell import run_cell
@@ -28,6 +28,7 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.engine.status import label, study_status
+from sme_registry.training.snapshots import Snapshots
 
 pytest.importorskip("stable_baselines3")
 
@@ -139,6 +140,23 @@ def test_a_life_has_the_policies_that_ppo_has_at_the_end_of_each_visit(
     assert result.stream_report.policy == "PPO"
     np.testing.assert_allclose(matrix(result.stream_report), rows, atol=1e-6)
     assert len({*matrix(result.stream_report)[:, 0]}) == 4
+
+
+def test_a_life_has_the_agent_that_stopped_learning_after_its_first_visit(
+    lived: tuple[CellResult, Path],
+) -> None:
+    result, model = lived
+    report = result.stream_report
+    assert report is not None
+    assert report.dynamic_regret is not None
+    frozen = report.reference_regret["frozen_agent"]
+    own = report.dynamic_regret
+    assert frozen.visits[0].online_regret == pytest.approx(own.visits[0].online_regret)
+    kept = Snapshots(model.with_suffix(""), TWICE).visits[0]
+    expected = expected_regret([0.0, kept, kept, kept], TWICE, action_range="symmetric")
+    for visit in (1, 2, 3):
+        found, wanted = frozen.visits[visit].online_regret, expected.visits[visit].online_regret
+        assert found == pytest.approx(wanted, abs=1e-6)
 
 
 def test_a_life_s_document_is_read_again_and_holds_one_report(
