@@ -167,6 +167,11 @@ def refuse_other_digest(stated: str, document: Document, where: str, remedy: str
         )
 
 
+def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Plain data without those of these fields that are empty, as before the fields existed."""
+    return {key: value for key, value in plain.items() if value or key not in names}
+
+
 class Document(StrictModel):
     """A model with an identity: equal documents have equal digests, unequal ones do not.
 

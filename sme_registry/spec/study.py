@@ -83,7 +83,7 @@ class StudyAlgorithm(StrictModel):
         learn nothing. The agents of a team share one model; `independent:PPO` has one for each.
       hyperparameters: where they differ from the algorithm's defaults.
       action_range: of the environment it acts in: [−1, 1] ("symmetric") or [0, 1] ("unit").
-      steps: its budget; null takes the plan's.
+      steps: its budget on single tasks; null takes the plan's.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9 ._+()-]+$")]
@@ -222,6 +222,12 @@ class StudyPlan(Document):
                 _check_task(algorithm.uses, member.setting, f"algorithms.{i}.uses")
             if self.streams:
                 _check_stream(algorithm.uses, f"algorithms.{i}.uses")
+            if not self.classes and algorithm.steps is not None:
+                raise ValueError(
+                    f"algorithms.{i}.steps={algorithm.steps:,}: must be null, since lives have the "
+                    "steps of their streams, and the plan has no single tasks. Leave it out, or "
+                    "make streams with other steps."
+                )
         for i, lived in enumerate(self.streams):
             if lived.stream.visits > MAX_VISITS:
                 raise ValueError(

@@ -7,12 +7,18 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, JsonValue
+from pydantic import (
+    BeforeValidator,
+    Field,
+    JsonValue,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
 from sme_registry.errors import OptionError
 from sme_registry.io import read_json, to_json, versions, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
-from sme_registry.spec.document import Integer, Real, StrictModel
+from sme_registry.spec.document import Integer, Real, StrictModel, without_empty
 from sme_registry.spec.study import INDEPENDENT, in_jax
 
 RECORD = "run.json"
@@ -73,6 +79,10 @@ class RunRecord(StrictModel):
     protocol: EvaluationProtocol  # of the final evaluation
     protocol_digest: str
     versions: dict[str, str]  # of Python and the packages that the numbers depend on
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_empty(handler(self), "stream", "stream_digest")
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord | None:

@@ -237,6 +237,13 @@ def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> No
         StudyPlan.from_dict(fields)
 
 
+def test_a_plan_of_streams_alone_has_no_steps_of_an_algorithm() -> None:
+    fields = new_plan("-t", "mine.json", "-a", "TD3").plan.to_dict()
+    fields["algorithms"][0]["steps"] = 100
+    with pytest.raises(SpecError, match=r"algorithms.0.steps=100: .* steps of their streams"):
+        StudyPlan.from_dict(fields)
+
+
 def test_a_cell_whose_steps_are_not_those_of_its_stream_is_refused() -> None:
     fields = new_plan("-t", "mine.json", "-a", "TD3").plan.cells[0].cell.to_dict()
     with pytest.raises(SpecError, match="stream: its first phase and its steps must be the cell's"):

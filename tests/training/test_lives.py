@@ -249,3 +249,6 @@ def test_a_task_has_a_report_of_its_own_kind(tmp_path: Path) -> None:
     assert not isinstance(result.report, StreamReport)
     assert not (tmp_path / "run" / "snapshots").exists()
     assert (result.record.stream, result.record.stream_digest) == (None, "")
+    written = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert not {"stream", "stream_digest"} & written.keys()
+    assert RunRecord.read(tmp_path / "run") == result.record

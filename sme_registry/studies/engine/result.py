@@ -20,14 +20,10 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 
 from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel
+from sme_registry.spec.document import without_empty
 from sme_registry.spec.study import Cell
 
 _Numbers = Annotated[tuple[Real, ...], Field(strict=False)]
-
-
-def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Plain data without those of these fields that are empty, as before the fields existed."""
-    return {key: value for key, value in plain.items() if value or key not in names}
 
 
 class LearningCurve(StrictModel):

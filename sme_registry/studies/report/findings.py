@@ -15,7 +15,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.diagnosis.questions import THRESHOLDS as DIAGNOSIS
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, StrictModel, TupleOf
-from sme_registry.studies.engine.result import without_empty
+from sme_registry.spec.document import without_empty
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import ALL
 from sme_registry.studies.report.offline_findings import THRESHOLDS as OFFLINE
