@@ -60,7 +60,8 @@ class DynamicRegret(StrictModel):
       lifetime: environment steps at the points of the curve, at most 400.
       cumulative_regret: Σ regret until then.
       fresh_online_regret: `[P]` of an agent that trained on that phase alone; None without them.
-      learning_transfer: the mean over visits; None where no visit has one.
+      learning_transfer: the mean over the visits after visit 0 that have one, so over those that
+        are over; None where none has one.
     """
 
     steps: Integer
@@ -95,7 +96,6 @@ class DynamicRegret(StrictModel):
             dtype=np.float64,
         )
         transfer = metrics.learning_transfer(online, fresh)
-        known = transfer[~np.isnan(transfer)]
         visits = [
             visit.model_copy(update={"learning_transfer": None if math.isnan(gain) else gain})
             for visit, gain in zip(self.visits, transfer.tolist(), strict=True)
@@ -104,7 +104,7 @@ class DynamicRegret(StrictModel):
             update={
                 "visits": tuple(visits),
                 "fresh_online_regret": tuple(fresh.tolist()),
-                "learning_transfer": float(known.mean()) if known.size else None,
+                "learning_transfer": metrics.mean_after_first(transfer.tolist()),
             }
         )
 

@@ -28,11 +28,15 @@ policy or with one phase, G with one cycle.
 Learning transfer is the forward transfer of Continual World (Wołczyk et al. 2021), (AUC − AUC_b) /
 (1 − AUC_b), where the area under the curve of training is the mean step reward over all of its
 steps, 1 − o, instead of a mean over evaluations.
+
+In visit 0 a life is a fresh agent itself. So plasticity and learning transfer of a life are means
+over visits 1, 2, …; of one with a single visit nothing is known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -126,6 +130,19 @@ def learning_transfer(visits: Array, fresh: Array) -> Array:
     """
     alone = fresh[np.arange(len(visits)) % len(fresh)]
     return np.divide(alone - visits, alone, out=np.full_like(visits, np.nan), where=alone > 0.0)
+
+
+def mean_after_first(values: Sequence[float | None]) -> float | None:
+    """The mean over the visits after visit 0 of a plasticity or a learning transfer.
+
+    Args:
+      values: `[V]`; None or NaN, and left out, where a visit has none.
+
+    Returns:
+      None where no visit after visit 0 has a value.
+    """
+    known = [each for each in values[1:] if each is not None and not math.isnan(each)]
+    return float(np.mean(known)) if known else None
 
 
 def _over_earlier_phases(R: Array, change: Callable[[int, int], Array]) -> Array:

@@ -107,13 +107,12 @@ class Retention(StrictModel):
         )
 
     def final(self, metric: str) -> float | None:
-        """A metric at the end of the life; the mean over visits of a plasticity."""
+        """A metric at the end of the life; of a plasticity the mean over visits after visit 0."""
         value = getattr(self, metric)
         if not isinstance(value, tuple):
             return None if value is None else float(value)
         if metric.startswith("plasticity"):
-            known = [each for each in value if each is not None]
-            return float(np.mean(known)) if known else None
+            return metrics.mean_after_first(value)
         return None if value[-1] is None else float(value[-1])
 
 

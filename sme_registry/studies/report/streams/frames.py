@@ -17,11 +17,11 @@ finished. All frames are ordered by class, algorithm and run; `continual.metrics
     forward_transfer             mean gain on phases before their first visit
     relearning                   mean gain of the second visit of a phase on its first
     plasticity_ratio, plasticity_difference   of the visited phase's regret to a fresh agent's,
-                                 mean over visits
+                                 mean over visits ≥ 1: in visit 0 a life is a fresh agent itself
 
 Columns of the life, repeated in each of its regions; NaN where it has no such number:
 
-    learning_transfer            1 − online regret / that of the fresh agents, mean over visits
+    learning_transfer            1 − online regret / that of the fresh agents, mean over visits ≥ 1
     online_regret                mean of 1 − step reward over the life, in [0, 1]
     dynamic_regret               its sum
     uses, action_range, steps    the algorithm, its action range, environment steps of the life

@@ -82,10 +82,11 @@ def _metrics(streams: StreamAnalysis, name: str) -> TextTable:
     return TextTable(
         f"stream-metrics-{slug(name)}",
         f"Lives in {name}",
-        "IQM over lives, with its 95 % bootstrap interval, at the end of the life; plasticity, "
-        "learning transfer and the regret on the visited phase are means over visits. Performance "
-        "is 1 − normalised regret: 1 for the optimum, 0 for the constant ½. Below 1, a plasticity "
-        "ratio is better than a fresh agent. The last columns are agents that need no training.",
+        "IQM over lives, with its 95 % bootstrap interval, at the end of the life; the regret on "
+        "the visited phase is a mean over visits, plasticity and learning transfer over those "
+        "after visit 0, in which a life is a fresh agent itself. Performance is 1 − normalised "
+        "regret: 1 for the optimum, 0 for the constant ½. Below 1, a plasticity ratio is better "
+        "than a fresh agent. The last columns are agents that need no training.",
         frame,
         names=2,
     )
