@@ -19,6 +19,7 @@ from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.io import read_json, to_json
 from sme_registry.spec import Integer, StrictModel, SuiteFile
 from sme_registry.training import RunRecord
+from sme_registry.training.snapshots import model_of_cell
 
 if TYPE_CHECKING:
     from sme_registry.studies import CellStatus
@@ -184,7 +185,7 @@ def _cell(study: Path, status: CellStatus) -> SubmittedRun:
     if status.state == "failed":
         return SubmittedRun(source, cell.spec, cell.seed, cell.steps, None)
     stem = cell.digest.removeprefix("sha256:")
-    policy = study / "models" / f"{stem}.zip"
+    policy = model_of_cell(study, cell.digest)
     if not policy.is_file():
         raise OptionError(
             f"{source}: its model was not kept. Run the study in a new folder with --keep-models."

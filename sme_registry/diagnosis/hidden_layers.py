@@ -7,7 +7,7 @@ Of a multilayer perceptron with hidden outputs h `[n, H]` in n states, σ their 
     weight norm        √(Σ W²) over all layers, without biases
 
 Dormant units: Sokar et al. (2023). Effective rank: Kumar et al. (2021), srank with δ = 0.01. A unit
-of tanh is never dormant but can be stuck at a bound: it counts as saturated if its mean |h| is at
+of tanh is rarely dormant but can be stuck at a bound: it counts as saturated if its mean |h| is at
 least 0.95, where its mean derivative, 1 − h², is below 0.1.
 """
 

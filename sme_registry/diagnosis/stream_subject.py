@@ -95,11 +95,11 @@ def life_in_cell(
     fresh = [path.with_stem(_stem(each)) for each in cell.fresh]
     if all(each.exists() for each in fresh):
         report = _with_fresh(report, fresh)
-    kept = snapshots.Snapshots(study / "models" / path.stem, cell.stream)
+    kept = snapshots.Snapshots(snapshots.folder_of_cell(study, path.stem), cell.stream)
     networks = _kept(kept.visits, cell.stream, cell.action_range)
     initial = _kept([kept.initial], cell.stream, cell.action_range)
     alone = [
-        _kept([study / "models" / f"{_stem(each)}.zip"], each.document, cell.action_range)
+        _kept([snapshots.model_of_cell(study, each.digest)], each.document, cell.action_range)
         for each in cell.fresh
     ]
     return StreamSubject(

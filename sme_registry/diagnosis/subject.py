@@ -23,7 +23,7 @@ from sme_registry.io import read_json
 from sme_registry.spec import SMESpec
 from sme_registry.spec.study import INDEPENDENT, Cell, in_jax
 from sme_registry.task.draw import Array
-from sme_registry.training import RunRecord, checkpoint
+from sme_registry.training import RunRecord, checkpoint, snapshots
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import MODEL
@@ -242,7 +242,7 @@ def _cell_model(study: Path, stem: str, cell: Cell) -> Any:
         from sme_registry.evaluation.references import reference_policy
 
         return reference_policy(cell.uses.partition(":")[2], cell.spec)
-    path = study / "models" / f"{stem}.zip"
+    path = snapshots.model_of_cell(study, stem)
     if not path.exists():
         raise OptionError(
             f"cell={stem[:12]!r}: its model was not kept. Finished cells are not run again, so run "

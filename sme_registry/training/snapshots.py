@@ -17,6 +17,22 @@ from sme_registry.io import write_atomically
 from sme_registry.spec import StreamSpec
 
 FOLDER = "snapshots"  # of a run
+MODELS = "models"  # of a study
+
+
+def model_of_cell(study: Path, key: str) -> Path:
+    """Where a study keeps the trained model of a cell.
+
+    Args:
+      study: its folder.
+      key: the cell's digest.
+    """
+    return study / MODELS / f"{key.removeprefix('sha256:')}.zip"
+
+
+def folder_of_cell(study: Path, key: str) -> Path:
+    """The folder for the `Snapshots` of a cell that is a life; the arguments as above."""
+    return model_of_cell(study, key).with_suffix("")
 
 
 class Snapshots:

@@ -22,9 +22,10 @@ from sme_registry.io import Lock, file_lock, is_locked, read_json, to_json, writ
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.program_state import read_header
 from sme_registry.studies.engine.result import CellFailure, CellResult
+from sme_registry.training.snapshots import MODELS, folder_of_cell, model_of_cell
 
 PLAN = "plan.json"
-CELLS, FAILED, LOCKS, MODELS, REPORT = "cells", "failed", "locks", "models", "report"
+CELLS, FAILED, LOCKS, REPORT = "cells", "failed", "locks", "report"
 REQUESTS = "requests"  # selections of cells that were asked for, a file each
 STATES = "states"  # of programs that run, or were killed
 _STUDY_FILES = {PLAN, CELLS, FAILED, LOCKS, MODELS, REPORT, REQUESTS, STATES}
@@ -151,11 +152,11 @@ class Ledger:
 
     def model_path(self, key: str) -> Path:
         """Where a cell's trained model is, if it was kept."""
-        return self.folder / MODELS / f"{_hex(key)}.zip"
+        return model_of_cell(self.folder, key)
 
     def snapshots_path(self, key: str) -> Path:
         """The folder of the models at the ends of the visits of a life, if they were kept."""
-        return self.model_path(key).with_suffix("")
+        return folder_of_cell(self.folder, key)
 
     def failure_path(self, key: str) -> Path:
         """Where a cell's failure is, if it failed."""
