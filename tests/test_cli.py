@@ -684,6 +684,11 @@ class TestEvaluate:
         assert message in refused("evaluate", *arguments, *QUICK, "--out", "ev")
         assert [path.name for path in tmp_path.iterdir()] == ["life.json"]
 
+    def test_a_life_of_more_visits_than_are_evaluated_is_refused(self) -> None:
+        save(StreamSpec(phases=load("Cycle2").phases, cycles=10**6), "long.json")
+        message = "cycles × phases=2,000,000: must be at most 1,000"
+        assert message in refused("evaluate", "random", "random", "long.json", *QUICK)
+
     def test_a_zip_that_is_no_model_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "a.zip").write_bytes(b"not a zip")
         assert "not a model" in refused("evaluate", "a.zip", "Default")

@@ -61,6 +61,7 @@ def evaluate_life(
 def _evaluated(life: Life, stream: StreamSpec, protocol: EvaluationProtocol) -> StreamReport:
     from sme_registry import evaluation
 
+    stream.refuse_many_visits()
     visits = stream.visits
     policies: list[Any] = [*life.policies]
     if len(policies) not in (1, visits):

@@ -27,10 +27,7 @@ from sme_registry.spec.sme_spec import FULL_TURN, MAX_SEED, SMESpec
 from sme_registry.spec.validation_errors import short_repr
 
 MAX_PIECES = 10_000  # of one cycle
-MAX_VISITS = 1_000
-"""Of a life that is evaluated: the model at the end of each visit is kept, and evaluated on every
-phase."""
-
+MAX_VISITS = 1_000  # of a life that is evaluated
 BETWEEN_DRAWS = 10**6  # of the seeds of a stream, so that its draws have no task in common
 _SHARED = ("state_dim", "action_dim", "horizon")
 
@@ -279,6 +276,14 @@ class StreamSpec(NamedDocument):
         Runs of streams of one family can be compared as runs of one stream.
         """
         return self._moved(-int(str(self.phases[0].spec.seed), 0))
+
+    def refuse_many_visits(self) -> None:
+        """Raise SpecError if a life has more visits than are evaluated."""
+        if self.visits > MAX_VISITS:
+            raise SpecError(
+                f"cycles × phases={self.visits:,}: must be at most {MAX_VISITS:,}, since a life is "
+                "evaluated on every phase at the end of each visit. Use fewer cycles or phases."
+            )
 
     def _moved(self, by: int) -> StreamSpec:
         """This stream with a number added to the seed of every phase."""

@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, JsonValue, model_validator
 
+from sme_registry.errors import SpecError
 from sme_registry.spec.document import (
     Document,
     Integer,
@@ -25,7 +26,7 @@ from sme_registry.spec.document import (
 )
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.sme_spec import ActionRange, Setting, SMESpec
-from sme_registry.spec.stream import MAX_VISITS, Phase, StreamSpec
+from sme_registry.spec.stream import Phase, StreamSpec
 from sme_registry.spec.suite import Classes, StreamClasses, refuse_no_class
 
 FRESH_EVALUATIONS = 10  # at most, of a fresh agent
@@ -229,12 +230,10 @@ class StudyPlan(Document):
                     "make streams with other steps."
                 )
         for i, lived in enumerate(self.streams):
-            if lived.stream.visits > MAX_VISITS:
-                raise ValueError(
-                    f"streams.{i}.stream: has {lived.stream.visits:,} visits of phases: must be at "
-                    f"most {MAX_VISITS:,}, since each is evaluated on every phase. Use fewer "
-                    "cycles or phases."
-                )
+            try:
+                lived.stream.refuse_many_visits()
+            except SpecError as error:
+                raise ValueError(f"streams.{i}.stream: {error}") from None
         return self
 
     @property

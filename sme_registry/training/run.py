@@ -45,7 +45,6 @@ from sme_registry.spec import (
     StreamSpec,
     catalogue,
 )
-from sme_registry.spec.stream import MAX_VISITS
 from sme_registry.spec.study import in_jax
 from sme_registry.task import load_document, materialize, materialize_stream
 from sme_registry.training import checkpoint, reports
@@ -265,8 +264,8 @@ def _steps(document: SMESpec | StreamSpec, steps: int | None) -> int:
             f"stream {catalogue.title(document)}. Leave it out, or make another stream, whose "
             "phases have other steps."
         )
+    document.refuse_many_visits()
     advice = "Make a stream with fewer cycles or phases, or with shorter ones."
-    integer_in("cycles × phases", document.visits, 1, MAX_VISITS, advice=advice)
     return integer_in("steps", document.steps, 1, MAX_STEPS, advice=advice)
 
 

@@ -14,6 +14,7 @@ from sme_registry.errors import (
     OptionError,
     PolicyError,
     SMEError,
+    SpecError,
     UnknownNameError,
 )
 from sme_registry.evaluation import (
@@ -22,8 +23,10 @@ from sme_registry.evaluation import (
     across_seeds,
     dynamic_regret,
     evaluate_stream,
+    expected_regret,
     fresh_per_phase,
     frozen_after_first,
+    reference_regret,
 )
 from sme_registry.evaluation.continual import RegretBlocks, metrics
 from sme_registry.evaluation.continual.retention import final_specs
@@ -424,6 +427,17 @@ def test_bad_input_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
         evaluate_stream(*arguments, PROTOCOL)
     assert issubclass(error, SMEError)
+
+
+def test_a_life_of_more_visits_than_are_evaluated_is_refused():
+    long = stream_of(SPEC, SPEC.derive(seed=1), cycles=501)
+    message = "cycles × phases=.* must be at most 1,000"
+    with pytest.raises(SpecError, match=message):
+        evaluate_stream([half] * 1002, long, PROTOCOL)
+    with pytest.raises(SpecError, match=message):
+        expected_regret([half] * 1002, long, episodes=1)
+    with pytest.raises(SpecError, match=message):
+        reference_regret(stream_of(SPEC, cycles=10**6), episodes=1)
 
 
 def test_fresh_agents_are_one_for_each_phase():

@@ -233,7 +233,7 @@ def test_a_plan_with_a_life_of_more_visits_than_are_evaluated_is_refused() -> No
     stream = StreamSpec(phases=STREAM.phases, cycles=501)
     fields = new_plan("-t", "mine.json", "-a", "TD3").plan.to_dict()
     fields["streams"].append({"name": "long", "stream": stream.to_dict()})
-    with pytest.raises(SpecError, match=r"streams.1.stream: has 1,002 visits .* at most 1,000"):
+    with pytest.raises(SpecError, match=r"streams.1.stream: cycles × phases=1,002: .* 1,000"):
         StudyPlan.from_dict(fields)
 
 

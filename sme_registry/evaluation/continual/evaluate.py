@@ -62,13 +62,15 @@ def evaluate_stream(
       The report, with the reference agents on the same states.
 
     Raises:
-      UnknownNameError, SpecError: no such stream or protocol, or a field is out of range.
+      UnknownNameError, SpecError: no such stream or protocol, a field is out of range, or the
+        stream has more than 1,000 visits.
       OptionError: not one policy for each visit or phase.
       PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
       MissingDependencyError: the library that loads a policy is not installed.
       ResourceLimitError: the tasks would not fit in memory together.
     """
     stream = load_stream(stream)
+    stream.refuse_many_visits()
     protocol = resolve_protocol(protocol)
     P = len(stream.phases)
     V = stream.cycles * P

@@ -56,13 +56,15 @@ def expected_regret(
       progress: called after the episodes of each piece with the number of pieces done, and of all.
 
     Raises:
-      UnknownNameError, SpecError: no such stream, or a field is out of range.
+      UnknownNameError, SpecError: no such stream, a field is out of range, or the stream has more
+        than 1,000 visits.
       OptionError: not one policy or number for each visit, or a number outside [0, 1].
       PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
       MissingDependencyError: the library that loads a policy is not installed.
       ResourceLimitError: the tasks would not fit in memory together.
     """
     stream = load_stream(stream)
+    stream.refuse_many_visits()
     P = len(stream.phases)
     refuse_other_count("life", life, stream.cycles * P, "or number for each visit")
     integer_in("episodes", episodes, 1)
@@ -114,6 +116,7 @@ def reference_regret(
       As `expected_regret`.
     """
     stream = load_stream(stream)
+    stream.refuse_many_visits()
     if (frozen is None) != (training is None):
         raise OptionError(
             "frozen, training: must be given together or both left out. Give the policy at the "
