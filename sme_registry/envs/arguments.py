@@ -29,6 +29,8 @@ from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike
 from sme_registry.spec.resolve import resolve_stream
 from sme_registry.task import Task, load_task, materialize_stream
 
+MAX_LIFETIME = 2**62  # at which a life may begin: its steps are counted in 64 bits
+
 
 def load_overridden(environment: type, spec: SpecLike, overrides: dict[str, Any]) -> Task:
     """The task of an environment class that is called with these overrides of spec fields.
@@ -158,11 +160,11 @@ def refuse_unknown_options(options: dict[str, Any] | None, known: tuple[str, ...
 
 
 def lifetime_in(options: dict[str, Any] | None) -> int | None:
-    """The option `lifetime` of a stream's reset: an integer of at least 0; None without it."""
+    """The option `lifetime` of a stream's reset: an integer in [0, 2⁶²]; None without it."""
     if not options or "lifetime" not in options:
         return None
     advice = "Leave it out to continue the life."
-    return integer_in("lifetime", options["lifetime"], 0, advice=advice)
+    return integer_in("lifetime", options["lifetime"], 0, MAX_LIFETIME, advice=advice)
 
 
 def initial_states(state: Any, shape: tuple[int, ...]) -> Array:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeAlias
 from pydantic import Field, model_validator
 
 from sme_registry.errors import SpecError, UnknownNameError
+from sme_registry.io import integer_in
 from sme_registry.spec.document import (
     Digest,
     Integer,
@@ -265,8 +266,12 @@ class StreamSpec(NamedDocument):
         Phases with equal seeds have equal seeds in each draw, so what relates them is kept.
 
         Args:
-          number: of the draw, at least 0; 0 is the stream itself.
+          number: of the draw, in [0, 2³² − 1]; 0 is the stream itself.
+
+        Raises:
+          OptionError: the number is no such integer.
         """
+        number = integer_in("number", number, 0, 2**32 - 1)
         return self if number == 0 else self._moved(number * BETWEEN_DRAWS)
 
     @property

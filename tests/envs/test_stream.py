@@ -178,9 +178,14 @@ def test_another_lifetime_or_that_of_a_task_is_refused_and_nothing_changes() -> 
     env, batch = SMEStreamEnv(stream()), SMEStreamVectorEnv(stream(), 2)
     for each in env, batch:
         each.reset(seed=0)
-        for lifetime in (-1, 2.5, "late", None):
-            with pytest.raises(OptionError, match=r"^lifetime=.*must be an integer of at least 0"):
+        for lifetime in (-1, 2.5, "late", None, 2**62 + 1, 2**63 - 1, 2**70):
+            with pytest.raises(OptionError, match=r"^lifetime=.*must be an integer in \[0, 4,611,"):
                 each.reset(seed=1, options={"lifetime": lifetime})
+        action = np.full_like(each.action_space.sample(), 0.5)
+        assert np.max(each.step(action)[4]["lifetime"]) == 1
+        each.reset(seed=1, options={"lifetime": 2**62})
+        assert np.min(each.step(action)[4]["lifetime"]) == 2**62 + 1
+        each.reset(seed=0)
         assert np.max(each.reset()[1]["lifetime"]) == 0
         with pytest.raises(OptionError, match="unknown option"):
             each.reset(options={"lifetmie": 1})

@@ -15,6 +15,7 @@ import sme_registry
 from sme_registry.errors import (
     DigestMismatchError,
     FingerprintMismatchError,
+    OptionError,
     ResourceLimitError,
     SMEError,
     SpecError,
@@ -97,6 +98,12 @@ def test_the_draws_of_a_stream_are_one_family(spec, number):
     both = zip(spec.phases, drawn.phases, strict=True)
     assert {other.spec.seed - one.spec.seed for one, other in both} == {number * 10**6}
     assert stream(phase(9), phase(9, seed=2)).family != stream(phase(9), phase(9, seed=1)).family
+
+
+@pytest.mark.parametrize("number", [-1, True, 1.0, "2", 2**32, 10**80])
+def test_a_number_of_no_draw_is_refused(number):
+    with pytest.raises(OptionError, match=r"number=.*: must be an integer in \[0, 4,294,967,295\]"):
+        stream(phase(9)).draw(number)
 
 
 def test_a_drift_is_short_phases_in_equal_increments_of_the_angle():
