@@ -101,6 +101,10 @@ def test_suite_writes_a_file_of_tasks_files_sweeps_and_another_suite(tmp_path: P
 def test_train_refuses_what_a_stream_cannot_have() -> None:
     stream = refused("train", "Switch5", "--set", "complexity=3")
     assert "--set complexity: Switch5 is a stream." in stream
+    for field in ("cycles", "phases.0.steps"):
+        own = refused("train", "Switch5", "-a", "PPO", "--set", f"{field}=3")
+        assert "is a stream. It is a field of streams" in own
+    assert "PPO has no such" in refused("train", "Default", "-a", "PPO", "--set", "cycles=3")
     assert "make another stream in Python" in stream
     assert "steps=100: must be 100,000" in refused("train", "Switch5", "-n", "100")
     assert "num_envs=2: must be 1 on a stream" in refused("train", "Switch5", "--num-envs", "2")
@@ -663,6 +667,7 @@ class TestEvaluate:
         assert agent["fresh_normalised_regret"][0] < 0.5
         assert report["dynamic_regret"] is None
         assert report["reference_regret"].keys() > {"constant_half", "fresh_optimum"}
+        assert "\n\nNormalised regret in WD" in good(*life).stdout
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -670,6 +675,7 @@ class TestEvaluate:
             (("random", "random", "life.json"), "2 policies: must be one for the whole life, or 4"),
             (("randm", "life.json"), "Did you mean 'random'"),
             (("random", "life.json", "--set", "k=2"), "--set k: life.json is a stream. It is a"),
+            (("random", "life.json", "--set", "cycles=2"), "`StreamSpec(**dict(stream) | {'cyc"),
             (("random", "life.json", "--fresh", "random"), "must be 2 policies, one for each"),
             (("random", "Cycel2"), "Did you mean 'Cycle2-v1'"),
             (("random", "random", "Default"), "2 policies: must be one for the task 'Default'"),

@@ -171,7 +171,8 @@ def changed(
     if isinstance(document, SMESpec):
         return document.derive(**fields)
     for field in fields:
-        raise OptionError(f"--set {field}: {name} is a stream. {another_stream(field)}")
+        advice = another_stream(field.partition(".")[0])
+        raise OptionError(f"--set {field}: {name} is a stream. {advice}")
     return document
 
 

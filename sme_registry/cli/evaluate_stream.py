@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sme_registry.cli.files import can_draw, print_written
+from sme_registry.cli.files import can_draw, print_tables, print_written
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
 from sme_registry.spec import EvaluationProtocol, StreamSpec
-from sme_registry.terminal import Progress, err, out, print_json
+from sme_registry.terminal import Progress, err, print_json
 
 if TYPE_CHECKING:
     from sme_registry.evaluation import StreamReport
@@ -53,8 +53,7 @@ def evaluate_life(
     if json:
         print_json(report.to_dict())
     else:
-        for table in report.tables():
-            out().print(table)
+        print_tables(report.tables())
     print_written(files)
 
 

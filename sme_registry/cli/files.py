@@ -44,13 +44,16 @@ def print_training(
         record, report = result.record.to_dict(), result.report.to_dict()
         print_json({"folder": str(folder), "run": record, "evaluation": report})
         return
-    for each in tables:
-        out().print(each)
-    for index, each in enumerate(result.report.tables()):
+    print_tables([*tables, *result.report.tables()])
+    out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
+
+
+def print_tables(tables: Iterable[Table]) -> None:
+    """Print tables with an empty line between them."""
+    for index, table in enumerate(tables):
         if index:
             out().print()
-        out().print(each)
-    out().print(f"All files are in {escape(str(folder))}{os.sep}", soft_wrap=True)
+        out().print(table)
 
 
 def print_written(paths: Iterable[Path]) -> None:

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from rich.markup import escape
 
 from sme_registry.cli.arguments import KINDS, Json, find_any
+from sme_registry.cli.files import print_tables
 from sme_registry.cli.list import study_table, summary
 from sme_registry.errors import OptionError
 from sme_registry.spec import (
@@ -284,10 +285,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     tables = [make(suite) for make in (_tasks_table, _streams_table)]
     shown = [table for table in tables if table.rows]
     shown[0].title, shown[-1].caption = _title(file), file.digest
-    for index, table in enumerate(shown):
-        if index:
-            out().print()
-        out().print(table)
+    print_tables(shown)
     digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
     kind = "task" if suite.classes else "stream"
     if all(digest in known_specs() or digest in known_streams() for digest in digests):

@@ -197,7 +197,10 @@ def train(
     refuse_without_suite(context)
     if task is None:
         raise OptionError("Give a TASK or --suite, such as Default. See `sme train --help`.")
-    document = changed(load_document(task), task, overrides)
+    document = load_document(task)
+    if isinstance(document, StreamSpec):
+        overrides |= {name: settings[name] for name in settings if name in StreamSpec.model_fields}
+    document = changed(document, task, overrides)
     algorithm = training.full_name(algorithm or training.default_algorithm(document), agents)
     training.check_hyperparameters(algorithm, settings, others=SMESpec.model_fields)
     if out_folder is None:

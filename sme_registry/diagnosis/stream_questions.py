@@ -111,6 +111,7 @@ def _mean_of_others(visit: VisitDiagnosis, visits: Sequence[VisitDiagnosis]) -> 
 @_where(
     failed_as_fresh_agents="yes",
     failed_unlike_fresh_agents="yes",
+    some_failed_unlike_fresh_agents="yes",
     visits_failed="yes",
     every_visit_learnt="no",
 )
@@ -126,17 +127,27 @@ def _failure_to_learn(case: StreamCase) -> Outcome:
         for visit in case.visits
         if visit.normalised_regret >= _T["unlearnt"]
     ]
-    fresh = [row["fresh"] for row in failed]
-    if not failed:
-        reason = "every_visit_learnt"
-    elif None in fresh:
-        reason = "visits_failed"
-    else:
-        alike = min(fresh) >= _T["unlearnt"]
-        reason = "failed_as_fresh_agents" if alike else "failed_unlike_fresh_agents"
     highest = max(visit.normalised_regret for visit in case.visits)
     evidence = {"failed": failed, "visits": len(case.visits), "highest": highest}
-    return Outcome(reason, evidence, ("unlearnt",))
+    if not failed:
+        return Outcome("every_visit_learnt", evidence, ("unlearnt",))
+    if None in [row["fresh"] for row in failed]:
+        return Outcome("visits_failed", evidence, ("unlearnt",))
+    unlike = [row["visit"] for row in failed if _is_unlike_fresh(row)]
+    if not unlike:
+        reason = "failed_as_fresh_agents"
+    elif len(unlike) == len(failed):
+        reason = "failed_unlike_fresh_agents"
+    else:
+        reason = "some_failed_unlike_fresh_agents"
+    return Outcome(reason, {**evidence, "unlike_fresh": unlike}, ("unlearnt", "difference"))
+
+
+def _is_unlike_fresh(failed: dict[str, Any]) -> bool:
+    """Whether a visit failed because of the life before it, of which visit 0 has none."""
+    gap = failed["normalised_regret"] - failed["fresh"]
+    learns = failed["fresh"] < _T["unlearnt"] and gap >= _T["difference"]
+    return failed["visit"] > 0 and bool(learns)
 
 
 @_where(

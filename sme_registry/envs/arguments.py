@@ -25,7 +25,7 @@ from sme_registry.errors import (
     did_you_mean,
 )
 from sme_registry.io import choice, integer_in
-from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike
+from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.resolve import resolve_stream
 from sme_registry.task import Task, load_task, materialize_stream
 
@@ -72,7 +72,7 @@ def refuse_override(environment: type, name: str) -> NoReturn:
     parameters = inspect.signature(environment).parameters.values()
     named = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
     advice = did_you_mean(name, named) or " Remove it."
-    if name in SMESpec.model_fields:
+    if name in {*SMESpec.model_fields, *StreamSpec.model_fields}:
         advice = f" {another_stream(name)}"
     raise UnexpectedKeywordError(
         f"{environment.__name__}() got an unexpected keyword argument {name!r} for a stream: must "
@@ -81,7 +81,12 @@ def refuse_override(environment: type, name: str) -> NoReturn:
 
 
 def another_stream(field: str) -> str:
-    """What to do in order to change a field of the specs of a stream."""
+    """What to do in order to change a field of a stream, or of its specs."""
+    if field in StreamSpec.model_fields:
+        return (
+            "It is a field of streams: to change it, make another stream in Python, such as "
+            f"`StreamSpec(**dict(stream) | {{{field!r}: …}})`."
+        )
     return (
         "It is a field of specs: to change it, make another stream in Python, such as "
         f"`StreamSpec(phases=[{{'spec': phase.spec.derive({field}=…), 'steps': phase.steps}} "

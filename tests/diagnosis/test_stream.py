@@ -158,6 +158,71 @@ def test_fresh_agents_say_whether_the_life_or_the_task_is_the_cause_of_a_failure
     assert answer(diagnosis_of(alike), "loss of plasticity")[1] == "fresh_agents_learnt_little"
 
 
+def test_each_failed_visit_is_compared_with_the_fresh_agent_of_its_own_phase() -> None:
+    stream = stream_of(2, cycles=2)
+    first, second = optima(stream)
+    question = "failure to learn"
+
+    def reason(policies: list[Any], fresh: list[Any]) -> str:
+        verdict = diagnosis_of(report_of(policies, stream, fresh=fresh)).verdict(question)
+        assert stream_sentence(verdict)
+        return verdict.reason
+
+    # Phase 0 is learnt by no agent, phase 1 by the fresh one alone.
+    assert reason(["constant"] * 4, ["constant", second]) == "some_failed_unlike_fresh_agents"
+    assert reason(["constant", second] * 2, ["constant", second]) == "failed_as_fresh_agents"
+    assert reason([first, "constant"] * 2, ["constant", second]) == "failed_unlike_fresh_agents"
+    # Before the first visit there is no life, so that what it lacks is no fault of the life.
+    assert reason(["constant", second, first, second], [first, second]) == "failed_as_fresh_agents"
+
+
+def test_a_failure_that_is_hardly_worse_than_a_fresh_agent_s_is_not_blamed_on_the_life() -> None:
+    case = StreamCase(
+        stream_of(2),
+        [
+            VisitDiagnosis(
+                visit=v, phase=v, lifetime=(v + 1) * STEPS, steps=STEPS, dynamic_regret=None,
+                online_regret=None, normalised_regret=regret, network=None,
+            )
+            for v, regret in enumerate((0.5, 0.93))
+        ],
+        [
+            PhaseDiagnosis(
+                phase=j, outcome="retained", best_normalised_regret=0.5,
+                final_normalised_regret=0.5, initial_normalised_regret=None,
+                fresh_normalised_regret=fresh, fresh_online_regret=None, fresh_network=None,
+            )
+            for j, fresh in enumerate((0.5, 0.89))
+        ],
+        None,
+    )  # fmt: skip
+    (verdict,) = (
+        each
+        for each in answer_all(STREAM_QUESTIONS, case, STREAM_THRESHOLDS)
+        if each.question == "failure_to_learn"
+    )
+    assert verdict.reason == "failed_as_fresh_agents"
+
+
+def test_forgetting_of_a_phase_that_was_never_learnt_is_said_to_be_that() -> None:
+    stream = stream_of(3)
+    first, second, _ = optima(stream)
+
+    def away(observations: Any) -> Any:  # good in phase 1, and worse in phase 0 than before
+        best = second(observations)
+        return np.clip(best + 0.15 * (best - first(observations)), 0.0, 1.0)
+
+    found = diagnosis_of(report_of(["constant", second, away], stream))
+    assert [phase.outcome for phase in found.phases] == ["not_learnt", "retained", "not_learnt"]
+    assert found.forgetting is not None
+    assert found.forgetting > 0.0
+    assert answer(found, "forgetting") == ("no", "phases_retained")
+    assert "(mean over earlier phases, learnt or not)" in headline(found)
+    assert "earlier phases, learnt or not" in stream_sentence(found.verdict("forgetting"))
+    learnt = diagnosis_of(report_of(optima(stream), stream))
+    assert "learnt or not" not in headline(learnt)
+
+
 def test_the_visit_whose_regret_stands_out_is_named() -> None:
     stream = stream_of(2, cycles=2)
     life = fresh_per_phase(stream, optima(stream))

@@ -323,6 +323,8 @@ def test_returned_arrays_are_fresh_and_writing_into_them_moves_nothing() -> None
 def test_fields_of_specs_are_refused_with_the_way_to_another_stream(make: Any) -> None:
     with pytest.raises(UnexpectedKeywordError, match=r"'complexity' for a stream.*spec\.derive"):
         make("SME/Switch5-v1", complexity=10)
+    with pytest.raises(UnexpectedKeywordError, match=r"'cycles' for a stream.*StreamSpec\(\*\*"):
+        make("SME/Switch5-v1", cycles=2)
     with pytest.raises(UnexpectedKeywordError, match=r"Did you mean 'action_range'"):
         make("SME/Switch5-v1", action_rnge="unit")
 
