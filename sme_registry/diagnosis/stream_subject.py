@@ -93,7 +93,7 @@ def life_in_cell(
     report = _report(read_json(path), path)
     assert isinstance(report, StreamReport)
     fresh = [path.with_stem(_stem(each)) for each in cell.fresh]
-    if all(each.exists() for each in fresh):
+    if fresh and all(each.exists() for each in fresh):
         report = _with_fresh(report, fresh)
     kept = snapshots.Snapshots(snapshots.folder_of_cell(study, path.stem), cell.stream)
     networks = _kept(kept.visits, cell.stream, cell.action_range)
@@ -108,7 +108,7 @@ def life_in_cell(
         plan,
         networks,
         initial[0] if initial else None,
-        tuple(each[0] for each in alone if each) if all(alone) else None,
+        tuple(each[0] for each in alone if each) if alone and all(alone) else None,
     )
 
 

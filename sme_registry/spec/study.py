@@ -141,18 +141,24 @@ class Cell(Document):
 
     @property
     def fresh(self) -> tuple[Cell, ...]:
-        """Of a life: for each phase the run of an agent that trains on that phase alone."""
+        """Of a life: for each phase the run of an agent that trains on that phase alone.
+
+        None of a life that is such a run itself.
+        """
         if self.stream is None:
+            return ()
+        documents = [_alone(phase) for phase in self.stream.phases]
+        if documents == [self.stream]:
             return ()
         # A number that depends on the stream would give streams that share a phase different cells.
         evaluations = min(self.evaluations, FRESH_EVALUATIONS)
         return tuple(
             Cell(
                 **dict(self)
-                | _lived_in(_alone(phase))
+                | _lived_in(document)
                 | {"steps": phase.steps, "evaluations": evaluations}
             )
-            for phase in self.stream.phases
+            for phase, document in zip(self.stream.phases, documents, strict=True)
         )
 
     @property

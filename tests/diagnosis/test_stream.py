@@ -548,6 +548,18 @@ def test_a_life_of_a_study_that_kept_its_models_is_diagnosed(tmp_path: Path) -> 
     assert found.verdict("costly visits").reason.endswith("_than_fresh")
 
 
+def test_a_life_that_is_a_fresh_agent_itself_is_not_compared_with_itself(tmp_path: Path) -> None:
+    drift = {"rotation": 1.0, "increments": 2}
+    stream = StreamSpec(phases=[{"spec": SPEC, "steps": STEPS, "drift": drift}])
+    key = write_cell(tmp_path, cell_of(stream), report_of(["constant"], stream, [0.5]), 0.5)
+    Snapshots(tmp_path / "models" / key, stream).write(0, model_of("jax:PPO", stream))
+    (tmp_path / "models" / f"{key}.zip").write_bytes(saved_sb3(model_of("jax:PPO", stream)))
+    found = diagnose(load_cell(tmp_path, key), states=64)
+    (phase,) = found.phases
+    assert (phase.fresh_online_regret, phase.fresh_normalised_regret) == (None, None)
+    assert phase.fresh_network is None
+
+
 def test_a_cell_whose_phase_observes_and_drifts_has_fresh_agents_of_that_phase(
     tmp_path: Path,
 ) -> None:

@@ -134,6 +134,17 @@ def test_a_plan_has_a_life_and_fresh_agents_for_each_run() -> None:
     assert from_suite.streams == catalogue.find(SuiteFile, "continual").suite.streams
 
 
+def test_a_life_that_is_a_fresh_agent_itself_has_none() -> None:
+    drift = {"rotation": 1.0, "increments": 2}
+    alone = StreamSpec(phases=[{"spec": TASK, "steps": 40, "drift": drift}])
+    twice = StreamSpec(phases=alone.phases, cycles=2)
+    save(alone, "alone.json")
+    save(twice, "twice.json")
+    plan = new_plan("-t", "alone.json", "-t", "twice.json", "-a", "TD3", "--seeds", "1").plan
+    found = [(place.class_name, place.phase, place.cell.stream) for place in plan.cells]
+    assert found == [("alone", None, alone), ("twice", None, twice), ("twice", 0, alone)]
+
+
 def test_cells_that_streams_share_count_once() -> None:
     file = catalogue.find(StudyFile, "continual")
     assert len(file.plan.cells) == 135
@@ -186,6 +197,15 @@ def test_rollouts_that_do_not_end_where_phases_do_are_named_with_a_better_length
     assert "uneven rollouts: PPO on mine, Switch5: its rollouts of 2,048 steps" in result.stderr
     assert "--set PPO.n_steps=8" in result.stderr
     assert uneven_rollouts(catalogue.find(StudyFile, "continual").plan) == []
+
+
+def test_the_better_length_suits_every_stream() -> None:
+    twelve = StreamSpec(phases=[{"spec": STREAM.phases[0].spec, "steps": 12}] * 2)
+    save(twelve, "twelve.json")
+    chosen = ("-a", "PPO", "--set", "PPO.n_steps=8", "--set", "PPO.batch_size=4")
+    plan = new_plan("-t", "mine.json", "-t", "twelve.json", *chosen).plan
+    (uneven,) = uneven_rollouts(plan)
+    assert (uneven.streams, uneven.better) == (("twelve",), 4)  # 6 would suit twelve alone
 
 
 def test_a_suite_of_streams_is_trained_on_for_the_steps_of_its_streams() -> None:

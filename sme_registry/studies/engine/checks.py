@@ -105,7 +105,7 @@ class UnevenRollouts(NamedTuple):
       algorithm: its name in the plan.
       n_steps: of a rollout.
       streams: the names of the classes.
-      better: the longest shorter rollout that ends where their phases do.
+      better: the longest shorter rollout that ends where the phases of every stream do.
     """
 
     algorithm: str
@@ -126,11 +126,11 @@ def uneven_rollouts(plan: StudyPlan) -> list[UnevenRollouts]:
             member.name: math.gcd(*(phase.steps for phase in member.stream.phases))
             for member in plan.streams
         }
-        uneven_on = {name: steps for name, steps in phases.items() if steps % n}
+        uneven_on = tuple(name for name, steps in phases.items() if steps % n)
         if uneven_on:
-            together = math.gcd(*uneven_on.values())
+            together = math.gcd(*phases.values())
             better = max(m for m in range(1, min(n, together) + 1) if together % m == 0)
-            uneven.append(UnevenRollouts(algorithm.name, n, tuple(uneven_on), better))
+            uneven.append(UnevenRollouts(algorithm.name, n, uneven_on, better))
     return uneven
 
 

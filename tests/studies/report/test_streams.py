@@ -26,7 +26,7 @@ from sme_registry.studies.report.frames import plan_file
 from sme_registry.studies.report.streams import frames
 from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.findings import StreamFinding, StreamFindings
-from tests.studies.lives import AGENTS, STREAMS, live, stream_study
+from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
 
 pytest.importorskip("matplotlib")
 
@@ -256,10 +256,10 @@ def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps: Path) ->
     counts = streams.counts.set_index(["class_name", "algorithm"])
     assert tuple(counts.loc[("Switch", "Stubborn")]) == (3, 15, 5, 15, 1)
     assert tuple(counts.loc[("Cycle", "Tired")]) == (5, 5, 5, 10, 0)
-    # Switch and Related have the same phase 0, and so the same fresh agents of it.
+    # The three streams have the same phase 0, and so the same fresh agents of it.
     missing = streams.missing
-    assert (len(missing), missing.key.nunique()) == (2 + 3 * 5, 2 + 2 * 5)
-    assert (streams.finished, streams.requested, streams.planned) == (138, 150, 150)
+    assert (len(missing), missing.key.nunique()) == (2 + 3 * 5, 2 + 5)
+    assert (streams.finished, streams.requested, streams.planned) == (113, 120, 120)
     tired = streams.metrics[streams.metrics.algorithm == "Tired"].metric
     assert not {"plasticity_ratio", "plasticity_difference", "learning_transfer"} & set(tired)
     assert {"forgetting", "online_regret"} < set(tired)
@@ -304,7 +304,7 @@ def test_findings_say_what_fresh_agents_are_missing(gaps: Path) -> None:
     text = text_of(analysed(gaps))
     assert "its plasticity is unknown, since no life has all of its fresh agents" in text
     assert "5 lives have not all of their fresh agents yet" in text
-    assert "138 of 150 runs have finished" in text
+    assert "113 of 120 runs have finished" in text
     assert "Tired on phase 0 of Switch alone, run 0" in text
     assert "Stubborn on Switch, run 3: failed: ValueError: <b>bad</b>" in text
 
@@ -380,7 +380,7 @@ def test_the_report_of_streams_alone_is_whole_and_the_same_each_time(
     assert {f"figure-{name}" for name in FIGURES} < set(page.ids)
     assert "findings" not in page.ids
     text = " ".join(page.text.split())
-    assert "3 streams × 3 algorithms × 5 seeds: 150 of 150 runs have finished" in text
+    assert "3 streams × 3 algorithms × 5 seeds: 120 of 120 runs have finished" in text
     assert "In Related, Tired forgets most: at the end of the life" in text
     assert "so the changes are those that relatedness makes" in text
     read = Findings.from_dict(read_json(tmp_path / "one" / "findings.json"), "findings.json")
@@ -417,6 +417,21 @@ def test_every_figure_is_readable_and_shows_every_agent(study: Path, figures: li
     first = drawn["stream-retention-Switch"].axes[0].images[0].get_array()
     rows = within(streams_of(study).matrices, class_name="Switch", algorithm="Forgetful")
     np.testing.assert_allclose(np.ravel(first), rows.iqm)
+
+
+def test_a_life_of_one_visit_is_compared_with_no_fresh_agent(tmp_path: Path) -> None:
+    drift = {"rotation": 1.0, "increments": 2}
+    alone = {"phases": [{"spec": TASK, "steps": 100, "drift": drift}]}
+    plain = {"phases": [{"spec": TASK, "steps": 100}]}
+    streams = [{"name": "drift", "stream": alone}, {"name": "plain", "stream": plain}]
+    live(stream_study(streams=streams, seeds=2), tmp_path)
+    lives = studies.load_streams(tmp_path).lives
+    assert set(lives[lives.class_name == "drift"].fresh_agents) == {0}
+    assert lives.plasticity_ratio.isna().all()
+    assert {stream.without_fresh for stream in found_in(tmp_path).streams} == {0}
+    text = text_of(analysed(tmp_path))
+    assert "Plasticity: a life of one visit is a fresh agent itself" in text
+    assert "no life has all of its fresh agents" not in text
 
 
 def test_lives_of_a_single_seed_have_no_intervals(tmp_path: Path) -> None:

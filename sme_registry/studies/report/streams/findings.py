@@ -46,7 +46,8 @@ class LifeFinding(StrictModel):
     unlearnt: bool  # whether almost nothing was learnt in the visits: there is little to forget
     forgetting: LifeMetric | None  # None for a single visit
     forward_transfer: LifeMetric | None  # None without an initial policy, or with one phase
-    plasticity_ratio: LifeMetric | None  # None unless all fresh agents of a life have finished
+    # None unless all fresh agents of a life have finished, and for a single visit.
+    plasticity_ratio: LifeMetric | None
     last_plasticity_ratio: LifeMetric | None  # in the last visit
     learning_transfer: LifeMetric | None
 
@@ -71,6 +72,7 @@ class StreamFinding(StrictModel):
     forgetting: Literal["forgets", "indication", "open", "none"]
     rivals: TupleOf[Difference]  # the others with paired lives
     without_fresh: Integer  # lives without all of their fresh agents
+    single_visit: bool  # a life has one, so it is a fresh agent itself and has no plasticity
 
 
 class StreamChange(StrictModel):
@@ -129,15 +131,14 @@ def stream_findings(streams: StreamAnalysis) -> StreamFindings:
 def _stream(streams: StreamAnalysis, name: str) -> StreamFinding:
     found = [_life(streams, name, algorithm) for algorithm in streams.algorithms]
     lives = sorted((life for life in found if life is not None), key=_forgotten, reverse=True)
-    rows = streams.frames.lives
-    rows = rows[(rows.class_name == name) & (rows.region == WITHIN)]
-    phases = len(streams.classes[name].stream.phases)
+    lived = [life for life in streams.lives if life.planned.class_name == name]
     return StreamFinding(
         class_name=name,
         lives=tuple(lives),
         forgetting=_forgets(lives[0].forgetting),
         rivals=tuple(_rivals(streams, name, lives)),
-        without_fresh=int((rows.fresh_agents < phases).sum()),
+        without_fresh=sum(life.fresh_agents < len(life.planned.cell.fresh) for life in lived),
+        single_visit=streams.classes[name].stream.visits == 1,
     )
 
 

@@ -27,7 +27,8 @@ Columns of the life, repeated in each of its regions; NaN where it has no such n
     uses, action_range, steps    the algorithm, its action range, environment steps of the life
     state_dim, action_dim, horizon   of every phase
     stream_digest, seed          the stream's digest; the seed of training
-    fresh_agents                 number of its fresh agents that have finished
+    fresh_agents                 number of its fresh agents that have finished; a life of one phase
+                                 that drifts is a fresh agent itself, and has none
     seconds, steps_per_second    CPU time of the life, and training speed
     key                          digest of the life's cell, which names its file
 
@@ -153,7 +154,7 @@ def lives(plan: StudyPlan, results: Mapping[str, CellResult]) -> list[Life]:
             alone = [results.get(cell.digest) for cell in planned.cell.fresh]
             finished = [one for one in alone if one is not None]
             report = result.stream_report
-            if len(finished) == len(alone):
+            if alone and len(finished) == len(alone):
                 report = _with_fresh(report, finished)
             found.append(Life(planned, result, report, len(finished)))
     return found
