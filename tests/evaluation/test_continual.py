@@ -322,7 +322,9 @@ def test_learning_transfer_is_none_where_nothing_can_be_compared():
 @pytest.mark.parametrize(
     ("online", "message"),
     [
-        ([0.5], "fresh online_regret=.*must be 2 numbers"),
+        ([0.5], "fresh online_regret=.*must be 2 numbers, one for each phase"),
+        (0.3, "fresh online_regret=0.3: must be 2 numbers, one for each phase"),
+        (None, "fresh online_regret=None: must be 2 numbers"),
         ([0.5, 1.5], r"fresh online_regret=\[0.5, 1.5\]: must be in \[0, 1\]"),
         ([0.5, float("nan")], "fresh online_regret: has NaN"),
     ],
@@ -330,6 +332,37 @@ def test_learning_transfer_is_none_where_nothing_can_be_compared():
 def test_invalid_regret_of_fresh_agents_is_refused(online, message):
     with pytest.raises(OptionError, match=message):
         dynamic_regret(TWICE, [50], [0.5], 50).with_fresh(TWICE, online)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        stream_of(SPEC, cycles=4),
+        stream_of(SPEC, SPEC.derive(seed=1)),
+        stream_of(SPEC, SPEC.derive(seed=1), cycles=2, steps=40),
+        stream_of(SPEC, SPEC.derive(seed=1), cycles=2, steps=90),
+    ],
+)
+@pytest.mark.parametrize("switch", ["episode", "step"])
+def test_fresh_agents_of_another_stream_are_refused(other, switch):
+    own = stream_of(SPEC, SPEC.derive(seed=1), cycles=2, switch=switch)
+    log = dynamic_regret(own, [50, 100, 150], [0.5, 0.5, 0.5], 50)
+    assert log.with_fresh(own, [0.5, 0.5]).learning_transfer == 0.0
+    other = StreamSpec.from_dict({**other.to_dict(), "switch": switch})
+    with pytest.raises(OptionError, match=r"stream: is another one than that of this life, .* 150"):
+        log.with_fresh(other, [0.5] * len(other.phases))
+
+
+def test_a_visit_is_over_where_the_log_ends_less_than_an_episode_before():
+    # The last visit begins 6 steps late and ends in an unfinished episode of 6 steps.
+    late = dynamic_regret(TWICE, [56, 106, 156, 194], [0.5] * 4, [56, 50, 50, 38])
+    late = late.with_fresh(TWICE, [1.0, 1.0])
+    assert [visit.learning_transfer for visit in late.visits] == [0.5] * 4
+    # A visit of less than an episode of 10 steps.
+    short = stream_of(SPEC, SPEC.derive(seed=1), steps=8)
+    for steps, expected in ((3, None), (5, 0.5)):
+        log = dynamic_regret(short, [steps], [0.5], steps).with_fresh(short, [1.0, 1.0])
+        assert log.visits[0].learning_transfer == expected
 
 
 @pytest.mark.parametrize(
@@ -469,8 +502,11 @@ def test_fresh_agents_that_were_evaluated_by_themselves_give_the_same_plasticity
     assert logged.regions == later.regions
     with pytest.raises(OptionError, match="online_regret: this report has no dynamic regret"):
         without.with_fresh(fresh, [1.0, 0.25])
-    with pytest.raises(OptionError, match="fresh=1 reports: must be 2, one for each phase"):
+    with pytest.raises(OptionError, match="fresh=1 reports: must be 2 reports, one for each phase"):
         without.with_fresh(fresh[:1])
+    for wrong in (None, "ab", fresh[0], [None, None]):
+        with pytest.raises(OptionError, match=r"fresh=.*: must be 2 reports, one for each phase"):
+            without.with_fresh(wrong)
     with pytest.raises(OptionError, match=r"fresh\[0\]: is about .* the task of phase 0"):
         without.with_fresh([of_drift, of_drift])
     other = evaluate(alone[0], SPEC, PROTOCOL | {"states_per_region": 20})

@@ -82,19 +82,18 @@ class DynamicRegret(StrictModel):
             as many steps as the phase has.
 
         Raises:
-          OptionError: not one number in [0, 1] for each phase.
+          OptionError: not one number in [0, 1] for each phase; or the visits cannot be those of
+            this stream.
         """
-        P = len(stream.phases)
-        fresh = _column("fresh online_regret", online_regret, P)
+        _refuse_other_visits(stream, self)
+        fresh = _column("fresh online_regret", online_regret, len(stream.phases), "phase")
         if not (fresh >= 0.0).all() or not (fresh <= 1.0).all():
             raise OptionError(
                 f"fresh online_regret={fresh.tolist()}: must be in [0, 1]. Give the mean of 1 − r "
                 "over the training on each phase."
             )
-        online = np.array(
-            [visit.online_regret if _is_over(stream, visit) else None for visit in self.visits],
-            dtype=np.float64,
-        )
+        online = np.array([visit.online_regret for visit in self.visits], dtype=np.float64)
+        online[~_are_over(stream, self)] = np.nan
         transfer = metrics.learning_transfer(online, fresh)
         visits = [
             visit.model_copy(update={"learning_transfer": None if math.isnan(gain) else gain})
@@ -172,9 +171,31 @@ def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
     return np.asarray(v // len(ends) * stream.cycle_steps + ends[v % len(ends)])
 
 
-def _is_over(stream: StreamSpec, visit: VisitRegret) -> bool:
-    """Whether a visit's steps are those of its phase, but for an episode that is in no log."""
-    return visit.steps > stream.phases[visit.phase].steps - stream.horizon
+def _are_over(stream: StreamSpec, regret: DynamicRegret) -> npt.NDArray[np.bool_]:
+    """`[V]` whether the log reaches the end of each visit, but for an episode that is in no log.
+
+    That episode is shorter than T. Where it would be half of the visit or more, the visit is not
+    over.
+    """
+    steps = np.array([stream.phases[visit.phase].steps for visit in regret.visits])
+    missing = visit_ends(stream, len(steps)) - regret.lifetime[-1]
+    return np.asarray(missing < np.minimum(stream.horizon, steps / 2))
+
+
+def _refuse_other_visits(stream: StreamSpec, regret: DynamicRegret) -> None:
+    """Raise OptionError if a life in this stream has other visits after as many steps.
+
+    In an episode that goes on into another phase, its own may still be in force.
+    """
+    P, end = len(stream.phases), regret.lifetime[-1]
+    earliest, latest = visit_at(stream, np.array([max(0, end - stream.horizon), end - 1])) + 1
+    reached = len(regret.visits)
+    alike = all(visit.phase == visit.visit % P for visit in regret.visits)
+    if not alike or not earliest <= reached <= latest:
+        raise OptionError(
+            f"stream: is another one than that of this life, which has {reached} visits in "
+            f"{end:,} steps. Give the stream that the log is of."
+        )
 
 
 def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
@@ -186,7 +207,12 @@ def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
 
 
 def visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:
-    """`[N]` visits in force: the latest one of each row's phase that has begun."""
+    """`[N]` visits in force: the latest one of each row's phase that has begun.
+
+    An episode that is longer than all phases together may reach the next visit of its own phase;
+    rows of its later steps then count for that one, and a row of the whole episode for the one in
+    which it begins.
+    """
     phases = _column("phase", phase, len(visits)).astype(np.int64)
     P = len(stream.phases)
     in_force = visits - (visits - phases) % P
@@ -236,14 +262,15 @@ def _rows(
     return ends.astype(np.int64), lengths.astype(np.int64), means
 
 
-def _column(name: str, values: npt.ArrayLike, count: int) -> Array:
+def _column(name: str, values: npt.ArrayLike, count: int, of: str = "row") -> Array:
+    """`[count]` finite numbers, one for each of what `of` says; or, of rows, one for all."""
     try:
         array = np.asarray(values, dtype=np.float64)
-        if array.shape not in ((), (count,)):
+        if array.shape != (count,) and not (of == "row" and array.shape == ()):
             raise ValueError
     except (TypeError, ValueError):
         raise OptionError(
-            f"{name}={values!r:.60}: must be {count} numbers, one for each row."
+            f"{name}={values!r:.60}: must be {count} numbers, one for each {of}."
         ) from None
     array = np.broadcast_to(array, (count,))
     if not np.isfinite(array).all():

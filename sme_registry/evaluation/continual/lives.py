@@ -154,8 +154,8 @@ def _policies(
     """The policies of a life by their identity, prepared."""
     policies: dict[int, Policy] = {}
     for v, each in enumerate(life):
-        if isinstance(each, Real):
-            if not 0.0 <= float(each) <= 1.0:
+        if isinstance(each, Real | np.bool_):
+            if isinstance(each, bool | np.bool_) or not 0.0 <= float(each) <= 1.0:
                 raise OptionError(f"life[{v}]={each}: must be a policy, or a regret in [0, 1].")
         elif id(each) not in policies:
             policies[id(each)] = prepared(each, stream, f"life[{v}]", action_range, algorithm)

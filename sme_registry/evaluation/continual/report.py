@@ -314,8 +314,9 @@ def _fresh_regrets(
     Raises:
       OptionError: see `StreamReport.with_fresh`.
     """
-    if len(fresh) != len(tasks):
-        raise OptionError(f"fresh={len(fresh)} reports: must be {len(tasks)}, one for each phase.")
+    if not _are_reports(fresh) or len(fresh) != len(tasks):
+        given = f"{len(fresh)} reports" if _are_reports(fresh) else f"{fresh!r:.60}"
+        raise OptionError(f"fresh={given}: must be {len(tasks)} reports, one for each phase.")
     rows = []
     for phase, (report, task) in enumerate(zip(fresh, tasks, strict=True)):
         if isinstance(report, StreamReport):
@@ -332,6 +333,11 @@ def _fresh_regrets(
             )
         rows.append(row)
     return _and_shells(np.array(rows))
+
+
+def _are_reports(fresh: Any) -> bool:
+    kinds = EvaluationReport | StreamReport
+    return isinstance(fresh, Sequence) and all(isinstance(each, kinds) for each in fresh)
 
 
 def stream_regions(
