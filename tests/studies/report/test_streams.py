@@ -349,20 +349,75 @@ def test_forgetting_is_judged_by_its_interval_against_0(
     assert words in text
 
 
+Ends = tuple[float, ...]  # IQM, low, high
+
+
+def test_those_are_named_whose_interval_is_above_0_also_below_the_largest_value(
+    study: Path,
+) -> None:
+    forgetting = {"Tired": (0.5, -0.1, 1.1), "Forgetful": (0.3, 0.2, 0.4), "Stubborn": (0.1, 0, 0)}
+    found, text = with_metrics(study, "forgetting", forgetting, runs=5)
+    assert {stream.forgetting for stream in found.streams} == {"forgets"}
+    assert "no algorithm" not in text
+    assert (
+        "In Switch, Forgetful forgets: at the end of the life, performance on earlier phases is "
+        "0.30 below its best (95 % interval 0.20 to 0.40, 5 lives). The largest value, that of "
+        "Tired, is open: 0.50 (95 % interval −0.10 to 1.10, 5 lives)."
+    ) in text
+    forgetting["Tired"] = (0.5, 0.3, 0.6)
+    _, text = with_metrics(study, "forgetting", forgetting, runs=5)
+    assert "In Switch, Tired forgets" in text
+    assert "So does Forgetful: 0.30 (95 % interval 0.20 to 0.40, 5 lives)." in text
+
+
+def test_that_none_forgets_needs_enough_lives_of_each(study: Path) -> None:
+    below = (-0.2, -0.3, -0.1)
+    found, text = with_metrics(study, "forgetting", below, runs=2)
+    assert {stream.forgetting for stream in found.streams} == {"open"}
+    assert "no algorithm forgets" not in text
+    assert "no algorithm was shown to forget: no interval lies above 0" in text
+    found, _ = with_metrics(
+        study, "forgetting", {"Tired": below, "Forgetful": below, "Stubborn": (-0.5, -0.9, 0.1)}, 5
+    )
+    assert {stream.forgetting for stream in found.streams} == {"open"}
+
+
+def test_agents_that_learnt_nothing_are_not_said_to_forget_nothing(study: Path) -> None:
+    changed = changed_metrics(analysed(study), "visited_regret", (0.97, 0.95, 0.99), 5)
+    found, text = worded(changed_metrics(changed, "forgetting", (-0.2, -0.3, -0.1), 5))
+    assert {stream.forgetting for stream in found.streams} == {"unlearnt"}
+    assert "In Switch, no algorithm has learnt enough to forget anything." in text
+    found, _ = worded(changed_metrics(changed, "forgetting", (0.2, 0.1, 0.3), 5))
+    assert {stream.forgetting for stream in found.streams} == {"forgets"}
+
+
 def with_metrics(
-    study: Path, metric: str, interval: tuple[float, ...], runs: int
+    study: Path, metric: str, ends: Ends | dict[str, Ends], runs: int
 ) -> tuple[StreamFindings, str]:
     """The findings and their words, with other intervals of a metric."""
-    analysis = analysed(study)
+    return worded(changed_metrics(analysed(study), metric, ends, runs))
+
+
+def changed_metrics(
+    analysis: Analysis, metric: str, ends: Ends | dict[str, Ends], runs: int
+) -> Analysis:
+    """Tables with another IQM and interval of a metric, for all algorithms or by algorithm."""
     assert analysis.streams is not None
     rows = analysis.streams.metrics.copy()
-    rows.loc[rows.metric == metric, ["runs", "iqm", "low", "high"]] = runs, *interval
-    changed = dataclasses.replace(
+    for algorithm, each in (
+        ends if isinstance(ends, dict) else dict.fromkeys(AGENTS, ends)
+    ).items():
+        at = (rows.metric == metric) & (rows.algorithm == algorithm)
+        rows.loc[at, ["runs", "iqm", "low", "high"]] = runs, *each
+    return dataclasses.replace(
         analysis, streams=dataclasses.replace(analysis.streams, metrics=rows)
     )
-    found = findings(changed).streams
+
+
+def worded(analysis: Analysis) -> tuple[StreamFindings, str]:
+    found = findings(analysis).streams
     assert found is not None
-    return found, text_of(changed)
+    return found, text_of(analysis)
 
 
 # The report
@@ -383,6 +438,9 @@ def test_the_report_of_streams_alone_is_whole_and_the_same_each_time(
     assert "3 streams × 3 algorithms × 5 seeds: 120 of 120 runs have finished" in text
     assert "In Related, Tired forgets most: at the end of the life" in text
     assert "so the changes are those that relatedness makes" in text
+    assert "A ratio below 1 is better than a fresh agent’s." in text
+    assert "says nothing about plasticity" in text
+    assert "no matter of plasticity" not in text
     read = Findings.from_dict(read_json(tmp_path / "one" / "findings.json"), "findings.json")
     assert read.streams is not None
     assert [stream.class_name for stream in read.streams.streams] == [*STREAMS]

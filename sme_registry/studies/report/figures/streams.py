@@ -153,7 +153,7 @@ def _draw_plasticity(
         "Plasticity by visit",
         "Normalised regret on the phase just visited, divided by that of a fresh agent after as "
         f"many steps on that phase alone: above 1, plasticity was lost. {_INTERVAL} In its first "
-        "visit a life is a fresh agent itself: other values than 1 are no matter of plasticity.",
+        "visit a life is a fresh agent itself: other values than 1 say nothing about plasticity.",
         grid.files,
     )
 

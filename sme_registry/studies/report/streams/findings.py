@@ -24,6 +24,7 @@ UNLEARNT = DIAGNOSIS["unlearnt"]
 _CONTRASTED = ("forgetting", "plasticity_ratio", "forward_transfer", "learning_transfer")
 
 Verdict = Literal["above", "below", "open"]
+Forgetting = Literal["forgets", "indication", "open", "none", "unlearnt"]
 
 
 class LifeMetric(StrictModel):
@@ -64,12 +65,13 @@ class Difference(StrictModel):
 
 
 class StreamFinding(StrictModel):
-    """A stream: the lives of each algorithm, and which of them forgets most."""
+    """A stream: the lives of each algorithm, and which of them forget."""
 
     class_name: str
     lives: TupleOf[LifeFinding]  # by forgetting, the most first
-    # The first one's verdict: "forgets"; or "open" or "none" if not even its interval is above 0.
-    forgetting: Literal["forgets", "indication", "open", "none"]
+    # Whether any of them forgets. If not: "none" if that was shown for each of them, and "unlearnt"
+    # if none learnt anything that it could forget.
+    forgetting: Forgetting
     rivals: TupleOf[Difference]  # the others with paired lives
     without_fresh: Integer  # lives without all of their fresh agents
     single_visit: bool  # a life has one, so it is a fresh agent itself and has no plasticity
@@ -135,7 +137,7 @@ def _stream(streams: StreamAnalysis, name: str) -> StreamFinding:
     return StreamFinding(
         class_name=name,
         lives=tuple(lives),
-        forgetting=_forgets(lives[0].forgetting),
+        forgetting=_forgets(lives),
         rivals=tuple(_rivals(streams, name, lives)),
         without_fresh=sum(life.fresh_agents < len(life.planned.cell.fresh) for life in lived),
         single_visit=streams.classes[name].stream.visits == 1,
@@ -146,12 +148,20 @@ def _forgotten(life: LifeFinding) -> float:
     return -math.inf if life.forgetting is None else life.forgetting.value
 
 
-def _forgets(metric: LifeMetric | None) -> Literal["forgets", "indication", "open", "none"]:
-    if metric is None or metric.verdict == "below":
-        return "none"
-    if metric.verdict == "open":
-        return "none" if metric.low == metric.high == 0.0 else "open"
-    return "forgets" if metric.enough_runs else "indication"
+def _forgets(lives: list[LifeFinding]) -> Forgetting:
+    found = [life.forgetting for life in lives if life.forgetting is not None]
+    above = [metric for metric in found if metric.verdict == "above"]
+    if above:
+        return "forgets" if any(metric.enough_runs for metric in above) else "indication"
+    if found and all(life.unlearnt for life in lives):
+        return "unlearnt"
+    return "none" if all(map(_is_none, found)) else "open"
+
+
+def _is_none(metric: LifeMetric) -> bool:
+    """Whether a life was shown to forget nothing."""
+    nothing = metric.verdict == "below" or metric.low == metric.high == 0.0
+    return metric.enough_runs and nothing
 
 
 def _life(streams: StreamAnalysis, name: str, algorithm: str) -> LifeFinding | None:

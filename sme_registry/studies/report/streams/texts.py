@@ -85,8 +85,8 @@ def _metrics(streams: StreamAnalysis, name: str) -> TextTable:
         "IQM over lives, with its 95 % bootstrap interval, at the end of the life; the regret on "
         "the visited phase is a mean over visits, plasticity and learning transfer over those "
         "after visit 0, in which a life is a fresh agent itself. Performance is 1 − normalised "
-        "regret: 1 for the optimum, 0 for the constant ½. Below 1, a plasticity ratio is better "
-        "than a fresh agent. The last columns are agents that need no training.",
+        "regret: 1 for the optimum, 0 for the constant ½. A ratio below 1 is better than a "
+        "fresh agent’s. The last columns are agents that need no training.",
         frame,
         names=2,
     )
