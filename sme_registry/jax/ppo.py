@@ -388,6 +388,8 @@ def _latent(settings: PPO, weights: Weights, network: str, observation: jax.Arra
 class PPOProgram(Program):
     """Lanes of PPO; see `Program`."""
 
+    actor = ("mlp_extractor.policy_net.", "action_net.")
+
     def __init__(self, settings: PPO, *arguments: Any, **options: Any) -> None:
         self.rollout = settings.n_steps
         super().__init__(settings, *arguments, **options)

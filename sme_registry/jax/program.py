@@ -101,6 +101,9 @@ class Program(ABC):
     buffer = ""
     """The field of the state that is a replay buffer, `[capacity, ...]`: longer for more steps."""
 
+    actor: tuple[str, ...] = ("actor.",)
+    """How the names of the weights begin that `act` reads."""
+
     rollout = 1
     """Steps between two updates: an evaluation due in them has the weights before the second."""
 

@@ -12,7 +12,7 @@ pytest.importorskip("jax")
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.jax.program import Evaluation, Program, StepLog
-from sme_registry.jax.run import new_program, run
+from sme_registry.jax.run import ALGORITHMS, new_program, run, settings_of
 from sme_registry.spec import StreamSpec
 
 SPECS = (SMESpec(state_dim=2), SMESpec(state_dim=1))
@@ -183,3 +183,15 @@ def test_a_program_of_invalid_lanes_is_refused(change: dict[str, Any], message: 
     arguments = {"specs": SPECS, "seeds": (0, 1), "steps": 10, **change}
     with pytest.raises(OptionError, match=message):
         new_program("jax:PPO", **arguments)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_actor_of_each_algorithm_is_all_that_acts(name: str) -> None:
+    _, program = ALGORITHMS[name]
+    settings = settings_of(f"jax:{name}", {"policy_kwargs": {"net_arch": [3]}})
+    weights = program.initial_weights(settings, np.random.default_rng(0), 4, 2)
+    actor = {each: weights[each] for each in weights if each.startswith(program.actor)}
+    observations = np.linspace(0.0, 1.0, 8, dtype=np.float32).reshape(2, 4)
+    expected, actions = (program.act(settings, w, observations, True) for w in (weights, actor))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(actions, expected)
+    assert not [each for each in actor if "critic" in each or "value" in each or "target" in each]

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from sme_registry.jax.program import Evaluation, StepLog
 
 _PROGRAM, _RECORDS = "program/", "records/"  # prefixes of arrays in a state
-_SNAPSHOT = "snapshot/"  # prefix of the records of lives: the weights before training and of visits
+_SNAPSHOT = "snapshot/"  # prefix of the records of lives: weights before training and of visits
 
 
 class Ended(NamedTuple):
@@ -99,19 +99,21 @@ def run_lanes(
         exist here, or a model cannot be kept.
       SpecError: JAX does not have one of the tasks.
     """
-    run = _Run(cells, lanes, progress)
+    run = _Run(cells, lanes, progress, keep_models)
     if keep_models:
         _new_model(cells[0])  # what Stable-Baselines3 refuses is refused before the training
     run.train()
-    yield from run.results(keep_models)
+    yield from run.results()
 
 
 class _Run:
     """A program, the cells of its lanes, and the records of what they did."""
 
-    def __init__(self, cells: Sequence[Cell], lanes: Lanes, progress: Report) -> None:
+    def __init__(
+        self, cells: Sequence[Cell], lanes: Lanes, progress: Report, keep_models: bool
+    ) -> None:
         cell = self._cell = cells[0]
-        self._lanes, self._progress = lanes, progress
+        self._lanes, self._progress, self._keep_models = lanes, progress, keep_models
         self._own = {cell.digest: cell for cell in cells}
         self._cells = lanes.cells or tuple(cells)
         self._keys = [each.digest for each in self._cells]
@@ -152,7 +154,7 @@ class _Run:
         )
         self._note_failures()
 
-    def results(self, keep_models: bool) -> Iterator[Ended]:
+    def results(self) -> Iterator[Ended]:
         """Evaluate the trained policies within and out of distribution.
 
         Those with tasks of the same draw are evaluated together, which is faster; each life alone.
@@ -170,15 +172,9 @@ class _Run:
         evaluated = _evaluate(groups, self._lanes.processes)
         for group, (reports, seconds) in zip(draws.values(), evaluated, strict=True):
             for lane, report in zip(group, reports, strict=True):
-                yield self._ended(lane, report, seconds / len(group), keep_models)
+                yield self._ended(lane, report, seconds / len(group))
 
-    def _ended(
-        self,
-        lane: int,
-        report: _Report | PolicyError,
-        seconds: float,
-        keep_models: bool,
-    ) -> Ended:
+    def _ended(self, lane: int, report: _Report | PolicyError, seconds: float) -> Ended:
         cell = self._cells[lane]
         if isinstance(report, PolicyError):
             return Ended(cell, report)
@@ -192,7 +188,7 @@ class _Run:
             timing=self._timing(seconds),
             versions=versions_for(cell.uses),
         )
-        if not keep_models:
+        if not self._keep_models:
             return Ended(cell, result)
         return Ended(cell, result, self._model(lane), self._snapshots(lane))
 
@@ -203,7 +199,10 @@ class _Run:
         return _Trained(cell, self._weights_of_life(lane), self._blocks.dynamic_regret(lane))
 
     def _begin_lives(self) -> None:
-        """Records of lives, which hold the weights of visits for as long as the program runs."""
+        """Records of lives, which hold the weights of visits for as long as the program runs.
+
+        Those of the actor are enough to evaluate a visit; a model that is kept has all of them.
+        """
         stream = self._cell.stream
         self._blocks = None if stream is None else RegretBlocks(stream, self._lanes.count)
         if stream is None or self._blocks is None:
@@ -212,14 +211,16 @@ class _Run:
         snapshots = stream.visits + 1
         for lane in range(len(self._cells)):
             for name, weight in self._program.weights(lane).items():
+                if not (self._keep_models or name.startswith(self._program.actor)):
+                    continue
                 kept = np.zeros((snapshots, *weight.shape), weight.dtype)
                 kept[0] = weight
                 self._records[f"{_SNAPSHOT}{lane}/{name}"] = kept
 
     def _on_visit(self, visit: int, weights: list[Arrays]) -> None:
         for lane, own in enumerate(weights):
-            for name, weight in own.items():
-                self._records[f"{_SNAPSHOT}{lane}/{name}"][visit + 1] = weight
+            for name, kept in _named(self._records, f"{_SNAPSHOT}{lane}/").items():
+                kept[visit + 1] = own[name]
 
     def _weights_of_life(self, lane: int) -> list[Arrays]:
         """A lane's weights before training, and at the end of each visit."""
@@ -336,10 +337,13 @@ class _Run:
         if state is None or read_header(state) != json.loads(to_json(self._header())):
             return
         arrays = read_state(state)
-        records = _named(arrays, _RECORDS)
+        # A program that kept models has more weights of visits than one that keeps none.
+        records = {n: a for n, a in _named(arrays, _RECORDS).items() if n in self._records}
         try:
             if _forms(records) != _forms(self._records):
-                raise OptionError("its records of the lanes are missing or others.")
+                raise OptionError(
+                    "its records of the lanes are missing or others, or of lives without models."
+                )
             self._program.restore(_named(arrays, _PROGRAM))
         except OptionError as error:
             self._progress(0, self._cell.steps, 0, f"starts again, without {state}: {error}")

@@ -23,8 +23,9 @@ from sme_registry.studies.engine import lanes
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
 from sme_registry.studies.engine.estimate import Estimator
-from sme_registry.studies.engine.jobs import Programs
+from sme_registry.studies.engine.jobs import Lanes, Programs
 from sme_registry.studies.engine.ledger import Ledger
+from sme_registry.studies.engine.program_state import read_state
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.studies.engine.status import label, study_status
@@ -409,3 +410,51 @@ def test_after_kill_9_lives_in_jax_go_on_with_the_weights_of_their_visits(tmp_pa
         assert [visit.steps for visit in regret.visits] == [32, 32]
         assert regret.online_regret == pytest.approx(result.online_regret)
         assert result.curve.steps == (16, 32, 48, 64)
+
+
+class Interrupted(Exception):
+    """At the end of the last visit."""
+
+
+@pytest.mark.parametrize(
+    ("kept_before", "kept_after", "lived_after"),
+    [(False, False, [1]), (True, False, [1]), (False, True, [0, 1])],
+)
+def test_the_state_of_lives_in_jax_has_the_weights_that_its_reports_or_models_need(
+    kept_before: bool, kept_after: bool, lived_after: list[int], tmp_path: Path
+) -> None:
+    pytest.importorskip("jax")
+    cells = [place.cell for place in jax_file().plan.cells if place.cell.stream]
+    program = Lanes(2, state=tmp_path / "state.npz")
+    ended: list[int] = []
+    notes: list[str] = []
+    original = lanes._Run._on_visit
+
+    def on_visit(run: Any, visit: int, weights: Any) -> None:
+        ended.append(visit)
+        original(run, visit, weights)
+        if visit == 1 and ended == [0, 1] and not notes:
+            raise Interrupted
+
+    def report(done: int, total: int, compilations: int = 0, note: str = "", /) -> None:
+        notes.extend([note] if note else [])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lanes, "SECONDS_BETWEEN_STATES", 0.0)
+        patch.setattr(lanes._Run, "_on_visit", on_visit)
+        with pytest.raises(Interrupted):
+            list(lanes.run_lanes(cells, program, report, kept_before))
+        prefix = "records/snapshot/1/"
+        names = {n.removeprefix(prefix) for n in read_state(tmp_path / "state.npz") if prefix in n}
+        assert {"action_net.bias", "mlp_extractor.policy_net.0.weight"} <= names
+        assert ("value_net.bias" in names) is kept_before
+        ended.clear()
+        (tmp_path / "state.npz").replace(tmp_path / "again.npz")
+        program = Lanes(2, state=tmp_path / "again.npz")
+        finished = list(lanes.run_lanes(cells, program, report, kept_after))
+    assert ended == lived_after
+    assert any("starts again" in note for note in notes) is (lived_after == [0, 1])
+    for each in finished:
+        assert isinstance(each.ended, CellResult)
+        assert len(each.snapshots) == (3 if kept_after else 0)
+        assert len({*matrix(each.ended.stream_report)[:, 0]}) == 2
