@@ -88,9 +88,10 @@ def evaluate(
     the agent's r_cum/k, and its one-hot index. It returns `[B, C]`, C being the most channels that
     an agent owns. The report then includes each agent.
 
-    On a stream, give the policy at the end of each visit, or one policy for the whole life, which
-    then learns nothing: its dynamic regret is reported as well. A reference policy, such as linear,
-    is that of phase 0.
+    On a stream, give the policy at the end of each visit, or one policy for the whole life. That
+    one learns nothing, and its expected dynamic regret is reported as well. On a stream with a
+    single visit, a policy is taken for one that learns nothing: what its training cost is in the
+    stream.json of sme train. A reference policy, such as linear, is that of phase 0.
 
     Examples:
 

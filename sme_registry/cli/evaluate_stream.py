@@ -19,7 +19,7 @@ class Life(NamedTuple):
     """The policies of a life, as the command line has them.
 
     Attributes:
-      policies: at the end of each visit; or one, which acts for the whole life.
+      policies: at the end of each visit; or one, which acts for the whole life and learns nothing.
       initial: before training.
       fresh: of an agent for each phase, trained on that phase alone.
       action_range: of all of them, as in `evaluate`.

@@ -168,7 +168,8 @@ class StreamReport(ReportFile):
       visits: in order.
       regions: WD, then OOD 1, 2, …
       ood: the mean of the matrices over the shells.
-      dynamic_regret: of training; None without its log.
+      dynamic_regret: of training; of a life in which nobody learns, as `sme evaluate` has it, that
+        which is expected; None without either.
       reference_regret: the dynamic regret of reference agents, by their names in `LABELS`; left out
         of the JSON where there is none.
       versions: of Python and the packages that the numbers depend on.
