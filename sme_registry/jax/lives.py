@@ -11,9 +11,7 @@ switch, which `Lives` checks.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
 from typing import Any
 
 import jax
@@ -55,8 +53,7 @@ class Lives:
         self._stream = first if isinstance(first, StreamSpec) else None
         if self._stream is not None:
             check_switches(self._stream)
-        self._ends = [*accumulate(phase.steps for phase in self._phases)]
-        self.phases = len(self._ends) if self._stream and self._stream.observes_phase else 0
+        self.phases = 0 if self._stream is None else self._stream.observed_phases
         drawn = {lane: _tasks(lane) for lane in lanes}
         pieces = [*zip(*(drawn[lane] for lane in lanes), strict=True)]
         specs = {task.spec for tasks in pieces for task in tasks}
@@ -83,27 +80,15 @@ class Lives:
         return self.at(lifetime if at_once else lifetime - 1).phase
 
     def visit_ends(self, after: int) -> Iterator[tuple[int, int]]:
-        """Visits of phases that end later than a step: the index of each in the life, and its end.
-
-        Visit v is of phase v mod P, in cycle v div P.
-        """
-        if self._stream is None:
-            return
-        P, length = len(self._ends), self._stream.cycle_steps
-        first = after // length * P + bisect_right(self._ends, after % length)
-        for visit in range(first, P * self._stream.cycles):
-            yield visit, visit // P * length + self._ends[visit % P]
+        """See `StreamSpec.visit_ends`; without a stream there are none."""
+        return iter(()) if self._stream is None else self._stream.visit_ends(after)
 
     @property
     def last_visit(self) -> tuple[int, int] | None:
         """The last visit, and the step after which its phase goes on; None without a stream."""
         if self._stream is None:
             return None
-        return len(self._ends) * self._stream.cycles - 1, self._stream.steps
-
-    @property
-    def _phases(self) -> Sequence[Any]:
-        return self._stream.phases if self._stream else ()
+        return self._stream.visits - 1, self._stream.steps
 
     def _in_phase(self, piece: int, params: TaskParams) -> TaskParams:
         if self._stream is None or not self.phases:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_right
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import accumulate
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeAlias
@@ -259,6 +260,20 @@ class StreamSpec(NamedDocument):
     def next_switch(self, lifetime: int) -> int | None:
         """The lifetime at which the piece in force is over; None in the last piece of the life."""
         return self.schedule.next_switch(lifetime)
+
+    def visit_ends(self, after: int = 0) -> Iterator[tuple[int, int]]:
+        """Visits of phases that end later than a lifetime: the index of each, and its end.
+
+        Visit v is of phase v mod P, in cycle v div P. The last one goes on at its end.
+
+        Args:
+          after: environment steps since the life began, at least 0.
+        """
+        ends, length = [*accumulate(phase.steps for phase in self.phases)], self.cycle_steps
+        P = len(ends)
+        first = after // length * P + bisect_right(ends, after % length)
+        for visit in range(first, self.visits):
+            yield visit, visit // P * length + ends[visit % P]
 
     def draw(self, number: int) -> StreamSpec:
         """The same stream with other tasks: number · 10⁶ is added to the seed of every phase.

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sme_registry.evaluation.continual.dynamic_regret import visit_ends
 from sme_registry.spec import StreamSpec
 
 
@@ -28,9 +27,9 @@ class VisitEnds:
     def __init__(
         self, stream: StreamSpec, on_visit: Callable[[int], object], steps: int = 0
     ) -> None:
-        *ends, end = visit_ends(stream, stream.visits).tolist()
-        self._upcoming = [(visit, end) for visit, end in enumerate(ends) if end >= steps]
-        self._last, self._on_visit = (len(ends), end), on_visit
+        *upcoming, self._last = stream.visit_ends()
+        self._upcoming = [(visit, end) for visit, end in upcoming if end >= steps]
+        self._on_visit = on_visit
 
     def after_step(self, steps: int) -> None:
         """Count a step; `steps` are all that were taken, and the learner has not learned since."""

@@ -89,6 +89,18 @@ def test_the_piece_in_force_is_the_one_whose_steps_include_the_lifetime(spec, da
     assert switch == (boundaries[0] if boundaries else None)
 
 
+@given(streams())
+def test_visits_end_where_their_phases_do(spec):
+    ends = [end for _, end in spec.visit_ends()]
+    assert [visit for visit, _ in spec.visit_ends()] == [*range(spec.visits)]
+    for visit, (begin, end) in enumerate(pairwise([0, *ends])):
+        for lifetime in (begin, end - 1):
+            assert spec.pieces[spec.piece_at(lifetime)].phase == visit % len(spec.phases)
+            assert next(spec.visit_ends(lifetime)) == (visit, end)
+    assert ends[-1] == spec.steps
+    assert [*spec.visit_ends(spec.steps)] == []
+
+
 @given(streams(), st.integers(0, 5))
 def test_the_draws_of_a_stream_are_one_family(spec, number):
     drawn = spec.draw(number)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import islice, takewhile
 from typing import Any, Self
 
 import numpy as np
@@ -166,9 +167,7 @@ def dynamic_regret(
 
 def visit_ends(stream: StreamSpec, visits: int) -> _Integers:
     """`[V]` the lifetime at which each of the first visits is over."""
-    ends = np.cumsum([phase.steps for phase in stream.phases])
-    v = np.arange(visits)
-    return np.asarray(v // len(ends) * stream.cycle_steps + ends[v % len(ends)])
+    return np.array([end for _, end in islice(stream.visit_ends(), visits)], dtype=np.int64)
 
 
 def _are_over(stream: StreamSpec, regret: DynamicRegret) -> npt.NDArray[np.bool_]:
@@ -200,10 +199,9 @@ def _refuse_other_visits(stream: StreamSpec, regret: DynamicRegret) -> None:
 
 def visit_at(stream: StreamSpec, lifetime: _Integers) -> _Integers:
     """`[N]` the visits to which lifetimes belong; the last visit goes on at the end."""
-    ends = np.cumsum([phase.steps for phase in stream.phases])
-    cycle, inside = np.divmod(lifetime, stream.cycle_steps)
-    visits = cycle * len(ends) + np.searchsorted(ends, inside, side="right")
-    return np.asarray(np.minimum(visits, stream.cycles * len(ends) - 1))
+    latest = lifetime.max()
+    over = [*takewhile(lambda end: end <= latest, (end for _, end in stream.visit_ends()))]
+    return np.minimum(np.searchsorted(over, lifetime, side="right"), stream.visits - 1)
 
 
 def visits_in_force(stream: StreamSpec, visits: _Integers, phase: npt.ArrayLike) -> _Integers:

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sme_registry.evaluation.continual.dynamic_regret import visit_ends
 from sme_registry.evaluation.continual.report import StreamReport, Visit, stream_regions
 from sme_registry.evaluation.continual.retention import (
     Subject,
@@ -119,8 +118,8 @@ def evaluate_stream(
         protocol=protocol,
         protocol_digest=protocol.digest,
         visits=tuple(
-            Visit(visit=v, cycle=v // P, phase=v % P, lifetime=int(end), spec_digest=digests[v % P])
-            for v, end in enumerate(visit_ends(stream, V))
+            Visit(visit=v, cycle=v // P, phase=v % P, lifetime=end, spec_digest=digests[v % P])
+            for v, end in stream.visit_ends()
         ),
         regions=regions,
         ood=ood,

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from sme_registry.evaluation.continual.dynamic_regret import (
     DynamicRegret,
     dynamic_regret,
-    visit_at,
     visit_ends,
     visits_in_force,
 )
@@ -42,7 +41,7 @@ class RegretBlocks:
         ends = visit_ends(stream, visits)
         begins = np.concatenate([[0], ends[:-1]])
         each = np.minimum(ends - begins, max(1, _BLOCKS // visits))
-        self._stream = stream
+        self._stream, self._visit_ends = stream, ends
         self._ends: _Integers = np.concatenate(
             [
                 begin + (end - begin) * np.arange(1, n + 1) // n
@@ -63,7 +62,7 @@ class RegretBlocks:
         """
         before = end - len(regret) + np.arange(len(regret))
         blocks = np.searchsorted(self._ends, before, side="right")
-        visits = visit_at(self._stream, before)
+        visits = np.searchsorted(self._visit_ends[:-1], before, side="right")
         if phase is not None:
             visits = visits_in_force(self._stream, visits, phase)
         # What a phase that is over still gets counts in its last block, and so what follows a life.

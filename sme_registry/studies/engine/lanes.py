@@ -24,7 +24,6 @@ import numpy as np
 from sme_registry.errors import OptionError, PolicyError
 from sme_registry.evaluation import EvaluationReport, StreamReport, as_policy, evaluate_many
 from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
-from sme_registry.evaluation.continual.dynamic_regret import visit_ends
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
 from sme_registry.io import Arrays, to_json
@@ -295,8 +294,8 @@ class _Run:
         if cell.stream is None:
             return {}
         files, model = Snapshots(Path(), cell.stream), _new_model(cell)
-        ends = visit_ends(cell.stream, len(files.visits)).tolist()
-        steps = [0, *ends[:-1], self._program.steps]
+        *ends, _ = (end for _, end in cell.stream.visit_ends())
+        steps = [0, *ends, self._program.steps]
         weights = self._weights_of_life(lane)
         snapshots = {}
         for path, own, trained in zip([files.initial, *files.visits], weights, steps, strict=True):
