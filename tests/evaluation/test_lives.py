@@ -191,6 +191,8 @@ def test_a_report_has_the_regret_of_reference_agents(tmp_path):
     assert StreamReport.read(report.write(tmp_path / "stream.json")) == report
 
     text = str(report)
+    (steps,) = (line.split() for line in text.splitlines() if line.lstrip().startswith("steps"))
+    assert steps == ["steps", "150", *["200"] * 4]  # sums over different steps are no comparison
     for value in (0.75, -0.5, references["frozen_optimum"].visits[1].online_regret):
         assert f" {value:.3f}" in text
     assert f"{references['constant_half'].dynamic_regret:,.1f}" in text

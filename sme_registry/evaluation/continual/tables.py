@@ -81,6 +81,8 @@ def of_regret(report: StreamReport) -> Table:
         table.add_row(label, *_cells(each[v] if v < len(each) else None for each in columns))
     table.add_section()
     table.add_row("whole life", *_cells(ends), style="bold")
+    # Of training they can differ from the stream's: whole rollouts, or an unfinished episode.
+    table.add_row("steps", *(f"{life.steps:,}" for life in lives.values()))
     sums = [f"{life.dynamic_regret:,.1f}" for life in lives.values()]
     table.add_row("dynamic regret (sum)", *sums)
     return table
