@@ -37,6 +37,7 @@ QUANTITIES = {
     "plasticity_difference": "their difference",
     "learning_transfer": "online regret of a visit below a fresh agent's, as a share of the latter",
     "fresh_online_regret": "online regret of an agent trained on a phase alone",
+    "frozen_online_regret": "online regret of an agent that stops learning after its first visit",
     "dynamic_regret": "Σ of regret over a lifetime, or over a visit",
     "cumulative_regret": "Σ of regret until a lifetime",
     "lifetime": "environment steps of a life",

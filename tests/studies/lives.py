@@ -17,7 +17,12 @@ from typing import Any
 import numpy as np
 
 from sme_registry import materialize
-from sme_registry.evaluation import dynamic_regret, evaluate, evaluate_stream
+from sme_registry.evaluation import (
+    dynamic_regret,
+    evaluate,
+    evaluate_stream,
+    reference_regret,
+)
 from sme_registry.evaluation.continual.retention import final_specs
 from sme_registry.spec import Cell, SMESpec, StreamSpec, StudyFile, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
@@ -93,7 +98,9 @@ def lived(cell: Cell, key: str) -> CellResult:
         return CellResult(report=report, **common)
     life = evaluate_stream(policies, document, cell.protocol, initial="constant", name="agent")
     log = dynamic_regret(document, steps, regrets, 10)
-    return CellResult(stream_report=life.with_dynamic_regret(log), **common)
+    references = reference_regret(document, frozen=policies[0], training=log, episodes=20)
+    life = life.with_dynamic_regret(log).with_reference_regret(references)
+    return CellResult(stream_report=life, **common)
 
 
 def _share(cell: Cell, visit: int, *, alone: bool) -> float:

@@ -23,7 +23,7 @@ from sme_registry.studies.engine.result import CellFailure
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.findings import Findings, findings
 from sme_registry.studies.report.frames import plan_file
-from sme_registry.studies.report.streams import frames
+from sme_registry.studies.report.streams import frames, tables
 from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.findings import StreamFinding, StreamFindings
 from tests.studies.lives import AGENTS, STREAMS, TASK, live, stream_study
@@ -251,6 +251,43 @@ def test_a_regret_curve_ends_at_the_dynamic_regret_next_to_that_of_fresh_agents(
             assert at_switch.iloc[0] == pytest.approx(100 * first.median())
 
 
+def test_a_life_is_beside_the_same_agent_that_stopped_learning_after_visit_0(study: Path) -> None:
+    streams = streams_of(study)
+    for (name, algorithm), curve in streams.regret.groupby(["class_name", "algorithm"]):
+        frozen = [
+            life.report.reference_regret["frozen_agent"] for life in streams.lives
+            if (life.planned.class_name, life.planned.algorithm) == (name, algorithm)
+        ]  # fmt: skip
+        own = {"class_name": name, "algorithm": algorithm, "metric": "frozen_online_regret"}
+        (row,) = within(streams.metrics, **own).itertuples()
+        assert row.iqm == pytest.approx(trim_mean([log.online_regret for log in frozen], 0.25))
+        assert row.low <= row.iqm <= row.high
+        last = np.median([log.dynamic_regret for log in frozen])
+        assert curve.frozen.iloc[-1] == pytest.approx(last)
+        (row,) = within(streams.visit_metrics, visit=1, **own).itertuples()
+        visits = [log.visits[1].online_regret for log in frozen]
+        assert row.iqm == pytest.approx(trim_mean(visits, 0.25))
+
+
+def test_reference_agents_are_those_that_lives_recorded_and_else_computed(study: Path) -> None:
+    lives = streams_of(study).lives
+    costs = tables.reference_costs(lives)
+    for (name, reference), logs in costs.items():
+        own = [life.report for life in lives if life.planned.class_name == name]
+        recorded = {each.stream_digest: each.reference_regret[reference] for each in own}
+        assert logs == [*recorded.values()]
+    old = [
+        life._replace(report=life.report.model_copy(update={"reference_regret": {}}))
+        for life in lives
+    ]
+    computed = tables.reference_costs(old)
+    assert computed.keys() == costs.keys()
+    for place, logs in computed.items():
+        for mine, theirs in zip(logs, costs[place], strict=True):
+            assert mine.online_regret == pytest.approx(theirs.online_regret, abs=0.1)
+    assert tables.regret(old).frozen.isna().all()
+
+
 def test_what_is_missing_is_counted_and_leaves_plasticity_unknown(gaps: Path) -> None:
     streams = streams_of(gaps)
     counts = streams.counts.set_index(["class_name", "algorithm"])
@@ -438,15 +475,16 @@ def test_the_report_of_streams_alone_is_whole_and_the_same_each_time(
     assert "3 streams × 3 algorithms × 5 seeds: 120 of 120 runs have finished" in text
     assert "In Related, Tired forgets most: at the end of the life" in text
     assert "so the changes are those that relatedness makes" in text
+    assert "online regret, frozen after visit 0" in text
     assert "A ratio below 1 is better than a fresh agent’s." in text
     assert "says nothing about plasticity" in text
     assert "no matter of plasticity" not in text
     read = Findings.from_dict(read_json(tmp_path / "one" / "findings.json"), "findings.json")
     assert read.streams is not None
     assert [stream.class_name for stream in read.streams.streams] == [*STREAMS]
-    tables = {path.stem for path in files if path.suffix == ".csv"}
-    assert "stream_lives" in tables
-    assert "results" not in tables
+    written = {path.stem for path in files if path.suffix == ".csv"}
+    assert "stream_lives" in written
+    assert "results" not in written
     for path in files:
         if path.suffix == ".tex":
             assert path.read_text().isascii()
@@ -466,6 +504,7 @@ def test_every_figure_is_readable_and_shows_every_agent(study: Path, figures: li
     for name in ("stream-metrics", "stream-regret", "stream-plasticity"):
         labels = [text.get_text() for text in drawn[name].legends[0].get_texts()]
         assert labels[:3] == [*AGENTS]
+        assert ("frozen after visit 0" in labels) == (name == "stream-regret")
     for name in ("stream-metrics", "stream-regret", "stream-plasticity", "stream-learning-curves"):
         lines = [line for line in drawn[name].axes[0].lines if len(line.get_xdata())]
         assert {line.get_color() for line in lines} >= set(COLOURS[: len(AGENTS)]), name

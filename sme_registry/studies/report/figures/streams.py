@@ -37,7 +37,10 @@ _INTERVAL = (
     "IQM over lives with its 95 % bootstrap interval, within distribution. "
     f"Hollow: fewer than {ENOUGH_RUNS} lives, so that the interval is an indication only."
 )
-_FRESH = Look(GREY, "", (0, (5, 1.2, 1, 1.2)))
+_BESIDE = {  # a life, in the colour of its algorithm
+    "fresh": ("fresh agents", Look(GREY, "", (0, (5, 1.2, 1, 1.2)))),
+    "frozen": (LABELS["frozen_agent"], Look(GREY, "", (0, (2.5, 1.2)))),
+}
 _REFERENCES = {
     "frozen_optimum": Look(GREY, "", (0, (1, 1.2))),
     "constant_half": CONSTANT,
@@ -98,8 +101,9 @@ def _draw_regret(
             rows = streams.regret[streams.regret.class_name == name]
             for algorithm, look in looks.items():
                 curve = rows[rows.algorithm == algorithm]
-                fresh = look._replace(marker="", dash=_FRESH.dash)
-                axes.plot(curve.lifetime, curve.fresh, **fresh.line, linewidth=1.1, zorder=2.5)
+                for column, (_, beside) in _BESIDE.items():
+                    line = look._replace(marker="", dash=beside.dash).line
+                    axes.plot(curve.lifetime, curve[column], **line, linewidth=1.1, zorder=2.5)
             _draw_lines(axes, rows, "lifetime", looks)
             for reference, curve in references[references.class_name == name].groupby("reference"):
                 look = _REFERENCES[str(reference)]
@@ -107,19 +111,24 @@ def _draw_regret(
             _finish_lifetime(axes, streams, name)
             axes.yaxis.set_major_formatter(step_text)
         grid.label_rows("dynamic regret  (Σ of 1 − r)")
-        any_fresh = streams.regret.fresh.notna().any()
-        fresh_look = {"fresh agents": _FRESH} if any_fresh else {}
+        known = {column for column in _BESIDE if streams.regret[column].notna().any()}
+        beside_looks = dict(_BESIDE[column] for column in _BESIDE if column in known)
         drawn = {LABELS[name]: look for name, look in _REFERENCES.items()
                  if name in set(references.reference)}  # fmt: skip
-        panels.legend(grid.figure, {**looks, **fresh_look, **drawn})
+        panels.legend(grid.figure, {**looks, **beside_looks, **drawn})
     caption = (
         f"{_QUARTILES} The regret of every step, summed over the lifetime; shades and numbers "
     )
     caption += "above are visits and their phases. Grey: agents that need no training."
-    if any_fresh:
+    if "fresh" in known:
         caption += (
             " Dash-dotted, in the colour of the algorithm: agents that start anew in each visit, "
             "spread evenly over it. A life below that line learns faster than fresh agents."
+        )
+    if "frozen" in known:
+        caption += (
+            " Dashed, in the colour of the algorithm: the same agents if they stop learning after "
+            "visit 0. A life above that line lost by learning on."
         )
     return Picture("stream-regret", "Dynamic regret", caption, grid.files)
 

@@ -24,6 +24,8 @@ Columns of the life, repeated in each of its regions; NaN where it has no such n
     learning_transfer            1 − online regret / that of the fresh agents, mean over visits ≥ 1
     online_regret                mean of 1 − step reward over the life, in [0, 1]
     dynamic_regret               its sum
+    frozen_online_regret         online regret of the same agent if it stops learning after visit 0,
+                                 in expectation
     uses, action_range, steps    the algorithm, its action range, environment steps of the life
     state_dim, action_dim, horizon   of every phase
     stream_digest, seed          the stream's digest; the seed of training
@@ -40,8 +42,8 @@ Columns of the life, repeated in each of its regions; NaN where it has no such n
     normalised_regret            on the phase just visited
     fresh_normalised_regret      that of the phase's fresh agent
     average_performance, backward_transfer, forgetting, plasticity_ratio, plasticity_difference
-    online_regret, dynamic_regret, fresh_online_regret, learning_transfer   of the visit's training,
-                                 repeated in each region
+    online_regret, dynamic_regret, frozen_online_regret, fresh_online_regret, learning_transfer
+                                 of the visit's training, repeated in each region
 
 `retention`: the retention matrices, one row per life, region, visit and phase.
 
@@ -85,12 +87,12 @@ _BY_VISIT = (
     "plasticity_difference",
 )  # fmt: skip
 _LIVES = f"""{RUN_COLUMNS} region:str epsilon_low epsilon_high states:int64 visited_regret
-    {" ".join(_OF_LIFE)} learning_transfer online_regret dynamic_regret uses:str action_range:str
-    steps:int64 state_dim:int64 action_dim:int64 horizon:int64 stream_digest:str seed:int64
-    fresh_agents:int64 seconds steps_per_second key:str"""
+    {" ".join(_OF_LIFE)} learning_transfer online_regret dynamic_regret frozen_online_regret
+    uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64 horizon:int64
+    stream_digest:str seed:int64 fresh_agents:int64 seconds steps_per_second key:str"""
 _VISITS = f"""{RUN_COLUMNS} region:str visit:int64 cycle:int64 phase:int64 lifetime:int64
     normalised_regret fresh_normalised_regret {" ".join(_BY_VISIT)} online_regret dynamic_regret
-    fresh_online_regret learning_transfer"""
+    frozen_online_regret fresh_online_regret learning_transfer"""
 _RETENTION = f"{RUN_COLUMNS} region:str visit:Int64 phase:int64 normalised_regret"
 
 
@@ -179,6 +181,7 @@ def _with_fresh(report: StreamReport, fresh: Sequence[CellResult]) -> StreamRepo
 
 def _life_rows(life: Life) -> Iterator[dict[str, Any]]:
     cell, result, regret = life.result.cell, life.result, life.report.dynamic_regret
+    frozen = life.report.reference_regret.get("frozen_agent")
     of_life = {
         **place(life.planned),
         **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
@@ -190,6 +193,7 @@ def _life_rows(life: Life) -> Iterator[dict[str, Any]]:
             name: getattr(life.report.stream, name)
             for name in ("state_dim", "action_dim", "horizon")
         },
+        "frozen_online_regret": None if frozen is None else frozen.online_regret,
         "stream_digest": life.report.stream_digest,
         "fresh_agents": life.fresh_agents,
         "seconds": result.timing.total,
@@ -232,10 +236,11 @@ def _visit_regret(report: StreamReport, visit: int, phase: int) -> dict[str, Any
     regret = report.dynamic_regret
     if regret is None or visit >= len(regret.visits):
         return {}
-    alone = regret.fresh_online_regret
+    alone, frozen = regret.fresh_online_regret, report.reference_regret.get("frozen_agent")
     names = ("online_regret", "dynamic_regret", "learning_transfer")
     return {
         **{name: getattr(regret.visits[visit], name) for name in names},
+        "frozen_online_regret": None if frozen is None else frozen.visits[visit].online_regret,
         "fresh_online_regret": None if alone is None else alone[phase],
     }
 

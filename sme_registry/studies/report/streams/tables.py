@@ -16,7 +16,8 @@ Names of the CSV files begin with `stream_`.
     differences         as in `report.tables`, in WD
     references          reference, region, metric: value, the median over the lives' streams
     regret              lifetime: median, q25, q75 of the regret until then; fresh: the median of
-                        fresh agents', NaN without them; runs
+                        fresh agents', and frozen: of the same agents if they stop
+                        learning after visit 0; NaN without them; runs
     reference_regret    reference, lifetime: median over the lives' streams, in expectation
     learning_curves     as in `report.tables`, on the task in force, not smoothed
     counts              lives, fresh_agents: finished; planned_lives, planned_fresh_agents; failed:
@@ -35,8 +36,10 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.evaluation.continual import DynamicRegret, reference_regret
+from sme_registry.evaluation.continual import DynamicRegret, StreamReport, reference_regret
+from sme_registry.evaluation.continual.report import LABELS as REFERENCES
 from sme_registry.evaluation.continual.report import METRICS as LABELS
+from sme_registry.evaluation.continual.report import TRAINED
 from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
 from sme_registry.statistics import Array
 from sme_registry.studies.engine.result import CellResult
@@ -55,6 +58,7 @@ _EACH = (
     Metric("plasticity_difference", "plasticity difference", 1),
     Metric("learning_transfer", "learning transfer", -1),
     Metric("online_regret", "online regret", 1, 3),
+    Metric("frozen_online_regret", f"online regret, {REFERENCES['frozen_agent']}", 1, 3),
 )
 METRICS = (
     Metric("visited_regret", _VISITED, 1),
@@ -168,21 +172,23 @@ def _estimates(
 
 def reference_costs(lives: Sequence[Life]) -> Costs:
     """The expected dynamic regret of the reference agents in the streams of these lives."""
-    streams: dict[str, dict[str, StreamSpec]] = {}
+    streams: dict[str, dict[str, StreamReport]] = {}
     for life in lives:
         of_class = streams.setdefault(life.planned.class_name, {})
-        of_class[life.report.stream_digest] = life.report.stream
-    return {
-        (class_name, reference): [log[reference] for log in logs]
-        for class_name, of_class in streams.items()
-        if (
-            logs := [
-                reference_regret(stream, episodes=-(-_EPISODES // len(of_class)))
-                for stream in of_class.values()
-            ]
-        )
-        for reference in logs[0]
-    }
+        if life.report.reference_regret or life.report.stream_digest not in of_class:
+            of_class[life.report.stream_digest] = life.report
+    costs: dict[tuple[str, str], list[DynamicRegret]] = {}
+    for class_name, of_class in streams.items():
+        for report in of_class.values():
+            for name, log in _untrained(report, -(-_EPISODES // len(of_class))).items():
+                costs.setdefault((class_name, name), []).append(log)
+    return costs
+
+
+def _untrained(report: StreamReport, episodes: int) -> dict[str, DynamicRegret]:
+    """The reference agents of a life's stream, which lives of older versions do not have."""
+    recorded = {k: log for k, log in report.reference_regret.items() if k not in TRAINED}
+    return recorded or reference_regret(report.stream, episodes=episodes)
 
 
 def references(lives: Sequence[Life], costs: Costs) -> pd.DataFrame:
@@ -207,21 +213,25 @@ def references(lives: Sequence[Life], costs: Costs) -> pd.DataFrame:
 
 def regret(lives: Sequence[Life]) -> pd.DataFrame:
     """The dynamic regret until points of the life, next to that of fresh agents."""
-    columns = f"{_PLACE} lifetime median q25 q75 fresh runs:int64"
+    columns = f"{_PLACE} lifetime median q25 q75 fresh frozen runs:int64"
     tables = [frame([], columns)]
     for place, group in _groups(lives).items():
         logs = [log for life in group if (log := life.report.dynamic_regret) is not None]
         if not logs:
             continue
         references = [life.report.reference_regret for life in group]
-        alone = [log for each in references if (log := each.get("fresh_agents")) is not None]
+        beside = {
+            column: [each[name] for each in references if name in each]
+            for column, name in (("fresh", "fresh_agents"), ("frozen", "frozen_agent"))
+        }
         x = np.linspace(0.0, min(log.lifetime[-1] for log in logs), _POINTS)
         q25, median, q75 = np.quantile(_until(logs, x), [0.25, 0.5, 0.75], axis=0)
-        fresh: Any = np.median(_until(alone, x), axis=0) if alone else math.nan
         table = {
             "class_name": place[0], "algorithm": place[1], "lifetime": x, "median": median,
-            "q25": q25, "q75": q75, "fresh": fresh, "runs": len(logs),
+            "q25": q25, "q75": q75, "runs": len(logs),
         }  # fmt: skip
+        for column, agents in beside.items():
+            table[column] = np.median(_until(agents, x), axis=0) if agents else math.nan
         tables.append(pd.DataFrame(table))
     return pd.concat(tables, ignore_index=True)
 

@@ -31,7 +31,8 @@ CSV_TABLES = (
     "reference_regret", "learning_curves", "counts", "missing",
 )  # fmt: skip
 _METRIC = {metric.key: metric for metric in (*METRICS, *BY_VISIT)}
-_OF_TRAINING = ("learning_transfer", "online_regret")  # the same numbers in all regions
+# The same numbers in all regions.
+_OF_TRAINING = ("learning_transfer", "online_regret", "frozen_online_regret")
 _SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING)
 
 
