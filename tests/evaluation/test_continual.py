@@ -29,6 +29,7 @@ from sme_registry.evaluation import (
     reference_regret,
 )
 from sme_registry.evaluation.continual import RegretBlocks, metrics
+from sme_registry.evaluation.continual.report import METRICS, Retention
 from sme_registry.evaluation.continual.retention import final_specs
 from sme_registry.spec import StreamSpec
 
@@ -562,3 +563,8 @@ def test_only_runs_of_one_stream_are_combined():
         across_seeds([report(), other])
     with pytest.raises(OptionError, match="one or more"):
         across_seeds([])
+
+
+def test_one_mapping_names_every_metric_of_a_retention():
+    regrets = {"normalised_regret", "initial_normalised_regret", "fresh_normalised_regret"}
+    assert [*METRICS] == [name for name in Retention.model_fields if name not in regrets]

@@ -55,8 +55,11 @@ METRICS = {
     "forward_transfer": "forward transfer",
     "relearning": "relearning",
     "plasticity_ratio": "plasticity ratio",
+    "plasticity_difference": "plasticity difference",
 }
 """The metrics of `Retention`, and their labels."""
+BY_VISIT = tuple(name for name in METRICS if name not in ("forward_transfer", "relearning"))
+"""Those that have a value for each visit; the others have one for the life."""
 
 _Optional = TupleOf[Real | None]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
-from sme_registry.evaluation.continual.report import StreamReport
+from sme_registry.evaluation.continual.report import METRICS, StreamReport
 from sme_registry.statistics import (
     DRAWS,
     Array,
@@ -18,17 +18,6 @@ from sme_registry.statistics import (
     aggregate,
     iqm,
     stratified_bootstrap,
-)
-
-_FIELDS = (
-    "normalised_regret",
-    "average_performance",
-    "backward_transfer",
-    "forgetting",
-    "forward_transfer",
-    "relearning",
-    "plasticity_ratio",
-    "plasticity_difference",
 )
 
 
@@ -60,7 +49,7 @@ def across_seeds(
     same_stream(reports)
     runs = {
         field: np.stack([_numbers(getattr(r.region(region).agent, field)) for r in reports])
-        for field in _FIELDS
+        for field in ("normalised_regret", *METRICS)
     }
     regrets = [report.dynamic_regret for report in reports]
     logs = [regret for regret in regrets if regret is not None]

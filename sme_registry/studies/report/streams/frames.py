@@ -67,7 +67,7 @@ import numpy as np
 import pandas as pd
 
 from sme_registry.evaluation import StreamReport
-from sme_registry.evaluation.continual.report import METRICS, StreamRegion
+from sme_registry.evaluation.continual.report import BY_VISIT, METRICS, StreamRegion
 from sme_registry.spec import PlannedCell, StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.result import CellResult
@@ -81,17 +81,12 @@ from sme_registry.studies.report.frames import (
     plan_file,
 )
 
-_OF_LIFE = (*METRICS, "plasticity_difference")
-_BY_VISIT = (
-    "average_performance", "backward_transfer", "forgetting", "plasticity_ratio",
-    "plasticity_difference",
-)  # fmt: skip
 _LIVES = f"""{RUN_COLUMNS} region:str epsilon_low epsilon_high states:int64 visited_regret
-    {" ".join(_OF_LIFE)} learning_transfer online_regret dynamic_regret frozen_online_regret
+    {" ".join(METRICS)} learning_transfer online_regret dynamic_regret frozen_online_regret
     uses:str action_range:str steps:int64 state_dim:int64 action_dim:int64 horizon:int64
     stream_digest:str seed:int64 fresh_agents:int64 seconds steps_per_second key:str"""
 _VISITS = f"""{RUN_COLUMNS} region:str visit:int64 cycle:int64 phase:int64 lifetime:int64
-    normalised_regret fresh_normalised_regret {" ".join(_BY_VISIT)} online_regret dynamic_regret
+    normalised_regret fresh_normalised_regret {" ".join(BY_VISIT)} online_regret dynamic_regret
     frozen_online_regret fresh_online_regret learning_transfer"""
 _RETENTION = f"{RUN_COLUMNS} region:str visit:Int64 phase:int64 normalised_regret"
 
@@ -205,7 +200,7 @@ def _life_rows(life: Life) -> Iterator[dict[str, Any]]:
         yield {
             **of_life,
             **region.model_dump(include={"epsilon_low", "epsilon_high", "states"}),
-            **{name: region.agent.final(name) for name in _OF_LIFE},
+            **{name: region.agent.final(name) for name in METRICS},
             "region": region.name,
             "visited_regret": M[np.arange(len(M)), np.arange(len(M)) % M.shape[1]].mean(),
         }
@@ -224,7 +219,7 @@ def _visit_rows(life: Life) -> Iterator[dict[str, Any]]:
             agent, alone = region.agent, region.agent.fresh_normalised_regret
             yield {
                 **of_visit,
-                **{name: getattr(agent, name)[v] for name in _BY_VISIT},
+                **{name: getattr(agent, name)[v] for name in BY_VISIT},
                 "region": region.name,
                 "normalised_regret": agent.normalised_regret[v][j],
                 "fresh_normalised_regret": None if alone is None else alone[j],

@@ -36,10 +36,12 @@ import numpy as np
 import pandas as pd
 
 from sme_registry import statistics
-from sme_registry.evaluation.continual import DynamicRegret, StreamReport, reference_regret
-from sme_registry.evaluation.continual.report import LABELS as REFERENCES
-from sme_registry.evaluation.continual.report import METRICS as LABELS
-from sme_registry.evaluation.continual.report import TRAINED
+from sme_registry.evaluation.continual import (
+    DynamicRegret,
+    StreamReport,
+    reference_regret,
+    report,
+)
 from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
 from sme_registry.statistics import Array
 from sme_registry.studies.engine.result import CellResult
@@ -50,23 +52,22 @@ from sme_registry.studies.report.tables import PLACE, Bootstrap, Metric, by_plac
 WITHIN, OUTSIDE = "WD", "OOD"
 TASKS, SCHEDULE = "tasks", "schedule"
 _VISITED = "regret on the visited phase"
-_EACH = (
-    Metric("average_performance", LABELS["average_performance"], -1),
-    Metric("forgetting", LABELS["forgetting"], 1),
-    Metric("backward_transfer", LABELS["backward_transfer"], -1),
-    Metric("plasticity_ratio", LABELS["plasticity_ratio"], 1),
-    Metric("plasticity_difference", "plasticity difference", 1),
+_LESS_IS_BETTER = ("forgetting", "plasticity_ratio", "plasticity_difference")
+_RETENTION = {
+    key: Metric(key, label, 1 if key in _LESS_IS_BETTER else -1)
+    for key, label in report.METRICS.items()
+}
+OF_TRAINING = (
     Metric("learning_transfer", "learning transfer", -1),
     Metric("online_regret", "online regret", 1, 3),
-    Metric("frozen_online_regret", f"online regret, {REFERENCES['frozen_agent']}", 1, 3),
+    Metric("frozen_online_regret", f"online regret, {report.LABELS['frozen_agent']}", 1, 3),
 )
-METRICS = (
-    Metric("visited_regret", _VISITED, 1),
-    *_EACH,
-    Metric("forward_transfer", LABELS["forward_transfer"], -1),
-    Metric("relearning", LABELS["relearning"], -1),
+METRICS = (Metric("visited_regret", _VISITED, 1), *_RETENTION.values(), *OF_TRAINING)
+BY_VISIT = (
+    Metric("normalised_regret", _VISITED, 1),
+    *(_RETENTION[key] for key in report.BY_VISIT),
+    *OF_TRAINING,
 )
-BY_VISIT = (Metric("normalised_regret", _VISITED, 1), *_EACH)
 _PLACE = "class_name:str algorithm:str"
 _INTERVAL = "runs:int64 iqm low high"
 _POINTS = 201  # of a curve of regret
@@ -179,30 +180,29 @@ def reference_costs(lives: Sequence[Life]) -> Costs:
             of_class[life.report.stream_digest] = life.report
     costs: dict[tuple[str, str], list[DynamicRegret]] = {}
     for class_name, of_class in streams.items():
-        for report in of_class.values():
-            for name, log in _untrained(report, -(-_EPISODES // len(of_class))).items():
+        for one in of_class.values():
+            for name, log in _untrained(one, -(-_EPISODES // len(of_class))).items():
                 costs.setdefault((class_name, name), []).append(log)
     return costs
 
 
-def _untrained(report: StreamReport, episodes: int) -> dict[str, DynamicRegret]:
+def _untrained(life: StreamReport, episodes: int) -> dict[str, DynamicRegret]:
     """The reference agents of a life's stream, which lives of older versions do not have."""
-    recorded = {k: log for k, log in report.reference_regret.items() if k not in TRAINED}
-    return recorded or reference_regret(report.stream, episodes=episodes)
+    recorded = {k: log for k, log in life.reference_regret.items() if k not in report.TRAINED}
+    return recorded or reference_regret(life.stream, episodes=episodes)
 
 
 def references(lives: Sequence[Life], costs: Costs) -> pd.DataFrame:
     """The reference agents in each stream, which need no training: medians over its draws."""
     values: dict[tuple[str, ...], dict[str, float]] = {}
     for life in lives:
-        report = life.report
-        for region in (*report.regions, report.ood):
+        for region in (*life.report.regions, life.report.ood):
             for name, retention in region.references.items():
-                for metric in LABELS:
+                for metric in _RETENTION:
                     value = retention.final(metric)
                     if value is not None:
                         at = life.planned.class_name, name, region.name, metric
-                        values.setdefault(at, {})[report.stream_digest] = value
+                        values.setdefault(at, {})[life.report.stream_digest] = value
     rows = [(*at, float(np.median([*each.values()]))) for at, each in values.items()]
     rows += [
         (*place, WITHIN, "online_regret", float(np.median([log.online_regret for log in logs])))

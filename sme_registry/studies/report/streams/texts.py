@@ -12,6 +12,7 @@ from sme_registry.studies.report.streams.analysis import StreamAnalysis
 from sme_registry.studies.report.streams.tables import (
     BY_VISIT,
     METRICS,
+    OF_TRAINING,
     OUTSIDE,
     SCHEDULE,
     WITHIN,
@@ -32,7 +33,7 @@ CSV_TABLES = (
 )  # fmt: skip
 _METRIC = {metric.key: metric for metric in (*METRICS, *BY_VISIT)}
 # The same numbers in all regions.
-_OF_TRAINING = ("learning_transfer", "online_regret", "frozen_online_regret")
+_OF_TRAINING = tuple(metric.key for metric in OF_TRAINING)
 _SHOWN_BY_VISIT = ("normalised_regret", "forgetting", "plasticity_ratio", *_OF_TRAINING)
 
 
