@@ -404,7 +404,7 @@ def test_those_are_named_whose_interval_is_above_0_also_below_the_largest_value(
     forgetting["Tired"] = (0.5, 0.3, 0.6)
     _, text = with_metrics(study, "forgetting", forgetting, runs=5)
     assert "In Switch, Tired forgets" in text
-    assert "So does Forgetful: 0.30 (95 % interval 0.20 to 0.40, 5 lives)." in text
+    assert "Forgetful forgets, too: 0.30 (95 % interval 0.20 to 0.40, 5 lives)." in text
 
 
 def test_that_none_forgets_needs_enough_lives_of_each(study: Path) -> None:
