@@ -18,8 +18,7 @@ from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError, SMEError, SpecError
 from sme_registry.io import read_json, to_json
 from sme_registry.spec import Integer, StrictModel, SuiteFile
-from sme_registry.training import RunRecord
-from sme_registry.training.snapshots import model_of_cell
+from sme_registry.training import RunRecord, model_of_cell
 
 if TYPE_CHECKING:
     from sme_registry.studies import CellStatus

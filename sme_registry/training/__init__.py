@@ -24,6 +24,7 @@ from sme_registry.training.hyperparameters import (
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord
 from sme_registry.training.run import DEFAULT_STEPS, TrainingResult, train
+from sme_registry.training.snapshots import model_of_cell
 
 __all__ = [
     "ALGORITHMS",
@@ -36,6 +37,7 @@ __all__ = [
     "folder_name",
     "full_name",
     "known_algorithm",
+    "model_of_cell",
     "nested_hyperparameters",
     "numpy_policy",
     "read_episodes",

@@ -116,8 +116,8 @@ def test_a_stream_where_one_task_is_needed_is_a_typed_error(name: Any) -> None:
 class _Forgets(SMEStreamEnv):
     """Restarts the life at each reset."""
 
-    def _begin_life(self, seed: int | None) -> dict[str, Any]:
-        return super()._begin_life(0)
+    def _live(self, lifetime: int | None) -> dict[str, Any]:
+        return super()._live(0)
 
 
 class _Lags(SMEStreamEnv):

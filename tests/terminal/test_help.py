@@ -74,7 +74,7 @@ def test_a_suggestion_ends_with_one_mark() -> None:
         ("sme", "sme study run smo", {"smoke"}),
         ("sme", "sme evaluate linear Default --protocol qu", {"quick"}),
         ("sme", "sme evaluate opt", {"optimal"}),
-        ("sme-leaderboard", "sme-leaderboard init board --suite co", {"core"}),
+        ("sme-leaderboard", "sme-leaderboard init board --suite cor", {"core"}),
         ("sme-leaderboard", "sme-leaderboard new b --suite smo", {"smoke"}),
     ],
 )
