@@ -43,6 +43,10 @@ from tests.leaderboard.web.site import boards
 # More patient than httpx, for busy machines; a connection for each request, as `httpx.get` has.
 HTTP = httpx.Client(timeout=60, limits=httpx.Limits(max_keepalive_connections=0))
 
+# A refusal takes about 0.01 s of the process. The bound tells it from work that an attacker buys,
+# on a machine that does much else.
+CPU_SECONDS = 10.0
+
 Json = dict[str, Any]
 JSON = {"Accept": "application/json"}
 BROWSER = {"Accept": "text/html,application/xhtml+xml"}
@@ -617,7 +621,7 @@ def test_an_upload_that_is_too_large_is_refused_by_its_length(
     )
     assert answer.startswith(b"HTTP/1.1 413 ")
     assert b'"code":"too_large"' in answer
-    assert time.process_time() - start < 1.0
+    assert time.process_time() - start < CPU_SECONDS
 
 
 def test_an_upload_without_a_length_is_stopped_at_the_limit(
@@ -829,7 +833,7 @@ def test_an_invalid_submission_has_its_code(
     change(plain)
     start = time.process_time()  # the server is a thread of this process
     answer = post(url, _signed_anyway(plain, key, store.document.key))
-    assert time.process_time() - start < 1.0
+    assert time.process_time() - start < CPU_SECONDS
     assert (answer.json()["code"], 400 <= answer.status_code < 500) == (code, True)
     assert set(answer.json()) == {"code", "message"}
     assert store.entries() == []
@@ -868,7 +872,7 @@ def test_a_body_that_is_no_submission_has_its_code(
 ) -> None:
     start = time.process_time()  # the server is a thread of this process
     answer = post(url, text)
-    assert time.process_time() - start < 1.0
+    assert time.process_time() - start < CPU_SECONDS
     assert refusal(answer) == (status, code)
     assert store.entries() == []
 
