@@ -288,7 +288,7 @@ def _show_suite(file: SuiteFile, json: bool) -> None:
     print_tables(shown)
     digests = [each.digest for each in (*suite.instances, *suite.stream_instances)]
     kind = "task" if suite.classes else "stream"
-    if all(digest in known_specs() or digest in known_streams() for digest in digests):
+    if known_specs().keys() | known_streams().keys() >= set(digests):
         out().print(f"To train on a {kind}: sme train {digests[0][:_SHORT]}", soft_wrap=True)
     else:  # one outside the catalogue cannot be found by its digest
         out().print(f"To train on these {kind}s: sme study new plan.json -a PPO --suite FILE")

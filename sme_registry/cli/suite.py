@@ -51,8 +51,8 @@ def new(
     """Write a suite's file: classes of tasks or streams, each with several instances.
 
     A class is one setting under several seeds, so that a method is judged on a kind of task and not
-    on one draw. Studies, leaderboards and --suite accept the file like the name of a suite.
-    Leaderboards need single tasks. `sme suite FILE` is short for `sme suite new FILE`.
+    on one draw. Studies, leaderboards and --suite accept the file like the name of a suite;
+    leaderboards only if it has no streams. `sme suite FILE` is short for `sme suite new FILE`.
 
     Examples:
 

@@ -382,8 +382,7 @@ def _draw_references(axes: Axes, reports: Sequence[StreamReport], *, trained: bo
 def _curves(lives: Sequence[DynamicRegret]) -> tuple[Array, Array]:
     """`[X]` lifetimes that all lives have reached, and the `[n, X]` regret until then."""
     x = np.linspace(0.0, min(life.lifetime[-1] for life in lives), _POINTS)
-    curves = [np.interp(x, [0, *life.lifetime], [0.0, *life.cumulative_regret]) for life in lives]
-    return x, np.array(curves)
+    return x, np.array([life.until(x) for life in lives])
 
 
 def _regret(report: StreamReport) -> DynamicRegret:

@@ -297,6 +297,11 @@ class StreamSpec(NamedDocument):
         """
         return self._moved(-int(str(self.phases[0].spec.seed), 0))
 
+    @property
+    def kinds(self) -> set[SMESpec]:
+        """The tasks of the phases, but for their seeds and rotations."""
+        return {phase.spec.derive(rotation=0.0, seed=0) for phase in self.phases}
+
     def refuse_many_visits(self) -> None:
         """Raise SpecError if a life has more visits than are evaluated."""
         if self.visits > MAX_VISITS:
@@ -308,10 +313,14 @@ class StreamSpec(NamedDocument):
     def _moved(self, by: int) -> StreamSpec:
         """This stream with a number added to the seed of every phase."""
         phases = [
-            Phase(spec=spec.derive(seed=_moved(spec.seed, by)), steps=steps, drift=drift)
-            for spec, steps, drift in ((one.spec, one.steps, one.drift) for one in self.phases)
+            Phase(
+                spec=one.spec.derive(seed=_moved(one.spec.seed, by)),
+                steps=one.steps,
+                drift=one.drift,
+            )
+            for one in self.phases
         ]
-        return StreamSpec.from_dict({**self.to_dict(), "phases": [one.to_dict() for one in phases]})
+        return StreamSpec(**{**dict(self), "phases": phases})
 
 
 StreamLike: TypeAlias = StreamSpec | dict[str, Any] | str | os.PathLike[str]

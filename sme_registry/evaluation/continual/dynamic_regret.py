@@ -74,6 +74,11 @@ class DynamicRegret(StrictModel):
     fresh_online_regret: TupleOf[Real] | None = None
     learning_transfer: Real | None = None
 
+    def until(self, lifetime: Array) -> Array:
+        """`[X]` Σ regret until lifetimes `[X]`, between the points of the curve in proportion."""
+        curve = [0, *self.lifetime], [0.0, *self.cumulative_regret]
+        return np.asarray(np.interp(lifetime, *curve))
+
     def with_fresh(self, stream: StreamSpec, online_regret: Sequence[float]) -> Self:
         """This regret with the learning transfer of its visits, against agents that start anew.
 

@@ -234,7 +234,7 @@ def _changes(streams: StreamAnalysis) -> Iterable[StreamChange]:
     for row in rows.astype(object).to_dict("records"):
         ends = {"low": _known(row["low"]), "high": _known(row["high"])}
         info = streams.classes[row["class_name"]]
-        related = info.related and not base.related and info.kinds == base.kinds
+        related = info.related and not base.related and info.stream.kinds == base.stream.kinds
         yield StreamChange(**{**row, **ends}, related=related)
 
 

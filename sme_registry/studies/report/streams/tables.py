@@ -42,7 +42,7 @@ from sme_registry.evaluation.continual import (
     reference_regret,
     report,
 )
-from sme_registry.spec import SMESpec, StreamSpec, StudyPlan
+from sme_registry.spec import StreamSpec, StudyPlan
 from sme_registry.statistics import Array
 from sme_registry.studies.engine.result import CellResult
 from sme_registry.studies.report.frames import frame, ordered
@@ -96,11 +96,6 @@ class StreamInfo:
     def related(self) -> bool:
         """Whether all phases are rotations of one task."""
         return len({phase.spec.derive(rotation=0.0) for phase in self.stream.phases}) == 1
-
-    @property
-    def kinds(self) -> set[SMESpec]:
-        """The tasks of the phases, but for their seeds and rotations."""
-        return {phase.spec.derive(rotation=0.0, seed=0) for phase in self.stream.phases}
 
 
 def stream_infos(plan: StudyPlan) -> dict[str, StreamInfo]:
@@ -250,9 +245,7 @@ def reference_curves(costs: Costs) -> pd.DataFrame:
 
 def _until(logs: Sequence[DynamicRegret], lifetime: Array) -> Array:
     """`[n, X]` regret of each life until these lifetimes."""
-    return np.array(
-        [np.interp(lifetime, [0, *log.lifetime], [0.0, *log.cumulative_regret]) for log in logs]
-    )
+    return np.array([log.until(lifetime) for log in logs])
 
 
 def counts(
