@@ -22,7 +22,7 @@ from sme_registry.terminal import err, out
 
 _MOST_AGENTS = 2**12  # the spec allows far fewer; a list of billions would fill the memory
 _NO_OPTION = ("schema_version", "team")
-_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT"}
+_METAVARS = {int: "INT", float: "FLOAT", str: "TEXT", type(None): "JSON"}
 _HELP = {  # where the field's description is too short or missing
     "k": "Reward interval: steps between payouts",
     "r_min": "Reward threshold: step rewards at or below it are set to 0",
@@ -31,6 +31,8 @@ _HELP = {  # where the field's description is too short or missing
     "hidden_width": "H, width of the inner layers of the optimal policy",
     "policy_init": "'semi_orthogonal', or 'unit_variance', which also suits layers that widen",
     "rotation": "θ, radians: how far the optimal policy is rotated away from the one of θ = 0",
+    "safety": "Limits of the actions, such as '{\"tightness\": 0.2}'",
+    "observation": 'What the agent sees, such as \'{"distractors": 32, "mixing": "nonlinear"}\'',
     "seed": "Seed of the draw: an integer, or hexadecimal 0x… for a sealed task",
 }
 
@@ -54,7 +56,7 @@ def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
                     typer.Option(
                         f"--{name.replace('_', '-')}",
                         metavar=_METAVARS[type(field.default)],
-                        help=f"{about}; default {field.default}.",
+                        help=f"{about}; default {'none' if field.default is None else field.default}.",
                     ),
                 ],
             )

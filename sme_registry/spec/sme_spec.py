@@ -142,13 +142,68 @@ class TeamSpec(Document):
         return self
 
 
+class SafetySpec(Document):
+    """State-dependent upper limits of the action channels, which the optimum breaks at times.
+
+    Source: METHOD, section 8.
+
+    Attributes:
+      tightness: τ in (0, ½], about the share of states and channels in which the optimum is above
+        its limit.
+    """
+
+    tightness: Annotated[Real, Field(gt=0, le=0.5, description="τ, share of limits that bite")]
+
+
+class ObservationSpec(Document):
+    """What the agent sees in place of the state: distractors beside it, and an invertible map.
+
+    Source: METHOD, section 9.
+
+    Attributes:
+      distractors: m, channels beside the state that change neither reward nor optimum.
+      dynamics: how they move: drawn anew at each step ("noise", the default), by a transition of
+        their own under random inputs ("autonomous"), or under the agent's actions ("driven"). None
+        without distractors.
+      mixing: the map: none, a scaled rotation about the centre ("orthogonal"), or `mixing_depth`
+        square uniform layers ("nonlinear").
+      mixing_depth: number of layers in [1, 3], 1 by default; None for another mixing.
+    """
+
+    distractors: Annotated[
+        Integer, Field(ge=0, le=MAX_DIM, description="m, channels without meaning")
+    ] = 0
+    dynamics: Literal["noise", "autonomous", "driven"] | None = None
+    mixing: Literal["none", "orthogonal", "nonlinear"] = "none"
+    mixing_depth: Annotated[Integer, Field(ge=1, le=3)] | None = None
+
+    @model_validator(mode="after")
+    def _one_document_for_one_observation(self) -> Self:
+        if not self.distractors and self.mixing == "none":
+            raise ValueError(
+                "has neither distractors nor a mixing, so it changes nothing. Give one of them, or "
+                "leave observation out."
+            )
+        for field, needed, default in (
+            ("dynamics", self.distractors > 0, "noise"),
+            ("mixing_depth", self.mixing == "nonlinear", 1),
+        ):
+            value = getattr(self, field)
+            if value is not None and not needed:
+                what = "distractors > 0" if field == "dynamics" else "mixing='nonlinear'"
+                raise ValueError(f"{field}={value!r}: needs {what}. Leave it out.")
+            if value is None and needed:
+                object.__setattr__(self, field, default)
+        return self
+
+
 class Setting(Document):
     """One setting of the axes: everything that a task is generated from, except its seed.
 
     Defaults are the paper's (METHOD, section 1), or ours where it has none.
     """
 
-    left_out_by_default: ClassVar[tuple[str, ...]] = ("rotation",)
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
 
     schema_version: SchemaVersion = 1
     state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="S, state channels")] = 8
@@ -168,6 +223,8 @@ class Setting(Document):
     rotation: Annotated[
         Real, Field(ge=0, lt=FULL_TURN, description="θ, radians by which π*'s input is rotated")
     ] = 0.0
+    safety: SafetySpec | None = None
+    observation: ObservationSpec | None = None
 
     @field_validator("team")
     @classmethod
@@ -217,6 +274,32 @@ class Setting(Document):
                 f"and {what}. Leave it out, or add a channel."
             )
         return self
+
+    @model_validator(mode="after")
+    def _optimum_is_known(self) -> Self:
+        if self.safety is not None and self.D > 0:
+            raise ValueError(
+                f"safety: needs D=0, not D={self.D}, because with early termination the best safe "
+                "action is not known: it may pay to break a limit and survive. Leave one of them "
+                "out."
+            )
+        for field in ("safety", "observation"):
+            if getattr(self, field) is not None and self.team is not None:
+                raise ValueError(
+                    f"{field}: is for a single agent, and this task is for a team of "
+                    f"{len(self.team.agents)}. Leave one of them out."
+                )
+        return self
+
+    @property
+    def observation_dim(self) -> int:
+        """Entries of a single agent's observation: S, the distractors, t/T and r_cum/k."""
+        return self.state_dim + self.distractors + 2
+
+    @property
+    def distractors(self) -> int:
+        """m, 0 without `observation`."""
+        return 0 if self.observation is None else self.observation.distractors
 
 
 class SMESpec(Setting, NamedDocument):

@@ -27,13 +27,17 @@ class Layer(NamedTuple):
 
 
 def transition_matrix(spec: SMESpec) -> Array:
-    """W `[A, S]`: U(0,1) entries, each row divided by its sum, on the grid 2⁻²⁹.
+    """W `[A, S]`: U(0,1) entries, each row divided by its sum, on the grid 2⁻²⁹."""
+    return _mixing_weights(spec.seed, "transition/W", spec.action_dim, spec.state_dim)
+
+
+def _mixing_weights(seed: int | str, name: str, rows: int, columns: int) -> Array:
+    """U(0,1) entries `[rows, columns]`, each row divided by its sum, on the grid 2⁻²⁹.
 
     In exact integer arithmetic: each entry is rounded down to the grid, and a row's
     difference from exactly 1 is added, one grid step each, to the entries that lost most.
     """
-    shape = (spec.action_dim, spec.state_dim)
-    bits = raw_bits(spec.seed, "transition/W", math.prod(shape)).reshape(shape)
+    bits = raw_bits(seed, name, rows * columns).reshape(rows, columns)
     # Odd 32-bit numbers, the mid-points of 2³¹ bins. With at most 2²⁰ of them in a row, every
     # product and sum below is an integer under 2⁶³.
     weights = (bits >> np.uint64(33)) * np.uint64(2) + np.uint64(1)
@@ -65,6 +69,46 @@ def optimal_policies(spec: SMESpec, stream: str = "policy") -> tuple[tuple[Layer
     )
 
 
+def limiting_network(spec: SMESpec) -> tuple[Layer, ...]:
+    """The layers of v, of which the action limits are 1 − 2τ v(s); none without `safety`.
+
+    Of the optimal policy's shape, and independent of it. A rotation does not move them.
+    """
+    if spec.safety is None:
+        return ()
+    everything = tuple(range(spec.state_dim))
+    return _network(spec, "safety", everything, spec.action_dim)
+
+
+def distractor_transition(spec: SMESpec) -> tuple[Array, Array] | None:
+    """W `[A, m]` and b `[m]` of the distractors' own transition; None where they have none."""
+    if spec.observation is None or spec.observation.dynamics in (None, "noise"):
+        return None
+    m = spec.distractors
+    W = _mixing_weights(spec.seed, "observation/W", spec.action_dim, m)
+    return W, uniform(spec.seed, "observation/b", m)
+
+
+def mixing_layers(spec: SMESpec) -> tuple[Layer, ...]:
+    """The layers of the map from state and distractors `[S + m]` to what the agent sees.
+
+    x ↦ W x + b where the mixing is orthogonal, then W = Q/c and b = ½ − W ½ with the least c that
+    keeps the cube's image in the cube. Uniform layers where it is nonlinear. None without mixing.
+    """
+    if spec.observation is None or spec.observation.mixing == "none":
+        return ()
+    n = spec.state_dim + spec.distractors
+    if spec.observation.mixing == "orthogonal":
+        Q = _haar(spec.seed, "observation/mixing/0", n, n)
+        W = Q / np.abs(Q).sum(axis=1).max()
+        return (Layer(W, 0.5 - 0.5 * W.sum(axis=1)),)
+    depth = spec.observation.mixing_depth or 1
+    matrices = [
+        math.sqrt(12.0) * _haar(spec.seed, f"observation/mixing/{i}", n, n) for i in range(depth)
+    ]
+    return tuple(Layer(W, -0.5 * W.sum(axis=1)) for W in matrices)
+
+
 def agents(spec: SMESpec) -> tuple[AgentSpec, ...]:
     """The agents of a spec; without a team, one that owns and observes everything."""
     if spec.team is not None:
@@ -83,6 +127,17 @@ def observed_channels(spec: SMESpec) -> tuple[tuple[int, ...], ...]:
 def _optimal_policy(
     spec: SMESpec, stream: str, observed: tuple[int, ...], action_dim: int
 ) -> tuple[Layer, ...]:
+    """A network whose input the spec's rotation turns."""
+    (W, b), *others = _network(spec, stream, observed, action_dim)
+    if spec.rotation:
+        W = W @ _rotation(spec, f"{stream}/rotation", len(observed))
+        b = -0.5 * W.sum(axis=1)
+    return (Layer(W, b), *others)
+
+
+def _network(
+    spec: SMESpec, stream: str, observed: tuple[int, ...], action_dim: int
+) -> tuple[Layer, ...]:
     """A Deep Uniform Network of L layers: in → H → … → H → out; in → out where L = 1."""
     inner = spec.complexity - 1
     widths = [len(observed), *[spec.hidden_width] * inner, action_dim]
@@ -91,8 +146,6 @@ def _optimal_policy(
         _uniform_matrix(spec, name, inputs, outputs)
         for name, inputs, outputs in zip(names, widths[:-1], widths[1:], strict=True)
     ]
-    if spec.rotation:
-        matrices[0] = matrices[0] @ _rotation(spec, f"{stream}/rotation", len(observed))
     return tuple(Layer(W, -0.5 * W.sum(axis=1)) for W in matrices)
 
 

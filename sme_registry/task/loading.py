@@ -157,11 +157,19 @@ def _checked_stream(resolved: ResolvedStream) -> StreamSpec:
 
 
 def _draw(spec: SMESpec) -> Task:
-    W, b = draw.transition_matrix(spec), draw.transition_offset(spec)
-    policies = draw.optimal_policies(spec)
-    for array in (W, b, *(part for policy in policies for layer in policy for part in layer)):
+    task = Task(
+        spec,
+        draw.transition_matrix(spec),
+        draw.transition_offset(spec),
+        draw.optimal_policies(spec),
+        draw.observed_channels(spec),
+        draw.limiting_network(spec),
+        draw.distractor_transition(spec),
+        draw.mixing_layers(spec),
+    )
+    for array in task.arrays:
         array.setflags(write=False)
-    return Task(spec, W, b, policies, draw.observed_channels(spec))
+    return task
 
 
 _draw_cached = functools.lru_cache(maxsize=64)(_draw)

@@ -8,6 +8,15 @@ Source: METHOD, section 1. Axis letters: `B` batch, `S` state_dim, `A` action_di
     r̂(s, a)  = max(0, 4 (r̃ − ¾))
     r(s, a)  = r̂ if r̂ > r_min, else 0                   step reward; regret = 1 − r
 
+With `safety` (METHOD, section 8), v another such network and τ its tightness:
+
+    ℓ(s)       = 1 − 2τ v(s)                            limits of the action channels
+    cost(s, a) = mean_i max(0, a_i − ℓ_i(s)) / (2τ)     in [0, 1]
+    a_safe(s)  = min(π*(s), ℓ(s))                       the best action of cost 0
+
+With `observation` (METHOD, section 9) the agent sees x = M(s, d) in place of s, of distractors d
+that move by a transition of their own, and an invertible map M.
+
 Every method takes one state `[S]` or a batch `[B, S]`, and returns one value or a batch. States may
 lie outside the unit cube. Actions are clipped to [0, 1], as the environment clips them. States of
 the wrong shape or not finite raise StateError, and such actions ActionError.
@@ -15,6 +24,7 @@ the wrong shape or not finite raise StateError, and such actions ActionError.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import cast
@@ -41,6 +51,9 @@ class Task:
       b: `[S]` transition offset in (0, 1).
       policies: the layers of each agent's optimal policy; one entry where there is no team.
       observed: the state channels that each agent observes.
+      limiting: the layers of v; empty without `safety`.
+      distractor_transition: W `[A, m]` and b `[m]` of autonomous and driven distractors; else None.
+      mixing: the layers of M, from `[S + m]` to `[S + m]`; empty without a mixing.
     """
 
     spec: SMESpec
@@ -48,6 +61,17 @@ class Task:
     b: Array
     policies: tuple[tuple[Layer, ...], ...]
     observed: tuple[tuple[int, ...], ...]
+    limiting: tuple[Layer, ...] = ()
+    distractor_transition: tuple[Array, Array] | None = None
+    mixing: tuple[Layer, ...] = ()
+
+    @property
+    def arrays(self) -> Iterator[Array]:
+        """Every array of the task."""
+        yield from (self.W, self.b, *(self.distractor_transition or ()))
+        for layers in (*self.policies, self.limiting, self.mixing):
+            for layer in layers:
+                yield from layer
 
     @property
     def layers(self) -> list[Layer] | list[list[Layer]]:
@@ -86,11 +110,7 @@ class Task:
         Returns:
           `[B, S]` or `[S]` next states in [0, 1].
         """
-        s, a = self._pairs(s, a)
-        y = s + self.b
-        for i in range(self.spec.action_dim):
-            y = y + self.W[i] * a[..., i, None].astype(np.float32).astype(np.float64)
-        return np.asarray(2.0 * np.abs(y - np.rint(y)))
+        return _moved(*self._pairs(s, a), self.W, self.b)
 
     def optimal_action(self, s: npt.ArrayLike) -> Array:
         """π*(s), the unique action of regret 0.
@@ -115,6 +135,67 @@ class Task:
     def regret(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
         """1 − r, `[B]` or a scalar, in [0, 1]: by how much the optimal step reward exceeds r."""
         return 1.0 - self.step_reward(s, a)
+
+    def limit(self, s: npt.ArrayLike) -> Array:
+        """ℓ, the limit of each action channel, `[B, A]` or `[A]` in [1 − 2τ, 1]; 1 without safety.
+
+        Args:
+          s: `[B, S]` or `[S]` states, any real numbers.
+        """
+        s = self._states(s)
+        if self.spec.safety is None:
+            return np.ones((*s.shape[:-1], self.spec.action_dim))
+        return 1.0 - 2.0 * self.spec.safety.tightness * through(self.limiting, s)
+
+    def safe_action(self, s: npt.ArrayLike) -> Array:
+        """min(π*, ℓ), `[B, A]` or `[A]`: of all actions of cost 0 the one of the highest reward.
+
+        The nearest one to π* in the L1 norm, and unique, since each channel has its own limit.
+        """
+        s = self._states(s)
+        return np.minimum(self.policy(s), self.limit(s))
+
+    def cost(self, s: npt.ArrayLike, a: npt.ArrayLike) -> Array:
+        """The mean excess over the limits, over 2τ: `[B]` or a scalar, in [0, 1]."""
+        s, a = self._pairs(s, a)
+        return self.cost_of(a, self.limit(s))
+
+    def cost_of(self, a: Array, limit: Array) -> Array:
+        """The cost of actions in [0, 1] under limits, `[..., A]` each."""
+        if self.spec.safety is None:
+            return cast(Array, np.zeros(a.shape[:-1])[()])
+        excess = np.maximum(0.0, a - limit).sum(axis=-1) / self.spec.action_dim
+        return excess / (2.0 * self.spec.safety.tightness)
+
+    def distractor_step(self, d: npt.ArrayLike, u: npt.ArrayLike) -> Array:
+        """The next distractors `[B, m]` or `[m]`, ψ(d + u W + b), as `transition` computes it.
+
+        Args:
+          d: `[B, m]` or `[m]` autonomous or driven distractors.
+          u: `[B, A]` or `[A]` what drives them: uniform random numbers, or the agent's actions.
+        """
+        assert self.distractor_transition is not None
+        d = _checked(d, self.spec.distractors, "distractors", StateError)
+        return _moved(d, self._actions(u), *self.distractor_transition)
+
+    def seen(self, s: npt.ArrayLike, d: npt.ArrayLike | None = None) -> Array:
+        """M(s, d), what the agent sees of the state: `[B, S + m]` or `[S + m]`.
+
+        Args:
+          s: `[B, S]` or `[S]` states, any real numbers.
+          d: `[B, m]` or `[m]` distractors; None where the task has none.
+        """
+        x = self._states(s)
+        if self.spec.distractors:
+            d = _checked(
+                np.empty(0) if d is None else d, self.spec.distractors, "distractors", StateError
+            )
+            x = np.concatenate([x, d], axis=-1)
+        assert self.spec.observation is not None or not self.mixing
+        if self.spec.observation is not None and self.spec.observation.mixing == "orthogonal":
+            ((W, b),) = self.mixing
+            return x @ W.T + b
+        return through(self.mixing, x)
 
     def reward_of(self, similarity: npt.ArrayLike) -> Array:
         """The step reward r of similarities r̃, of any shape."""
@@ -170,9 +251,7 @@ class Task:
             # `take`, since the rows of s[..., channels] are not contiguous, and BLAS would then sum
             # a batch in another order than its lanes.
             x = s if len(channels) == self.spec.state_dim else s.take(channels, axis=-1)
-            for W, b in layers:
-                x = ndtr(x @ W.T + b)
-            actions.append(x)
+            actions.append(through(layers, x))
         return np.concatenate(actions, axis=-1) if len(actions) > 1 else actions[0]
 
     def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
@@ -190,6 +269,21 @@ class Task:
 
     def _actions(self, a: npt.ArrayLike) -> Array:
         return np.clip(_checked(a, self.spec.action_dim, "action", ActionError), 0.0, 1.0)
+
+
+def through(layers: Iterable[Layer], x: Array) -> Array:
+    """The output of uniform layers, Φ(W x + b) of each, of inputs `[..., in]`."""
+    for W, b in layers:
+        x = ndtr(x @ W.T + b)
+    return x
+
+
+def _moved(s: Array, a: Array, W: Array, b: Array) -> Array:
+    """ψ(s + a W + b) of states `[..., S]` and actions `[..., A]`; see `Task.transition`."""
+    y = s + b
+    for i in range(len(W)):
+        y = y + W[i] * a[..., i, None].astype(np.float32).astype(np.float64)
+    return np.asarray(2.0 * np.abs(y - np.rint(y)))
 
 
 def _checked(values: npt.ArrayLike, width: int, name: str, error: type[Exception]) -> Array:

@@ -146,11 +146,20 @@ FIELDS = [
     ("seed", "0xb", PARTS),
     ("policy_init", "unit_variance", set()),
     ("team", {"agents": [{"action_dim": 3}], "reward": "team"}, set()),
+    ("safety", {"tightness": 0.2}, {"safety"}),
+    ("observation", {"distractors": 2}, set()),
+    ("observation", {"distractors": 2, "dynamics": "driven"}, {"distractors"}),
+    ("observation", {"mixing": "nonlinear", "mixing_depth": 2}, {"mixing/0", "mixing/1"}),
 ]
 
 
 def parts(task):
     named = {f"inner/{i}": layer.W for i, layer in enumerate(task.policies[0][:-1])}
+    if task.limiting:
+        named["safety"] = task.limiting[-1].W
+    if task.distractor_transition:
+        named["distractors"] = task.distractor_transition[0]
+    named |= {f"mixing/{i}": layer.W for i, layer in enumerate(task.mixing)}
     return {"W": task.W, "b": task.b, **named, "output": task.policies[0][-1].W}
 
 
