@@ -47,6 +47,7 @@ def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
     for name, field in SMESpec.model_fields.items():
         if name not in _NO_OPTION:
             about = _HELP.get(name) or field.description
+            default = "none" if field.default is None else field.default
             options[name] = inspect.Parameter(
                 name,
                 inspect.Parameter.KEYWORD_ONLY,
@@ -56,7 +57,7 @@ def _with_field_options(command: Callable[..., None]) -> Callable[..., None]:
                     typer.Option(
                         f"--{name.replace('_', '-')}",
                         metavar=_METAVARS[type(field.default)],
-                        help=f"{about}; default {'none' if field.default is None else field.default}.",
+                        help=f"{about}; default {default}.",
                     ),
                 ],
             )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from sme_registry.errors import DigestMismatchError, SpecError
 from sme_registry.io import read_json, to_json, write_atomically
@@ -25,10 +25,26 @@ _ROWS = Annotated[tuple[_ROW, ...], Field(strict=False, min_length=1, max_length
 
 
 class Fingerprint(StrictModel):
-    """A drawn task's numbers at fixed probes: π*(s) and T(s, a), `[P, A]` and `[P, S]`."""
+    """A drawn task's numbers at fixed probes.
+
+    Attributes:
+      optimal_action: `[P, A]` π*(s).
+      next_state: `[P, S]` T(s, a).
+      limit: `[P, A]` ℓ(s); None, and left out of the JSON, without `safety`.
+      next_distractors: `[P, m]` T_d(d, a); None, likewise, where they have no transition.
+      seen: `[P, S + m]` M(s, d); None, likewise, without a mixing.
+    """
 
     optimal_action: _ROWS
     next_state: _ROWS
+    limit: _ROWS | None = None
+    next_distractors: _ROWS | None = None
+    seen: _ROWS | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields: dict[str, Any] = handler(self)
+        return {name: value for name, value in fields.items() if value is not None}
 
 
 class Envelope(StrictModel):

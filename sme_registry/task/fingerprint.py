@@ -7,12 +7,12 @@ refused, so that no other task runs under the same name.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sme_registry.errors import FingerprintMismatchError
-from sme_registry.spec import Fingerprint
+from sme_registry.spec import Fingerprint, SMESpec
 from sme_registry.task.draw import Array
 
 if TYPE_CHECKING:
@@ -24,22 +24,45 @@ _DECIMALS = 12
 _GOLDEN = 0.6180339887498949
 
 
-def probes(state_dim: int, action_dim: int) -> tuple[Array, Array]:
-    """The fixed probes: states `[3, S]`, the last scaled out of the cube, and actions `[3, A]`."""
+class Probes(NamedTuple):
+    """Where a task is probed.
+
+    Attributes:
+      states: `[3, S]`, the last one scaled out of the cube.
+      actions: `[3, A]`.
+      distractors: `[3, m]`.
+    """
+
+    states: Array
+    actions: Array
+    distractors: Array
+
+
+def probes(spec: SMESpec) -> Probes:
+    """The fixed probes of a task's shape."""
     p = np.arange(1, PROBES + 1)[:, None]
-    states = np.modf(_GOLDEN * p * np.arange(1, state_dim + 1))[0]
+    states, actions, distractors = (
+        np.modf(_GOLDEN * (p + i * PROBES) * np.arange(1, width + 1))[0]
+        for i, width in enumerate((spec.state_dim, spec.action_dim, spec.distractors))
+    )
     states[-1] = 0.5 + 1.5 * (states[-1] - 0.5)
-    actions = np.modf(_GOLDEN * (p + PROBES) * np.arange(1, action_dim + 1))[0]
-    return states, actions
+    return Probes(states, actions, distractors)
 
 
 def fingerprint_of(task: Task) -> Fingerprint:
     """The fingerprint of a drawn task."""
-    states, actions = probes(task.spec.state_dim, task.spec.action_dim)
-    return Fingerprint(
-        optimal_action=np.round(task.optimal_action(states), _DECIMALS).tolist(),
-        next_state=np.round(task.transition(states, actions), _DECIMALS).tolist(),
-    )
+    states, actions, distractors = probes(task.spec)
+    numbers = {
+        "optimal_action": task.optimal_action(states),
+        "next_state": task.transition(states, actions),
+    }
+    if task.limiting:
+        numbers["limit"] = task.limit(states)
+    if task.distractor_transition is not None:
+        numbers["next_distractors"] = task.distractor_step(distractors, actions)
+    if task.mixing:
+        numbers["seen"] = task.seen(states, distractors)
+    return Fingerprint(**{name: np.round(x, _DECIMALS).tolist() for name, x in numbers.items()})
 
 
 def check_fingerprint(published: Fingerprint, task: Task) -> None:
@@ -49,9 +72,13 @@ def check_fingerprint(published: Fingerprint, task: Task) -> None:
       FingerprintMismatchError: shapes differ, or a number differs by more than 1e-6.
     """
     drawn = fingerprint_of(task)
-    for field in ("optimal_action", "next_state"):
+    for field in Fingerprint.model_fields:
         here, rows = np.asarray(getattr(drawn, field)), getattr(published, field)
-        if [len(row) for row in rows] != [here.shape[1]] * len(here):
+        if rows is None and not here.ndim:
+            continue
+        if rows is None or not here.ndim:
+            difference = "is missing" if rows is None else "is of something that the task has not"
+        elif [len(row) for row in rows] != [here.shape[1]] * len(here):
             difference = "has another shape"
         else:
             distance = float(np.abs(here - rows).max())

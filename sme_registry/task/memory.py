@@ -21,7 +21,7 @@ def parameter_bytes(spec: SMESpec) -> int:
 
 def peak_bytes(spec: SMESpec) -> int:
     """An upper estimate of the bytes needed while a task is drawn."""
-    largest = max(out * inputs for inputs, out, _ in _shapes(spec))
+    largest = max(out * inputs for inputs, out, count in _shapes(spec) if count)
     if spec.rotation:
         largest = max(largest, max(_observed(spec)) ** 2)
     return parameter_bytes(spec) + 8 * _WORKSPACE * largest
@@ -62,16 +62,28 @@ def _gib(count: int) -> str:
 
 def _shapes(spec: SMESpec) -> Iterator[tuple[int, int, int]]:
     """`(inputs, outputs, how many)` of every matrix of a task, without a list of its layers."""
-    H, inner = spec.hidden_width, spec.complexity - 1
     yield spec.action_dim, spec.state_dim, 1  # W and b of the transition
     for agent, observed in zip(agents(spec), _observed(spec), strict=True):
-        if inner == 0:
-            yield observed, agent.action_dim, 1
-        else:
-            yield observed, H, 1
-            if inner > 1:
-                yield H, H, inner - 1
-            yield H, agent.action_dim, 1
+        yield from _of_network(spec, observed, agent.action_dim)
+    if spec.safety is not None:
+        yield from _of_network(spec, spec.state_dim, spec.action_dim)
+    if spec.observation is not None:
+        yield spec.action_dim, spec.distractors, int(spec.observation.dynamics != "noise")
+        mixed = spec.state_dim + spec.distractors
+        depth = spec.observation.mixing_depth or int(spec.observation.mixing != "none")
+        yield mixed, mixed, depth
+
+
+def _of_network(spec: SMESpec, inputs: int, outputs: int) -> Iterator[tuple[int, int, int]]:
+    """The same of a network of the spec's complexity and width."""
+    H, inner = spec.hidden_width, spec.complexity - 1
+    if inner == 0:
+        yield inputs, outputs, 1
+        return
+    yield inputs, H, 1
+    if inner > 1:
+        yield H, H, inner - 1
+    yield H, outputs, 1
 
 
 def _observed(spec: SMESpec) -> list[int]:
