@@ -110,7 +110,8 @@ class Task:
         Returns:
           `[B, S]` or `[S]` next states in [0, 1].
         """
-        return _moved(*self._pairs(s, a), self.W, self.b)
+        s, a = self._pairs(s, a)
+        return _moved(s, a, self.W, self.b)
 
     def optimal_action(self, s: npt.ArrayLike) -> Array:
         """π*(s), the unique action of regret 0.
@@ -163,9 +164,9 @@ class Task:
     def cost_of(self, a: Array, limit: Array) -> Array:
         """The cost of actions in [0, 1] under limits, `[..., A]` each."""
         if self.spec.safety is None:
-            return cast(Array, np.zeros(a.shape[:-1])[()])
-        excess = np.maximum(0.0, a - limit).sum(axis=-1) / self.spec.action_dim
-        return excess / (2.0 * self.spec.safety.tightness)
+            return np.zeros(a.shape[:-1])
+        excess = np.maximum(0.0, a - limit).sum(axis=-1)
+        return cast(Array, excess / (2.0 * self.spec.safety.tightness * self.spec.action_dim))
 
     def distractor_step(self, d: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """The next distractors `[B, m]` or `[m]`, ψ(d + u W + b), as `transition` computes it.
