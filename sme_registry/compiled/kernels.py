@@ -20,6 +20,8 @@ Numba's disk cache does not know a function's flags: never compile one of these 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 from numba import boolean, float32, float64, int64, njit, types, void
@@ -36,6 +38,7 @@ from sme_registry.compiled.values import (
     STEP_REWARD,
 )
 from sme_registry.task import Task
+from sme_registry.task.draw import Layer
 
 BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
 _HEADER = 10
@@ -53,12 +56,21 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
         task.b,
     ]
     for observed, layers in zip(task.observed, task.policies, strict=True):
-        parts += [[len(observed), len(layers)], observed]
-        for W, b in layers:
-            parts += [W.shape[::-1], W.T.ravel(), b]
+        parts += [[len(observed), len(layers)], observed, *_parts(layers)]
     packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
     packed[8] = packed.size
     return packed
+
+
+def pack_layers(layers: Sequence[Layer]) -> npt.NDArray[np.float64]:
+    """Layers as one flat array: how many, the widest, and each as in a packed task."""
+    widest = max(max(W.shape) for W, _ in layers)
+    parts = [np.array([len(layers), widest]), *_parts(layers)]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def _parts(layers: Sequence[Layer]) -> list[npt.ArrayLike]:
+    return [part for W, b in layers for part in (W.shape[::-1], W.T.ravel(), b)]
 
 
 def lane_size(packed: npt.NDArray[np.float64]) -> int:
@@ -216,10 +228,10 @@ def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-unt
 
 
 @njit(error_model="numpy")
-def _block_layer(W, b, x, y, cells, count):  # type: ignore[no-untyped-def]
+def _block_layer(W, b, x, y, cells, count, uniform=True):  # type: ignore[no-untyped-def]
     """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed.
 
-    `cells` `[count]` is room for those of Φ's table.
+    `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b.
     """
     # Two indices everywhere: a row taken as an array of its own costs two atomic operations.
     inputs, outputs = W.shape
@@ -249,6 +261,8 @@ def _block_layer(W, b, x, y, cells, count):  # type: ignore[no-untyped-def]
             for lane in range(count):
                 y[o, lane] = y[o, lane] + w * x[i0, lane]
             i += 1
+        if not uniform:
+            continue
         for lane in range(count):
             cells[lane], y[o, lane] = cell_of(y[o, lane])
         for lane in range(count):
@@ -475,6 +489,41 @@ def step_many(p, s, t, accumulated, action, moved, observation, optimal, values,
         for i in range(t.size):
             t[i] += 1
     return finite
+
+
+NETWORK = void(_PACKED, float64[:, ::1], boolean, float64[:, ::1])
+
+
+@njit(NETWORK, error_model="numpy", cache=True)
+def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
+    """The output of packed layers for `B` lanes.
+
+    Args:
+      p: the packed layers; see `pack_layers`.
+      s: `[in, B]`.
+      uniform: whether each layer ends with Φ.
+      out: `[out, B]`, written.
+    """
+    layers, widest = int(p[0]), int(p[1])
+    lanes = min(max(32, min(128, BLOCK_NUMBERS // widest)), s.shape[1])
+    x, y, cells = np.empty((widest, lanes)), np.empty((widest, lanes)), np.empty(lanes, np.int32)
+    for first in range(0, s.shape[1], lanes):
+        count = min(lanes, s.shape[1] - first)
+        for j in range(s.shape[0]):
+            for lane in range(count):
+                x[j, lane] = s[j, first + lane]
+        at = 2
+        for _ in range(layers):
+            inputs, outputs = int(p[at]), int(p[at + 1])
+            at += 2
+            b = at + inputs * outputs
+            W = p[at:b].reshape(inputs, outputs)
+            _block_layer(W, p[b : b + outputs], x, y, cells, count, uniform)
+            at = b + outputs
+            x, y = y, x
+        for o in range(out.shape[0]):
+            for lane in range(count):
+                out[o, first + lane] = x[o, lane]
 
 
 @njit(void(float64[:, ::1], _PACKED), error_model="numpy", cache=True)
