@@ -109,6 +109,12 @@ QUANTITIES = {
     "coverage": "in a recipe ε of the states kept; in a diagnosis the share of bins visited",
     "optimal_action": "π*(s) at the fingerprint's probes",
     "next_state": "T(s, a) at the fingerprint's probes",
+    "limit": "ℓ(s), the limits of the action channels, at the fingerprint's probes",
+    "next_distractors": "the distractors after d, at the fingerprint's probes",
+    "seen": "M(s, d), what the agent sees of the state, at the fingerprint's probes",
+    "tightness": "τ, share of states and channels in which the optimum breaks its limit",
+    "distractors": "m, channels of the observation without meaning",
+    "mixing_depth": "layers of a nonlinear mixing",
     # Hyperparameters
     "hidden": "widths of a network's hidden layers",
     "learning_rate": "step size of the optimiser",

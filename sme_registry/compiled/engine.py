@@ -27,6 +27,7 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
+from sme_registry.errors import SpecError
 from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array
@@ -107,7 +108,11 @@ def engine(task: Task, backend: Backend | None = None) -> Engine:
 
     Raises:
       OptionError, MissingDependencyError: see `chosen_backend`.
+      SpecError: the task has `safety` or `observation`, which no environment runs yet.
     """
+    for field in ("safety", "observation"):
+        if getattr(task.spec, field) is not None:
+            raise SpecError(f"{field}: no environment runs it yet. Leave it out.")
     make = _numba_engine if (backend or chosen_backend()) == "numba" else _numpy_engine
     return make(task)
 
