@@ -47,8 +47,8 @@ def certify(
     """Draw a task and check that it is sound, before training on it.
 
     A broken or trivial task is refused. A warning marks a valid but easy one, such as a
-    semi_orthogonal policy of 2 to 5 layers, whose target stays near the middle. Exit code 1 if any
-    task is refused.
+    semi_orthogonal policy of 2 to 5 layers, whose target stays near the middle, or one whose limits
+    bind more or less often than its tightness says. Exit code 1 if any task is refused.
 
     Examples:
 
@@ -139,6 +139,6 @@ def _print_certificate(label: str, certificate: Certificate) -> None:
         reasons = ", ".join(check.name for check in refused)
         err().print(f"[red]refused[/] for {reasons}. Use another seed, or change a field.")
     elif certificate.outcome == "warning":
-        err().print("[yellow]valid, but easy[/]: see the warnings above.")
+        err().print("[yellow]valid, with warnings[/]: see above.")
     else:
         err().print("[green]passed[/]")

@@ -179,21 +179,22 @@ class ObservationSpec(Document):
 
     @model_validator(mode="after")
     def _one_document_for_one_observation(self) -> Self:
-        if not self.distractors and self.mixing == "none":
-            raise ValueError(
-                "has neither distractors nor a mixing, so it changes nothing. Give one of them, or "
-                "leave observation out."
-            )
-        for field, needed, default in (
-            ("dynamics", self.distractors > 0, "noise"),
-            ("mixing_depth", self.mixing == "nonlinear", 1),
+        for field, condition, needed, default in (
+            ("dynamics", "distractors > 0", self.distractors > 0, "noise"),
+            ("mixing_depth", "mixing='nonlinear'", self.mixing == "nonlinear", 1),
         ):
             value = getattr(self, field)
             if value is not None and not needed:
-                what = "distractors > 0" if field == "dynamics" else "mixing='nonlinear'"
-                raise ValueError(f"{field}={value!r}: needs {what}. Leave it out.")
+                raise ValueError(
+                    f"{field}={value!r}: needs {condition}. Leave {field} out, or set {condition}."
+                )
             if value is None and needed:
                 object.__setattr__(self, field, default)
+        if not self.distractors and self.mixing == "none":
+            raise ValueError(
+                "distractors=0: with mixing='none' the agent would see the state as it is. Set "
+                "distractors > 0 or a mixing, or leave observation out."
+            )
         return self
 
 
@@ -279,15 +280,15 @@ class Setting(Document):
     def _optimum_is_known(self) -> Self:
         if self.safety is not None and self.D > 0:
             raise ValueError(
-                f"safety: needs D=0, not D={self.D}, because with early termination the best safe "
-                "action is not known: it may pay to break a limit and survive. Leave one of them "
+                f"D={self.D}: must be 0 with safety, because with early termination the best safe "
+                "action is not known: it may pay to break a limit and survive. Leave D or safety "
                 "out."
             )
         for field in ("safety", "observation"):
             if getattr(self, field) is not None and self.team is not None:
                 raise ValueError(
-                    f"{field}: is for a single agent, and this task is for a team of "
-                    f"{len(self.team.agents)}. Leave one of them out."
+                    f"{field}={short_repr(getattr(self, field).to_dict())}: must be null in a task "
+                    f"for a team ({len(self.team.agents)} agents). Leave {field} or team out."
                 )
         return self
 

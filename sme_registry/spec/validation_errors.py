@@ -57,7 +57,7 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
     """One of Pydantic's error lines as `field=value: what is allowed. What to do.`"""
     location, kind = line["loc"], line["type"]
     path = _shortened(".".join(str(part) for part in location), _MAX_PATH)
-    value = short_repr(line["input"])
+    value, schema = short_repr(line["input"]), _schema_at(root, location)
     if kind in ("extra_forbidden", "invalid_key"):
         known = _resolved(root, _schema_at(root, location[:-1])).get("properties", {})
         hint = (
@@ -67,7 +67,6 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
         if kind == "invalid_key":
             return f"{path}: field names must be strings.{hint}"
         return f"{path}={value}: unknown field.{hint} Rename or remove it."
-    schema = _schema_at(root, location)
     if kind == "value_error":
         message = str(line["ctx"]["error"])
         if "properties" not in _resolved(root, schema):
@@ -76,7 +75,9 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
     if kind == "missing":
         return f"{path}: missing: must be {_allowed(root, schema)}. Add it."
     if kind in ("model_type", "model_attributes_type"):
-        return f"{path}{': ' if path else ''}must be an object of named fields, got {value}."
+        fields = _resolved(root, schema).get("properties", {}) if path else {}
+        known = f" Known fields: {', '.join(fields)}." if fields else ""
+        return f"{path}{': ' if path else ''}must be an object of named fields, got {value}.{known}"
     fix = "Correct it."
     if schema.get("default") is not None:
         fix = f"Correct it, or leave it out for the default, {short_repr(schema['default'])}."

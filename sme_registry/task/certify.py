@@ -1,6 +1,7 @@
 """`certify`: checks of a drawn task, to reject a bad draw before training.
 
 Source: METHOD, sections 1 and 2. Axis letters: `S` state_dim, `A` action_dim, `N` lanes or states.
+`certify_safety` and `certify_observation` have the checks of specs with these fields.
 
 A check passes inside one range, warns inside a wider one, and refuses outside both. A warning means
 that a task is correct but easy: the constant action ½ is near its optimum, as METHOD says of
@@ -26,97 +27,35 @@ L 1..20). Mean r̃ of the constant policy: smallest, median, largest. Spread: sm
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
 
 import numpy as np
 
 from sme_registry.io import integer_in
 from sme_registry.spec import SpecLike
 from sme_registry.task import memory
+from sme_registry.task.certificate import INF, Certificate, Check, judged, numbers, reported
+from sme_registry.task.certify_observation import observation_checks
+from sme_registry.task.certify_safety import safety_checks
 from sme_registry.task.draw import Array, Layer
 from sme_registry.task.loading import load_task
-from sme_registry.task.streams import uniform
 from sme_registry.task.task import Task
-
-Outcome = Literal["passed", "warning", "refused", "reported"]
-_WORST_FIRST: tuple[Outcome, ...] = ("refused", "warning")
-
-_INF = math.inf
+from sme_registry.task.uniformity import (
+    CONSTANT_STEPS,
+    distance_from_uniform,
+    distinct_share,
+    lanes_followed,
+    uniform_bound,
+)
 
 STATES = 20_000  # the standard error of mean r̃ is then below 0.001
 LANES = 4_096
 MIXING_STEPS = 100
-CONSTANT_STEPS = 2_000
 _TOGETHER = 256
-_CHANNELS_FOLLOWED = 256
 _CELLS = 16
 _BLOCK = 4_096  # states
-_FALSE_ALARM = 1e-6  # chance that a uniform ensemble is refused by one of the uniformity checks
 _LINEAR_LIMIT = 1_024  # above it the least-squares fit takes longer than everything else
 _ROUNDING = 1e-9
 _CONSTANT_PASSES, _CONSTANT_WARNS = (0.65, 0.80), (0.60, 0.90)  # mean r̃ of the action ½
-
-
-@dataclass(frozen=True)
-class Check:
-    """One measured number of a task, and its range.
-
-    Attributes:
-      name: of the number.
-      value: the number; None where it was not measured; `meaning` gives the reason.
-      low, high: the range in which it passes; None where there is no bound on that side.
-      outcome: "passed"; "warning" for an easy task; "refused" for a broken or
-        trivial one; "reported" for numbers without a range.
-      meaning: one sentence for the reader.
-    """
-
-    name: str
-    value: float | None
-    low: float | None
-    high: float | None
-    outcome: Outcome
-    meaning: str
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """The result of `certify`.
-
-    Attributes:
-      digest: of the spec.
-      seed: of the states and actions that it was measured with; not the task's.
-      checks: in the order of `certify`.
-    """
-
-    digest: str
-    seed: int
-    checks: tuple[Check, ...]
-
-    @property
-    def outcome(self) -> Outcome:
-        """The worst of the checks: "passed", "warning" or "refused"."""
-        outcomes = {check.outcome for check in self.checks}
-        return next((worst for worst in _WORST_FIRST if worst in outcomes), "passed")
-
-    @property
-    def passed(self) -> bool:
-        """Whether no check refuses the task; warnings pass."""
-        return self.outcome != "refused"
-
-    def of(self, outcome: Outcome) -> tuple[Check, ...]:
-        """The checks with this outcome."""
-        return tuple(check for check in self.checks if check.outcome == outcome)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain JSON data."""
-        return {
-            "digest": self.digest,
-            "seed": self.seed,
-            "outcome": self.outcome,
-            "passed": self.passed,
-            "checks": [asdict(check) for check in self.checks],
-        }
 
 
 def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
@@ -137,12 +76,13 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
     seed = integer_in("seed", seed, 0, 2**53 - 1, advice="Leave it out for 0.")
     if not isinstance(task, Task):
         task = load_task(task)
-    S, A = task.spec.state_dim, task.spec.action_dim
+    S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
     lanes = max(256, min(LANES, 2**24 // (S * A)))
-    states = max(2_000, min(STATES, 2**26 // (S + task.spec.hidden_width)))
+    states = max(2_000, min(STATES, 2**26 // (S + m + task.spec.hidden_width)))
+    distractors = f", distractors={m}" if m else ""
     memory.refuse_above_limit(
-        48 * max(lanes, states) * (S + A + task.spec.hidden_width),
-        f"Certifying a task of state_dim={S}, action_dim={A}",
+        48 * max(lanes, states) * (S + A + m + task.spec.hidden_width),
+        f"Certifying a task of state_dim={S}, action_dim={A}{distractors}",
         "Certify a task of the same kind with fewer channels.",
     )
     checks = (
@@ -150,58 +90,35 @@ def certify(task: Task | SpecLike, *, seed: int = 0) -> Certificate:
         *_mixing(task, seed, lanes),
         _no_collapse(task, seed),
         *_difficulty(task, seed, states),
+        *safety_checks(task, seed, states),
+        *observation_checks(task, seed, states),
     )
     return Certificate(task.spec.digest, seed, checks)
 
 
-def _check(
-    name: str,
-    value: float,
-    meaning: str,
-    *,
-    passes: tuple[float, float],
-    warns: tuple[float, float] | None = None,
-) -> Check:
-    low, high = (bound if math.isfinite(bound) else None for bound in passes)
-    outcome: Outcome = "refused"
-    if passes[0] <= value <= passes[1]:
-        outcome = "passed"
-    elif warns is not None and warns[0] <= value <= warns[1]:
-        outcome = "warning"
-    return Check(name, value, low, high, outcome, meaning)
-
-
-def _report(name: str, value: float | None, meaning: str) -> Check:
-    return Check(name, value, None, None, "reported", meaning)
-
-
-def _draw(task: Task, seed: int, name: str, *shape: int) -> Array:
-    """Uniform numbers for measuring, independent of every stream that tasks are drawn from."""
-    label = f"certify/{task.spec.digest}/{name}"
-    return uniform(seed, label, math.prod(shape)).reshape(shape)
-
-
 def _parameters(task: Task) -> tuple[Check, ...]:
-    every = [layer for policy in task.policies for layer in policy]
+    every = [layer for network in (*task.policies, task.limiting) for layer in network]
+    network = "π* or v" if task.limiting else "π*"
     unit_rows = task.spec.policy_init == "unit_variance"
     return (
-        _check(
+        judged(
             "transition_row_sums",
             float(np.abs(task.W.sum(axis=1) - 1.0).max()),
             "How far a row of W is from the sum 1, which keeps an action's mass.",
-            passes=(-_INF, 0.0),
+            passes=(-INF, 0.0),
         ),
-        _check(
+        judged(
             "layers_orthogonal",
             max(_orthogonality_error(layer, unit_rows) for layer in every),
-            "How far W/√12 of a layer of π* is from semi-orthogonal (rescaled: from unit rows).",
-            passes=(-_INF, _ROUNDING),
+            f"How far W/√12 of a layer of {network} is from semi-orthogonal (rescaled: from unit "
+            "rows).",
+            passes=(-INF, _ROUNDING),
         ),
-        _check(
+        judged(
             "layers_centred",
             max(float(np.abs(layer.b + 0.5 * layer.W.sum(axis=1)).max()) for layer in every),
             "How far a layer's b is from −½ W 1, which keeps its outputs around ½.",
-            passes=(-_INF, _ROUNDING),
+            passes=(-INF, _ROUNDING),
         ),
     )
 
@@ -222,43 +139,33 @@ def _mixing(task: Task, seed: int, lanes: int) -> tuple[Check, ...]:
     which the actions put little may stay in a nearly invariant set. So it has no range.
     """
     S, A = task.spec.state_dim, task.spec.action_dim
-    s = _draw(task, seed, "states", lanes, S)
-    together = np.repeat(_draw(task, seed, "start", 1, S), _TOGETHER, axis=0)
+    s = numbers(task, seed, "states", lanes, S)
+    together = np.repeat(numbers(task, seed, "start", 1, S), _TOGETHER, axis=0)
     for t in range(MIXING_STEPS):
-        a = _draw(task, seed, f"actions/{t}", lanes, A)
+        a = numbers(task, seed, f"actions/{t}", lanes, A)
         s, together = task.transition(s, a), task.transition(together, a[:_TOGETHER])
-    # Kolmogorov's bound on √N·D, shared out over the channels (Bonferroni).
-    bound = math.sqrt(0.5 * math.log(2.0 * S / _FALSE_ALARM))
     return (
-        _check(
+        judged(
             "uniform_states",
-            _distance_from_uniform(s),
+            distance_from_uniform(s),
             f"Largest √N·KS distance of a state channel from uniform, {MIXING_STEPS} random "
             "actions after uniform starts.",
-            passes=(-_INF, bound),
+            passes=(-INF, uniform_bound(S)),
         ),
-        _check(
+        judged(
             "coverage",
             _coverage(s, pairs=S > 1),
             f"Smallest share of the {_CELLS} × {_CELLS} cells of two neighbouring state channels "
             "that these states lie in.",
-            passes=(0.95 if lanes == LANES else 0.5, _INF),
+            passes=(0.95 if lanes == LANES else 0.5, INF),
         ),
-        _report(
+        reported(
             "coverage_from_one_start",
             _coverage(together, pairs=False),
             f"Smallest share of {_CELLS} cells of a state channel that {_TOGETHER} lanes reach by "
             f"the same number of random actions, all from one start.",
         ),
     )
-
-
-def _distance_from_uniform(s: Array) -> float:
-    """The largest √N · KS distance of the marginals of `[N, S]` states from U(0, 1)."""
-    N = len(s)
-    ranked = np.sort(s, axis=0)
-    steps = np.arange(N)[:, None] / N
-    return float(math.sqrt(N) * np.maximum(ranked - steps, steps + 1.0 / N - ranked).max())
 
 
 def _coverage(s: Array, *, pairs: bool) -> float:
@@ -270,46 +177,27 @@ def _coverage(s: Array, *, pairs: bool) -> float:
 
 
 def _no_collapse(task: Task, seed: int) -> Check:
-    """Under one constant action a channel must neither merge its lanes nor fall into a short cycle.
-
-    A dyadic b with a dyadic action merges all lanes within 52 steps; float32 states cycle within
-    about 2,000.
-    """
     S, A = task.spec.state_dim, task.spec.action_dim
-    lanes = max(8, min(64, 2**20 // (S * A)))
-    constants = np.concatenate([np.full((1, A), c) for c in (0.0, 0.5, 1.0)])
-    constants = np.concatenate([constants, _draw(task, seed, "constants", 1, A)])
-    a = np.repeat(constants, lanes, axis=0)
-    s = np.tile(_draw(task, seed, "constant_starts", lanes, S), (len(constants), 1))
-    history = np.empty((CONSTANT_STEPS, len(constants), min(S, _CHANNELS_FOLLOWED)))
-    for t in range(CONSTANT_STEPS):
-        s = task.transition(s, a)
-        history[t] = s[::lanes, : history.shape[2]]
-    last = s.reshape(len(constants), lanes, S).swapaxes(0, 1)
-    return _check(
+    lanes = lanes_followed(S, A)
+    starts = numbers(task, seed, "constant_starts", lanes, S)
+    return judged(
         "distinct_states",
-        min(_distinct(history), _distinct(last)),
+        distinct_share(task.transition, starts, numbers(task, seed, "constants", 1, A)),
         f"Smallest share of distinct values of a state channel, over {CONSTANT_STEPS:,} steps of "
         f"one constant action and over {lanes} lanes after them: floating point must not collapse.",
-        passes=(0.99, _INF),
+        passes=(0.99, INF),
     )
-
-
-def _distinct(values: Array) -> float:
-    """The smallest share of distinct values along the first axis."""
-    ranked = np.sort(values, axis=0)
-    return float((1 + (np.diff(ranked, axis=0) > 0).sum(axis=0)).min()) / len(values)
 
 
 def _difficulty(task: Task, seed: int, states: int) -> list[Check]:
     """How far from trivial π* is: the scores of policies that know nothing, and its spread."""
-    s = _draw(task, seed, "difficulty", states, task.spec.state_dim)
+    s = numbers(task, seed, "difficulty", states, task.spec.state_dim)
     # In blocks: a deep policy's inner layers of all states would not fit in cache.
     optimal = np.concatenate([task.policy(s[i : i + _BLOCK]) for i in range(0, states, _BLOCK)])
     constant = np.full_like(optimal, 0.5)
     similarity = task.similarity_of(constant, optimal)
     checks = [
-        _check(
+        judged(
             "constant_policy_similarity",
             float(similarity.mean()),
             "Mean r̃ of the constant action ½ over uniform states; near 0.75 where π* spreads over "
@@ -317,20 +205,20 @@ def _difficulty(task: Task, seed: int, states: int) -> list[Check]:
             passes=_CONSTANT_PASSES,
             warns=_CONSTANT_WARNS,
         ),
-        _check(
+        judged(
             "constant_policy_reward",
             float(task.reward_of(similarity).mean()),
             "Mean step reward of the constant action ½, which an agent earns without learning.",
-            passes=(-_INF, 0.30),
-            warns=(-_INF, 0.60),
+            passes=(-INF, 0.30),
+            warns=(-INF, 0.60),
         ),
-        _check(
+        judged(
             "channel_spread",
             float(optimal.std(axis=0).min()),
             "Smallest standard deviation of a channel of π* over uniform states; 0.289 where it "
             "is uniform, 0 where the channel has collapsed to a constant.",
-            passes=(0.15, _INF),
-            warns=(0.05, _INF),
+            passes=(0.15, INF),
+            warns=(0.05, INF),
         ),
     ]
     if task.spec.team is not None:
@@ -338,7 +226,7 @@ def _difficulty(task: Task, seed: int, states: int) -> list[Check]:
         means = task.similarities_of(constant, optimal).mean(axis=0)
         agent = int(np.abs(means - 0.75).argmax())
         checks.append(
-            _check(
+            judged(
                 "agent_constant_policy_similarity",
                 float(means[agent]),
                 f"Mean r̃ of ½ over one agent's own channels: of {task.names[agent]}, where it is "
@@ -356,7 +244,7 @@ def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
     name = "linear_policy_reward"
     if S > _LINEAR_LIMIT or half < 4 * (S + 1):
         meaning = f"Not measured: a fit over state_dim={S} channels takes too long."
-        return _report(name, None, meaning)
+        return reported(name, None, meaning)
     affine = np.concatenate([s, np.ones((len(s), 1))], axis=1)
     fitted, *_ = np.linalg.lstsq(affine[:half], optimal[:half], rcond=None)
     actions = np.clip(affine[half:] @ fitted, 0.0, 1.0)
@@ -365,4 +253,4 @@ def _linear_policy(task: Task, s: Array, optimal: Array) -> Check:
         "Mean step reward of the least-squares linear policy, which needs no deep learning. It "
         "has no range: it is high at complexity 1 by construction."
     )
-    return _report(name, float(value), meaning)
+    return reported(name, float(value), meaning)

@@ -44,10 +44,11 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
       FingerprintMismatchError: the numbers drawn on this machine differ from the published ones.
     """
     spec = as_spec(spec)
+    sizes = ("state_dim", "action_dim", "complexity", "hidden_width")
+    named = [*sizes, "distractors"] if spec.distractors else sizes
     memory.refuse_above_limit(
         memory.peak_bytes(spec),
-        f"A task of state_dim={spec.state_dim}, action_dim={spec.action_dim}, "
-        f"complexity={spec.complexity}, hidden_width={spec.hidden_width}",
+        f"A task of {', '.join(f'{size}={getattr(spec, size)}' for size in named)}",
         "Make one of these smaller.",
     )
     small = memory.parameter_bytes(spec) <= _CACHED_BYTES

@@ -1,0 +1,173 @@
+"""Certificates of distractors and mixings: sound ones pass, and each check can fail."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec
+from sme_registry.errors import ResourceLimitError
+from sme_registry.task import Layer, Task, materialize
+from sme_registry.task.certify import certify
+from sme_registry.task.certify_observation import _jacobians, observation_checks
+from tests.task.test_certify import check
+
+MOVING = {"distractor_row_sums", "uniform_distractors", "distinct_distractors"}
+MIXED = {"mixing_orthogonal", "mixing_centred", "mixing_condition", "mixing_linear_r2"}
+
+
+def spec(**observation: Any) -> SMESpec:
+    return SMESpec(state_dim=4, action_dim=2, seed=1, observation=observation)
+
+
+def outcome(task: Task, name: str) -> str:
+    (found,) = [each for each in observation_checks(task, 0, 4_000) if each.name == name]
+    return found.outcome
+
+
+def with_mixing(task: Task, *layers: Layer) -> Task:
+    return dataclasses.replace(task, mixing=layers)
+
+
+@pytest.mark.parametrize(
+    ("observation", "names"),
+    [
+        ({"distractors": 4}, set()),
+        ({"distractors": 4, "dynamics": "autonomous"}, MOVING),
+        ({"distractors": 4, "dynamics": "driven", "mixing": "nonlinear"}, MOVING | MIXED),
+        ({"mixing": "orthogonal"}, MIXED | {"mixing_extent"}),
+        ({"distractors": 32, "mixing": "nonlinear", "mixing_depth": 3}, MIXED),
+    ],
+)
+def test_a_sound_task_passes_and_has_the_checks_of_its_parts(
+    observation: dict[str, Any], names: set[str]
+) -> None:
+    certificate = certify(spec(**observation))
+    assert certificate.outcome == "passed"
+    plain = {each.name for each in certify(SMESpec(state_dim=4, action_dim=2, seed=1)).checks}
+    assert {each.name for each in certificate.checks} - plain == names
+
+
+def test_an_orthogonal_mixing_is_undone_by_a_linear_map_without_loss() -> None:
+    certificate = certify(spec(distractors=4, mixing="orthogonal"))
+    assert check(certificate, "mixing_condition").value == pytest.approx(1.0)
+    assert check(certificate, "mixing_linear_r2").value == pytest.approx(1.0)
+    assert check(certificate, "mixing_extent").value == pytest.approx(1.0)
+
+
+def test_deeper_mixings_are_worse_conditioned_and_less_linear() -> None:
+    found = [
+        certify(spec(distractors=12, mixing="nonlinear", mixing_depth=depth)) for depth in (1, 2, 3)
+    ]
+    conditions = [check(each, "mixing_condition").value for each in found]
+    r2 = [check(each, "mixing_linear_r2").value for each in found]
+    assert conditions == sorted(conditions)  # type: ignore[type-var]
+    assert r2 == sorted(r2, reverse=True)  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("mixing", ["orthogonal", "nonlinear"])
+def test_the_jacobian_is_the_derivative_of_the_mixing(mixing: str) -> None:
+    depth = {"mixing_depth": 2} if mixing == "nonlinear" else {}
+    task = materialize(spec(distractors=2, mixing=mixing, **depth))
+    x, h = np.random.default_rng(0).random((5, 6)), 1e-6
+    steps = h * np.eye(6)
+    columns = [
+        (task.seen(x[:, :4] + e[:4], x[:, 4:] + e[4:]) - task.seen(x[:, :4], x[:, 4:])) / h
+        for e in steps
+    ]
+    np.testing.assert_allclose(_jacobians(task, x), np.stack(columns, axis=-1), atol=1e-4)
+
+
+def test_a_mixing_too_deep_for_float32_is_refused() -> None:
+    task = materialize(spec(distractors=36, mixing="nonlinear", mixing_depth=3))
+    twice = with_mixing(task, *task.mixing, *task.mixing)
+    assert outcome(task, "mixing_condition") == "passed"
+    assert outcome(twice, "mixing_condition") == "refused"
+
+
+def test_a_mixing_that_saturates_is_refused() -> None:
+    task = materialize(spec(distractors=4, mixing="nonlinear"))
+    ((W, b),) = task.mixing
+    saturated = with_mixing(task, Layer(20 * W, 20 * b))
+    for name in ("mixing_orthogonal", "mixing_condition", "mixing_linear_r2"):
+        assert outcome(saturated, name) == "refused"
+
+
+def test_a_mixing_that_loses_a_channel_is_refused() -> None:
+    task = materialize(spec(distractors=4, mixing="nonlinear"))
+    ((W, b),) = task.mixing
+    lossy = with_mixing(task, Layer(np.concatenate([W[:1], W[:-1]]), b))
+    for name in ("mixing_orthogonal", "mixing_condition", "mixing_linear_r2"):
+        assert outcome(lossy, name) == "refused"
+    condition = check(certify(lossy), "mixing_condition").value
+    assert condition is not None
+    assert np.isfinite(condition)  # JSON has no infinity
+
+
+@pytest.mark.parametrize("mixing", ["orthogonal", "nonlinear"])
+def test_a_mixing_that_is_not_orthogonal_or_off_centre_is_refused(mixing: str) -> None:
+    task = materialize(spec(distractors=4, mixing=mixing))
+    ((W, b),) = task.mixing
+    skewed = W.copy()
+    skewed[0, 0] += 1e-6
+    assert outcome(with_mixing(task, Layer(skewed, b)), "mixing_orthogonal") == "refused"
+    assert outcome(with_mixing(task, Layer(W, b + 1e-6)), "mixing_centred") == "refused"
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_a_rotation_that_leaves_the_cube_or_does_not_fill_it_is_refused(scale: float) -> None:
+    task = materialize(spec(distractors=4, mixing="orthogonal"))
+    ((W, _),) = task.mixing
+    scaled = Layer(scale * W, 0.5 - 0.5 * scale * W.sum(axis=1))
+    assert outcome(with_mixing(task, scaled), "mixing_extent") == "refused"
+    assert outcome(with_mixing(task, scaled), "mixing_centred") == "passed"
+
+
+class Folding(Task):
+    """Distractors that keep to half of the cube."""
+
+    def distractor_step(self, d, u):  # type: ignore[no-untyped-def, override]
+        return super().distractor_step(d, u) / 2.0
+
+
+@pytest.mark.parametrize("dynamics", ["autonomous", "driven"])
+def test_distractors_that_do_not_stay_uniform_are_refused(dynamics: str) -> None:
+    task = materialize(spec(distractors=3, dynamics=dynamics))
+    fields = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    assert outcome(task, "uniform_distractors") == "passed"
+    assert outcome(Folding(**fields), "uniform_distractors") == "refused"
+
+
+def test_distractors_that_collapse_are_refused() -> None:
+    task = materialize(spec(distractors=3, dynamics="driven"))
+    assert task.distractor_transition is not None
+    W, _ = task.distractor_transition
+    dyadic = dataclasses.replace(task, distractor_transition=(W, np.array([0.0, 0.25, 0.5])))
+    assert outcome(task, "distinct_distractors") == "passed"
+    assert outcome(dyadic, "distinct_distractors") == "refused"
+
+
+def test_rows_of_the_distractors_that_lose_an_actions_mass_are_refused() -> None:
+    task = materialize(spec(distractors=3, dynamics="driven"))
+    assert task.distractor_transition is not None
+    W, b = task.distractor_transition
+    lossy = dataclasses.replace(task, distractor_transition=(W * (1 + 2.0**-29), b))
+    assert outcome(lossy, "distractor_row_sums") == "refused"
+
+
+def test_a_mixing_of_very_many_channels_is_not_measured_and_says_so() -> None:
+    checks = observation_checks(materialize(spec(distractors=1_100, mixing="orthogonal")), 0, 2_000)
+    skipped = [each for each in checks if each.outcome == "reported"]
+    assert [each.name for each in skipped] == ["mixing_condition", "mixing_linear_r2"]
+    assert all(each.value is None and "1,104 channels" in each.meaning for each in skipped)
+
+
+def test_distractors_count_in_the_memory_of_a_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = spec(distractors=20_000)
+    monkeypatch.setenv("SME_MEMORY_LIMIT_GIB", "1")
+    materialize(many)
+    with pytest.raises(ResourceLimitError, match="distractors=20000"):
+        certify(many)
