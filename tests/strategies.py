@@ -33,9 +33,33 @@ def teams(draw: st.DrawFn, state_dim: int, action_dim: int) -> dict[str, Any]:
     return {"agents": agents, "reward": draw(st.sampled_from(["individual", "team"]))}
 
 
+SAFETY = st.fixed_dictionaries({"tightness": st.floats(0.0, 0.5, exclude_min=True)})
+
+
 @st.composite
-def spec_fields(draw: st.DrawFn, team: bool | None = None) -> dict[str, Any]:
-    """The fields of a valid spec as plain data; `team` says whether it has one (None: either)."""
+def observations(draw: st.DrawFn) -> dict[str, Any]:
+    """What an agent may see in place of the state; fields that have a default may be left out."""
+    mixing = draw(st.sampled_from(["none", "orthogonal", "nonlinear"]))
+    m = draw(st.integers(1 if mixing == "none" else 0, 5))
+    fields: dict[str, Any] = {"distractors": m, "mixing": mixing}
+    if m and draw(st.booleans()):
+        fields["dynamics"] = draw(st.sampled_from(["noise", "autonomous", "driven"]))
+    if mixing == "nonlinear" and draw(st.booleans()):
+        fields["mixing_depth"] = draw(st.integers(1, 3))
+    return fields
+
+
+@st.composite
+def spec_fields(
+    draw: st.DrawFn, team: bool | None = None, *, plain: bool = False
+) -> dict[str, Any]:
+    """The fields of a valid spec as plain data.
+
+    Args:
+      draw: Hypothesis's.
+      team: whether it has a team; None for either.
+      plain: leave out safety and observation.
+    """
     state_dim, action_dim = draw(st.integers(1, 6)), draw(st.integers(1, 5))
     fields = {
         "state_dim": state_dim,
@@ -51,12 +75,17 @@ def spec_fields(draw: st.DrawFn, team: bool | None = None) -> dict[str, Any]:
     }
     if draw(st.booleans()) if team is None else team:
         fields["team"] = draw(teams(state_dim, action_dim))
+    elif not plain:
+        if fields["D"] == 0.0 and draw(st.booleans()):
+            fields["safety"] = draw(SAFETY)
+        if draw(st.booleans()):
+            fields["observation"] = draw(observations())
     agents = fields.get("team", {}).get("agents", [])
     if state_dim > 1 and all(len(agent["observes"]) > 1 for agent in agents):
         fields["rotation"] = draw(ANGLES)
     return fields
 
 
-def specs(team: bool | None = None) -> st.SearchStrategy[SMESpec]:
-    """Valid specs; `team` says whether they have one (None: either)."""
-    return spec_fields(team).map(SMESpec.from_dict)
+def specs(team: bool | None = None, *, plain: bool = False) -> st.SearchStrategy[SMESpec]:
+    """Valid specs; see `spec_fields`."""
+    return spec_fields(team, plain=plain).map(SMESpec.from_dict)

@@ -203,6 +203,34 @@ class TestShow:
         assert facts["parameter_memory_bytes"] == 8 * numbers
         assert (facts["largest_return"], facts["payouts_in_a_full_episode"]) == (100, 4)
 
+    def test_limits_and_what_the_agent_sees_are_fields_and_facts(self) -> None:
+        observation = {"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"}
+        options = ("--safety", '{"tightness": 0.2}', "--observation", json.dumps(observation))
+        good("new", "a.json", *options)
+        text = good("show", "a.json").stdout
+        for line in (
+            r"safety\.tightness +0\.2", r"observation\.distractors +32",
+            r"observation\.dynamics +driven", r"observation\.mixing +nonlinear",
+            r"observation\.mixing_depth +1", r"limits +in \[0\.6, 1\], one for each action channel",
+        ):  # fmt: skip
+            assert re.search(f"^{line}$", text, re.M)
+        seen = "nonlinear mixing of state and 32 distractors"
+        derived = json.loads(good("show", "a.json", "--json").stdout)["derived"]
+        assert derived["observation"] == f"[42] float32 in [0, 1]: {seen}, t/T, r_cum/k"
+        good("new", "b.json", "--observation", '{"mixing": "orthogonal"}')
+        derived = json.loads(good("show", "b.json", "--json").stdout)["derived"]
+        assert "[10] float32 in [0, 1]: orthogonal mixing of state, t/T" in derived["observation"]
+        text = good("show", "Default").stdout
+        assert "limits" not in text
+        assert re.search(r"^safety +None$", text, re.M)
+
+    def test_the_classes_of_a_suite_differ_in_the_fields_of_a_block(self) -> None:
+        good("new", "a.json", "--safety", '{"tightness": 0.2}')
+        good("suite", "new", "s.json", "-t", "a.json", "--sweep", "safety.tightness=0.1,0.4")
+        text = good("show", "s.json").stdout
+        assert re.search(r"safety-tightness-0_1 +safety\.tightness=0\.1 ", text)
+        assert re.search(r"safety-tightness-0_4 +safety\.tightness=0\.4 ", text)
+
     def test_who_owns_and_sees_and_is_paid_for_what_is_a_table(self) -> None:
         text = good("show", "TeamBlind4").stdout
         rows = [line for line in text.splitlines() if line.startswith("agent_")]
@@ -392,6 +420,20 @@ class TestNew:
             (("--team", '{"agents": [{"action_dim": 3}]}'), "action_dim=4"),
             (("--team", "two"), "got 'two'"),
             (("--team", "nowhere.json"), "cannot be read"),
+            (
+                ("--safety", '{"tightness": 0.6}'),
+                "safety.tightness=0.6: must be a finite number in",
+            ),
+            (("--safety", "0.2"), "object of named fields, got 0.2. Known fields: tightness."),
+            (
+                ("--observation", '{"distractors": 1000000}', "--D", "0.5", "--safety", "{}"),
+                "Add it",
+            ),
+            (
+                ("--observation", '{"distractors": 99999, "mixing": "orthogonal"}'),
+                "distractors=99999",
+            ),
+            (("--from", "Team2", "--observation", '{"distractors": 1}'), "a team (2 agents)"),
             (("--team", "two", "--agents", "2"), "one or the other"),
             (("--agents", "3"), "shared equally"),
             (("--agents", "0"), "at least 1"),

@@ -22,7 +22,7 @@ from sme_registry.spec import (
 from sme_registry.terminal import Table, err, out, print_json
 
 if TYPE_CHECKING:
-    from sme_registry.task.certify import Certificate
+    from sme_registry.task.certificate import Certificate
 
 _MARKS = {
     "passed": "[green]passed[/]",

@@ -32,6 +32,7 @@ from sme_registry.spec import (
 from sme_registry.spec.envelope import Envelope
 from sme_registry.spec.protocol import EvaluationProtocol
 from sme_registry.spec.resolve import known_specs, known_streams
+from sme_registry.spec.sme_spec import Setting
 from sme_registry.terminal import Table, out, print_json, print_pairs
 
 Schema = enum.StrEnum(
@@ -132,15 +133,28 @@ def _show_task(document: SMESpec | EnvFile, json: bool) -> None:
         derived = facts | ({"agents": agents} if agents else {})
         print_json({**head, "spec": spec.to_dict(), "digest": spec.digest, "derived": derived})
         return
-    fields = spec.every_field()
-    if spec.team is not None:
-        fields["team"] = _team_summary(spec.team)
-    print_pairs(spec.content_name if isinstance(document, SMESpec) else _title(document), fields)
+    title = spec.content_name if isinstance(document, SMESpec) else _title(document)
+    print_pairs(title, _fields(spec))
     if agents:
         out().print()
         out().print(_agents_table(agents))
     out().print()
     print_pairs("Derived", {"digest": spec.digest, **facts})
+
+
+def _fields(setting: Setting) -> dict[str, Any]:
+    """Every field for people: a team in words, the fields of other blocks by their dotted names."""
+    fields: dict[str, Any] = {}
+    every_field = setting.every_field()
+    for name in type(setting).model_fields:
+        value = every_field[name]
+        if name == "team" and setting.team is not None:
+            fields[name] = _team_summary(setting.team)
+        elif isinstance(value, dict):
+            fields |= {f"{name}.{key}": each for key, each in value.items() if each is not None}
+        else:
+            fields[name] = value
+    return fields
 
 
 def _facts(spec: SMESpec) -> dict[str, Any]:
@@ -161,6 +175,8 @@ def _facts(spec: SMESpec) -> dict[str, Any]:
     }
     if spec.D > 0:
         facts["episode_ends_below_step_reward"] = max(spec.D, spec.r_min)
+    if spec.safety is not None:
+        facts["limits"] = f"in [{1 - 2 * spec.safety.tightness:g}, 1], one for each action channel"
     return facts
 
 
@@ -175,8 +191,9 @@ def _env_id(spec: SMESpec) -> str:
 def _spaces(spec: SMESpec) -> dict[str, str]:
     """Descriptions of the observation and action spaces."""
     if spec.team is None:
+        size = f"[{spec.observation_dim}] float32 in [0, 1]"
         return {
-            "observation": f"[{spec.state_dim + 2}] float32 in [0, 1]: state, t/T, r_cum/k",
+            "observation": f"{size}: {_seen(spec)}, t/T, r_cum/k",
             "action": f"[{spec.action_dim}] float32 in [0, 1]",
         }
     n, widest = len(spec.team.agents), max(agent.action_dim for agent in spec.team.agents)
@@ -187,6 +204,14 @@ def _spaces(spec: SMESpec) -> dict[str, str]:
         "state with unobserved channels set to 0, t/T, the agent's r_cum/k, its one-hot index",
         "shared_action": f"[{widest}]; an agent uses as many channels as it owns",
     }
+
+
+def _seen(spec: SMESpec) -> str:
+    """What an observation begins with."""
+    parts = f"state and {spec.distractors} distractors" if spec.distractors else "state"
+    if spec.observation is None or spec.observation.mixing == "none":
+        return parts
+    return f"{spec.observation.mixing} mixing of {parts}"
 
 
 def _team_summary(team: TeamSpec) -> str:
@@ -238,11 +263,11 @@ def _ranges(channels: list[int]) -> str:
 
 def _show_stream(file: StreamFile) -> None:
     """A stream's phases: when each begins, and in what its task differs from the one before."""
-    stream, before, begins = file.stream, SMESpec().every_field(), 0
+    stream, before, begins = file.stream, _fields(SMESpec()), 0
     rows = []
     for index, phase in enumerate(stream.phases):
-        fields = phase.spec.every_field()
-        changes = [f"{k}={_plain(v)}" for k, v in fields.items() if v != before[k]]
+        fields = _fields(phase.spec)
+        changes = [f"{k}={_plain(v)}" for k, v in fields.items() if v != before.get(k)]
         if phase.drift is not None:
             to, count = _plain(phase.drift.rotation), phase.drift.increments
             changes.append(f"rotation drifts to {to} in {count} increments")
@@ -326,10 +351,8 @@ def _streams_table(suite: Suite) -> Table:
 
 def _changes(member: SuiteClass) -> str:
     """The fields that differ from the default: `k=10, r_min=0.5`."""
-    default, fields = SMESpec().every_field(), member.setting.every_field()
-    if member.setting.team is not None:
-        fields["team"] = _team_summary(member.setting.team)
-    return ", ".join(f"{k}={v}" for k, v in fields.items() if v != default[k])
+    default = _fields(SMESpec())
+    return ", ".join(f"{k}={v}" for k, v in _fields(member.setting).items() if v != default.get(k))
 
 
 def _title(file: Envelope) -> str:

@@ -286,9 +286,10 @@ class Setting(Document):
             )
         for field in ("safety", "observation"):
             if getattr(self, field) is not None and self.team is not None:
+                agents = len(self.team.agents)
                 raise ValueError(
                     f"{field}={short_repr(getattr(self, field).to_dict())}: must be null in a task "
-                    f"for a team ({len(self.team.agents)} agents). Leave {field} or team out."
+                    f"for a team ({agents} agent{'s' * (agents > 1)}). Leave {field} or team out."
                 )
         return self
 

@@ -100,6 +100,91 @@ BAD = [
         {"team": {"agents": [{"action_dim": 4}], "reward": "shared"}},
         ["team.reward='shared': must be 'individual' or 'team'."],
     ),
+    *[
+        (
+            {"safety": {"tightness": tightness}},
+            [f"safety.tightness={tightness}: must be a finite number in (0, 0.5]. Correct it."],
+        )
+        for tightness in (0, 0.0, -0.1, 0.51, 1, float("nan"), float("inf"), True)
+    ],
+    ({"safety": {}}, ["safety.tightness: missing: must be a finite number in (0, 0.5]. Add it."]),
+    ({"safety": {"tightness": None}}, ["safety.tightness=None: must be a finite number in (0, "]),
+    (
+        {"safety": 0.2},
+        ["safety: must be an object of named fields, got 0.2. Known fields: tightness."],
+    ),
+    (
+        {"safety": {"tightness": 0.2, "tau": 0.2}},
+        ["safety.tau=0.2: unknown field. Known fields: tightness. Rename or remove it."],
+    ),
+    (
+        {"safety": {"tightness": 0.2}, "D": 0.25},
+        ["D=0.25: must be 0 with safety, because with early", "Leave D or safety out."],
+    ),
+    (
+        {"safety": {"tightness": 0.2}, "team": {"agents": [{"action_dim": 4}]}},
+        [
+            "safety={'tightness': 0.2}: must be null in a task for a team",
+            "Leave safety or team out",
+        ],
+    ),
+    (
+        {"observation": {"distractors": 2}, "team": {"agents": [{"action_dim": 4}]}},
+        ["observation={'distractors': 2,", "must be null in a task for a team (1 agent)"],
+    ),
+    (
+        {"observation": {"distractors": -1}},
+        ["observation.distractors=-1: must be an integer in [0, 1048576].", "the default, 0."],
+    ),
+    (
+        {"observation": {"distractors": 2**20 + 1}},
+        ["observation.distractors=1048577: must be an integer in [0, 1048576]."],
+    ),
+    ({"observation": {"distractors": 8.0}}, ["observation.distractors=8.0: must be an integer"]),
+    (
+        {"observation": {"distractors": 8, "dynamics": "random"}},
+        ["observation.dynamics='random': must be 'noise' or 'autonomous' or 'driven' or null."],
+    ),
+    (
+        {"observation": {"mixing": "linear"}},
+        ["observation.mixing='linear': must be 'none' or 'orthogonal' or 'nonlinear'."],
+    ),
+    *[
+        (
+            {"observation": {"mixing": "nonlinear", "mixing_depth": depth}},
+            [f"observation.mixing_depth={depth}: must be an integer in [1, 3] or null."],
+        )
+        for depth in (0, 4, 1.0, True)
+    ],
+    *[
+        (
+            {"observation": {"distractors": 2, "mixing": mixing, "mixing_depth": 2}},
+            ["observation.mixing_depth=2: needs mixing='nonlinear'. Leave mixing_depth out, or"],
+        )
+        for mixing in ("none", "orthogonal")
+    ],
+    *[
+        (
+            {"observation": {"dynamics": "driven", "mixing": mixing}},
+            ["observation.dynamics='driven': needs distractors > 0. Leave dynamics out, or set"],
+        )
+        for mixing in ("none", "orthogonal")
+    ],
+    *[
+        (
+            {"observation": observation},
+            ["observation.distractors=0: with mixing='none' the agent would see the state as"],
+        )
+        for observation in ({}, {"distractors": 0}, {"mixing": "none"})
+    ],
+    (
+        {"observation": "nonlinear"},
+        ["observation: must be an object of named fields, got 'nonlinear'.", "mixing_depth."],
+    ),
+    (
+        {"observation": {"distractor": 8}},
+        ["observation.distractor=8: unknown field.", "Did you mean 'distractors'?"],
+    ),
 ]
 
 

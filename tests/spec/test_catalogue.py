@@ -151,6 +151,24 @@ def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
         schema = SMESpec.model_json_schema()
         assert follows(schema, SMESpec().to_dict(), schema["$defs"])
         assert not follows(schema, SMESpec().to_dict() | bad, schema["$defs"])
+    definitions = SMESpec.model_json_schema()["$defs"]
+    tightness = definitions["SafetySpec"]["properties"]["tightness"]
+    assert (tightness["exclusiveMinimum"], tightness["maximum"]) == (0, 0.5)
+    observation = definitions["ObservationSpec"]["properties"]
+    assert observation["distractors"]["minimum"] == 0
+    assert observation["mixing"]["enum"] == ["none", "orthogonal", "nonlinear"]
+    depth = observation["mixing_depth"]["anyOf"][0]
+    assert (depth["minimum"], depth["maximum"]) == (1, 3)
+    for name in ("safety", "observation"):
+        assert follows(schema, SMESpec().to_dict() | {name: None}, schema["$defs"])
+    for good, bad in (
+        ({"safety": {"tightness": 0.5}}, {"safety": {"tightness": 0.0}}),
+        ({"observation": {"distractors": 2, "dynamics": "driven"}}, {"observation": {"m": 2}}),
+        ({"observation": {"mixing": "orthogonal"}}, {"observation": {"mixing": "linear"}}),
+        ({"observation": {"mixing_depth": 3}}, {"observation": {"mixing_depth": 4}}),
+    ):
+        assert follows(schema, SMESpec().to_dict() | good, schema["$defs"])
+        assert not follows(schema, SMESpec().to_dict() | bad, schema["$defs"])
     assert fields["seed"]["anyOf"][1]["pattern"] == "^0x[0-9a-fA-F]{1,64}$"
 
 

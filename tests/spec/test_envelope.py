@@ -16,6 +16,7 @@ from sme_registry.errors import (
 )
 from sme_registry.spec import (
     EnvFile,
+    Fingerprint,
     ProtocolFile,
     SMESpec,
     StudyFile,
@@ -23,7 +24,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.task import load_spec, load_task, materialize
-from sme_registry.task.fingerprint import fingerprint_of
+from sme_registry.task.fingerprint import check_fingerprint, fingerprint_of
 from sme_registry.task.loading import _draw_cached
 from tests.strategies import specs
 
@@ -146,6 +147,37 @@ def test_other_numbers_than_the_published_neither_load_nor_run(saved, published,
     ):
         with pytest.raises(FingerprintMismatchError, match=fragment):
             run()
+
+
+WHOLE = SMESpec(
+    state_dim=3, action_dim=2, safety={"tightness": 0.2},
+    observation={"distractors": 2, "dynamics": "driven", "mixing": "nonlinear"},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("field", ["limit", "next_distractors", "seen"])
+def test_a_fingerprint_holds_limits_distractors_and_what_is_seen(field):
+    task = materialize(WHOLE)
+    published = fingerprint_of(task).to_dict()
+    check_fingerprint(Fingerprint.from_dict(published), task)
+    off = json.loads(json.dumps(published))
+    off[field][1][1] += 2e-6
+    with pytest.raises(FingerprintMismatchError, match=f"fingerprint.{field}: differs by 2e-06"):
+        check_fingerprint(Fingerprint.from_dict(off), task)
+    missing = {name: rows for name, rows in published.items() if name != field}
+    with pytest.raises(FingerprintMismatchError, match=f"fingerprint.{field}: is missing"):
+        check_fingerprint(Fingerprint.from_dict(missing), task)
+    plain = materialize(SMESpec(state_dim=3, action_dim=2))
+    foreign = fingerprint_of(plain).to_dict() | {field: published[field]}
+    with pytest.raises(FingerprintMismatchError, match=f"fingerprint.{field}: is of something"):
+        check_fingerprint(Fingerprint.from_dict(foreign), plain)
+
+
+def test_a_fingerprint_without_these_parts_is_what_it_was_before_they_existed():
+    fields = fingerprint_of(materialize(SMESpec())).to_dict()
+    assert list(fields) == ["optimal_action", "next_state"]
+    noise = SMESpec(observation={"distractors": 2})
+    assert fingerprint_of(materialize(noise)).to_dict() == fields
 
 
 def test_a_rounding_difference_is_no_other_task(saved):

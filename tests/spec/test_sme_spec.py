@@ -12,7 +12,15 @@ from pydantic import ValidationError
 
 from sme_registry.errors import SpecError
 from sme_registry.io import parse_json
-from sme_registry.spec import AgentSpec, SMESpec, Suite, SuiteClass, TeamSpec
+from sme_registry.spec import (
+    AgentSpec,
+    ObservationSpec,
+    SafetySpec,
+    SMESpec,
+    Suite,
+    SuiteClass,
+    TeamSpec,
+)
 from tests.strategies import SEEDS, THRESHOLDS, spec_fields, specs
 
 # One other valid value for every field of a single-agent spec.
@@ -32,6 +40,9 @@ CHANGED = {
     "observation": {"distractors": 8},
     "seed": 1,
 }
+
+SAFE = "sha256:9b2f25e58ca2bdc6e04840144f1cf098789b4c08bbda38c8ad3d44afedc228b9"
+OBSERVED = "sha256:b53edb2f3d2bf66a71d61c5bbad25f3ae4293ca3efc7995538b147804f2d9654"
 
 
 @given(specs(), specs())
@@ -64,6 +75,50 @@ def test_every_field_but_the_version_of_the_schema_is_part_of_the_digest():
     assert set(json.loads(rotated.canonical_json())) == in_json | {"rotation"}
     assert rotated.digest.startswith("sha256:130c1352935c1883")  # as released
     assert rotated.derive(rotation=0.0) == SMESpec() == SMESpec(rotation=-0.0)
+
+
+def test_older_documents_have_the_bytes_that_they_had_before_safety_and_observation():
+    for spec in (SMESpec(), SMESpec(rotation=0.5), SMESpec(team={"agents": [{"action_dim": 4}]})):
+        named = SMESpec.from_dict(spec.to_dict() | {"safety": None, "observation": None})
+        assert named == spec
+        assert named.canonical_json() == spec.canonical_json()
+        assert b"safety" not in spec.canonical_json()
+        assert b"observation" not in spec.canonical_json()
+
+
+@pytest.mark.parametrize(
+    ("short", "full"),
+    [
+        (
+            {"distractors": 8},
+            {"distractors": 8, "dynamics": "noise", "mixing": "none", "mixing_depth": None},
+        ),
+        (
+            {"mixing": "nonlinear"},
+            {"distractors": 0, "dynamics": None, "mixing": "nonlinear", "mixing_depth": 1},
+        ),
+        (
+            {"mixing": "orthogonal"},
+            {"distractors": 0, "dynamics": None, "mixing": "orthogonal", "mixing_depth": None},
+        ),
+    ],
+)
+def test_a_default_of_observation_is_written_out_so_that_one_observation_is_one_document(
+    short, full
+):
+    spec = SMESpec(observation=short)
+    assert spec.to_dict()["observation"] == full
+    assert spec == SMESpec(observation=full)
+    assert spec.digest == SMESpec(observation=full).digest
+    assert SMESpec(observation=ObservationSpec(**short)) == spec
+    assert spec.derive(observation=None) == SMESpec()
+
+
+def test_the_digests_of_safety_and_observation_are_those_of_the_first_release():
+    assert SMESpec(safety={"tightness": 0.2}).digest == SAFE
+    assert SMESpec(safety=SafetySpec(tightness=0.2)).digest == SAFE
+    observation = {"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"}
+    assert SMESpec(observation=observation).digest == OBSERVED
 
 
 @given(specs())

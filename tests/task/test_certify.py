@@ -11,7 +11,8 @@ import pytest
 from sme_registry import SMESpec, load
 from sme_registry.errors import OptionError
 from sme_registry.task import Layer, Task, materialize
-from sme_registry.task.certify import Certificate, Check, certify
+from sme_registry.task.certificate import Certificate, Check
+from sme_registry.task.certify import certify
 
 SMALL = SMESpec(state_dim=3, action_dim=2, seed=1)
 

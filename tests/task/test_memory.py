@@ -17,6 +17,8 @@ TOO_LARGE = [
         complexity=10_000, hidden_width=4096, action_dim=1024,
         team={"agents": [{"action_dim": 1}] * 1024},
     ),
+    SMESpec(action_dim=2**20, observation={"distractors": 2**20, "dynamics": "autonomous"}),
+    SMESpec(observation={"distractors": 2**17, "mixing": "orthogonal"}),
 ]  # fmt: skip
 
 
@@ -58,6 +60,10 @@ def test_environments_and_files_of_such_a_task_are_refused_too(tmp_path):
         {"complexity": 50, "policy_init": "unit_variance"},
         {"complexity": 2, "state_dim": 4096, "action_dim": 4, "hidden_width": 1},
         {"action_dim": 40, "team": {"agents": [{"action_dim": 10}] * 4}, "complexity": 4},
+        {"complexity": 3, "hidden_width": 300, "safety": {"tightness": 0.2}},
+        {"action_dim": 300, "observation": {"distractors": 400, "dynamics": "driven"}},
+        {"observation": {"distractors": 200, "mixing": "orthogonal"}},
+        {"observation": {"distractors": 200, "mixing": "nonlinear", "mixing_depth": 3}},
     ],
 )
 def test_the_estimate_is_above_what_a_draw_takes_and_not_by_far(fields):
@@ -70,8 +76,7 @@ def test_the_estimate_is_above_what_a_draw_takes_and_not_by_far(fields):
     slack = 2**16  # Python's own objects
     assert peak <= memory.peak_bytes(spec) + slack
     assert memory.peak_bytes(spec) <= 8 * (peak + slack)
-    layers = [part for policy in task.policies for layer in policy for part in layer]
-    held = sum(array.nbytes for array in (task.W, task.b, *layers))
+    held = sum(array.nbytes for array in task.arrays)
     assert memory.parameter_bytes(spec) == held
 
 

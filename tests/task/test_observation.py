@@ -1,0 +1,168 @@
+"""What the agent sees in place of the state: METHOD, section 9."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.special import ndtr, ndtri
+
+from sme_registry import SMESpec
+from sme_registry.errors import ActionError, StateError
+from sme_registry.task import materialize
+from tests.strategies import observations, spec_fields
+
+
+@st.composite
+def observed_tasks(draw):
+    fields = draw(spec_fields(team=False)) | {"observation": draw(observations())}
+    return materialize(SMESpec.from_dict(fields))
+
+
+def task_of(**observation):
+    return materialize(SMESpec(seed=3, observation=observation))
+
+
+def inside(task, count=40):
+    """States and distractors in the cube."""
+    random = np.random.default_rng(20261122)
+    widths = task.spec.state_dim, task.spec.distractors
+    return tuple(random.random((count, width)) for width in widths)
+
+
+@given(observed_tasks())
+def test_the_agent_sees_numbers_in_the_unit_cube(task):
+    s, d = inside(task)
+    x = task.seen(s, d)
+    assert x.shape == (40, task.spec.observation_dim - 2)
+    assert ((x >= -1e-15) & (x <= 1.0 + 1e-15)).all()
+    corners = (np.sign(s - 0.5) + 1) / 2, (np.sign(d - 0.5) + 1) / 2
+    x = task.seen(*corners)
+    assert ((x >= -1e-15) & (x <= 1.0 + 1e-15)).all()
+
+
+@given(observed_tasks())
+def test_what_is_seen_can_be_undone(task):
+    s, d = inside(task, 10)
+    x = task.seen(s, d)
+    for W, b in reversed(task.mixing):
+        z = x if task.spec.observation.mixing == "orthogonal" else ndtri(x)
+        x = np.linalg.solve(W, (z - b).T).T
+    np.testing.assert_allclose(x, np.concatenate([s, d], axis=1), rtol=0, atol=1e-8)
+
+
+@given(observed_tasks())
+def test_state_reward_and_optimum_do_not_depend_on_what_is_seen(task):
+    fields = {**task.spec.to_dict()}
+    del fields["observation"]
+    plain = materialize(SMESpec.from_dict(fields))
+    s, _ = inside(task)
+    a = np.random.default_rng(1).random((40, task.spec.action_dim))
+    np.testing.assert_array_equal(task.optimal_action(s), plain.optimal_action(s))
+    np.testing.assert_array_equal(task.transition(s, a), plain.transition(s, a))
+    np.testing.assert_array_equal(task.step_reward(s, a), plain.step_reward(s, a))
+
+
+@given(observed_tasks())
+def test_a_single_state_is_seen_as_in_its_batch(task):
+    s, d = inside(task, 3)
+    np.testing.assert_allclose(task.seen(s[1], d[1]), task.seen(s, d)[1], rtol=0, atol=1e-14)
+
+
+def test_without_a_mixing_the_agent_sees_state_and_distractors():
+    task = task_of(distractors=3)
+    s, d = inside(task)
+    np.testing.assert_array_equal(task.seen(s, d), np.concatenate([s, d], axis=1))
+    plain = materialize(SMESpec())
+    np.testing.assert_array_equal(plain.seen(s), s)
+    assert (SMESpec().observation_dim, task.spec.observation_dim) == (10, 13)
+
+
+def test_an_orthogonal_mixing_turns_about_the_centre_and_shrinks_no_more_than_it_must():
+    task = task_of(distractors=8, mixing="orthogonal")
+    ((W, _),) = task.mixing
+    c = 1.0 / np.linalg.norm(W, axis=1)
+    np.testing.assert_allclose(c, c[0])
+    np.testing.assert_allclose(W @ W.T * c[0] ** 2, np.eye(16), atol=1e-14)
+    np.testing.assert_allclose(task.seen(np.full(8, 0.5), np.full(8, 0.5)), 0.5, atol=1e-15)
+    widest = np.abs(W).sum(axis=1).argmax()
+    corner = (np.sign(W[widest]) + 1) / 2
+    assert task.seen(corner[:8], corner[8:])[widest] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("channels", "shrinks"), [(8, 2.5), (16, 3.5), (40, 5.4)])
+def test_an_orthogonal_mixing_shrinks_by_what_the_method_says(channels, shrinks):
+    found = []
+    for seed in range(10):
+        spec = SMESpec(seed=seed, observation={"distractors": channels - 8, "mixing": "orthogonal"})
+        found.append(1.0 / np.linalg.norm(materialize(spec).mixing[0].W[0]))
+    assert np.mean(found) == pytest.approx(shrinks, rel=0.05)
+
+
+def test_a_nonlinear_mixing_is_its_uniform_layers():
+    task = task_of(distractors=4, mixing="nonlinear", mixing_depth=3)
+    s, d = inside(task)
+    x = np.concatenate([s, d], axis=1)
+    for W, b in task.mixing:
+        np.testing.assert_allclose(W @ W.T, 12.0 * np.eye(12), atol=1e-12)
+        np.testing.assert_allclose(W @ np.full(12, 0.5) + b, 0.0, atol=1e-14)
+        x = ndtr(x @ W.T + b)
+    np.testing.assert_allclose(task.seen(s, d), x, rtol=0, atol=1e-15)
+    assert len(task.mixing) == 3
+
+
+def test_another_depth_begins_with_the_same_layers():
+    shallow, deep = (task_of(mixing="nonlinear", mixing_depth=depth) for depth in (1, 2))
+    np.testing.assert_array_equal(shallow.mixing[0].W, deep.mixing[0].W)
+
+
+@given(observed_tasks())
+def test_distractors_move_by_the_equations_of_the_state(task):
+    if task.distractor_transition is None:
+        assert task.spec.observation.dynamics in (None, "noise")
+        return
+    W, b = task.distractor_transition
+    _, d = inside(task)
+    u = np.random.default_rng(2).random((40, task.spec.action_dim)).astype(np.float32)
+    expected = np.arccos(np.cos(2.0 * np.pi * (d + u @ W + b))) / np.pi
+    np.testing.assert_allclose(task.distractor_step(d, u), expected, rtol=0, atol=3e-8)
+    np.testing.assert_array_equal(task.distractor_step(d[0], u[0]), task.distractor_step(d, u)[0])
+    np.testing.assert_array_equal(W.sum(axis=1), 1.0)
+
+
+@pytest.mark.parametrize("actions", ["random", "constant", "optimal"])
+def test_driven_distractors_stay_uniform_under_actions_that_ignore_them(actions):
+    task, random = task_of(distractors=5, dynamics="driven"), np.random.default_rng(4)
+    s, d = random.random((10_000, 8)), random.random((10_000, 5))
+    for _ in range(300):
+        a = {
+            "random": lambda: random.random((10_000, 4)),
+            "constant": lambda: np.full((10_000, 4), 0.3),
+            "optimal": lambda: task.optimal_action(s),  # noqa: B023
+        }[actions]()
+        s, d = task.transition(s, a), task.distractor_step(d, a)
+    for channel in d.T:
+        assert stats.kstest(channel, "uniform").pvalue > 0.001
+
+
+def test_states_and_distractors_have_transitions_of_their_own():
+    task = materialize(SMESpec(observation={"distractors": 8, "dynamics": "driven"}))
+    W, b = task.distractor_transition
+    assert not np.isclose(W, task.W).any()
+    assert not np.isclose(b, task.b).any()
+
+
+def test_bad_distractors_are_refused_with_their_shape():
+    task = task_of(distractors=3, dynamics="driven")
+    s = np.zeros(8)
+    for call in (lambda d: task.seen(s, d), lambda d: task.distractor_step(d, np.zeros(4))):
+        with pytest.raises(StateError, match=r"distractors of shape \(2,\): must be \[3\]"):
+            call(np.zeros(2))
+        with pytest.raises(StateError, match="distractors: has NaN or infinite entries"):
+            call(np.full(3, np.nan))
+    with pytest.raises(StateError, match=r"distractors of shape \(0,\): must be \[3\]"):
+        task.seen(s)
+    with pytest.raises(ActionError, match=r"action of shape \(3,\): must be \[4\]"):
+        task.distractor_step(np.zeros(3), np.zeros(3))
+    with pytest.raises(StateError, match="state of shape"):
+        task.seen(np.zeros(7), np.zeros(3))
