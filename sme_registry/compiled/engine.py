@@ -1,5 +1,6 @@
 """`Engine`: the step of a task, by machine code where Numba is installed, else by NumPy.
 
+It is the step of METHOD's section 1; what `safety` and `observation` add follows in `extension`.
 Both have the same functions with the same arguments, so an environment works with either. States
 are bit-equal between them; oracle and rewards agree to 1e-12.
 """
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from sme_registry.compiled.notice import compiling
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
+    EXTENDED,
     LANE_STATE,
     LANE_T,
     LANE_VALUES,
@@ -27,7 +29,6 @@ from sme_registry.compiled.values import (
     SIMILARITY,
     STEP_REWARD,
 )
-from sme_registry.errors import SpecError
 from sme_registry.io import choice, is_installed, require_packages
 from sme_registry.task import Task, observe, step
 from sme_registry.task.draw import Array
@@ -108,11 +109,7 @@ def engine(task: Task, backend: Backend | None = None) -> Engine:
 
     Raises:
       OptionError, MissingDependencyError: see `chosen_backend`.
-      SpecError: the task has `safety` or `observation`, which no environment runs yet.
     """
-    for field in ("safety", "observation"):
-        if getattr(task.spec, field) is not None:
-            raise SpecError(f"{field}: no environment runs it yet. Leave it out.")
     make = _numba_engine if (backend or chosen_backend()) == "numba" else _numpy_engine
     return make(task)
 
@@ -182,7 +179,8 @@ def _numpy_engine(task: Task) -> Engine:
             return 0.0, -1.0
         lane[LANE_T] += 1.0
         lane[LANE_STATE:] = moved[:, 0]
-        return values[REWARD].item(), float(ends[0, 0] + 2 * ends[1, 0])
+        end = float(ends[0, 0] + 2 * ends[1, 0])
+        return values[REWARD].item(), end + EXTENDED if task.spec.extended else end
 
     def step_many(
         s: Array,

@@ -8,6 +8,7 @@ lanes, channel by channel, so that the inner loop is long enough to fill vector 
 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
     S, A, k, T, r_min, D, agents, widest layer, size of all this, pays the team (0 or 1),
+    EXTENDED or 0,
     W [A, S], b [S], for each agent
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
 A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
@@ -29,6 +30,7 @@ from numba import boolean, float32, float64, int64, njit, types, void
 from sme_registry.compiled.normal_cdf import cell_of, in_cell, normal_cdf
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
+    EXTENDED,
     LANE_STATE,
     LANE_T,
     LANE_VALUES,
@@ -41,7 +43,7 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Layer
 
 BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
-_HEADER = 10
+_HEADER = 11
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
 
 
@@ -52,11 +54,12 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
     parts = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
         [spec.r_min, spec.D, len(task.policies), widest, 0.0, task.pays_the_team],
+        [EXTENDED if spec.extended else 0.0],
         task.W.ravel(),
         task.b,
     ]
     for observed, layers in zip(task.observed, task.policies, strict=True):
-        parts += [[len(observed), len(layers)], observed, *_parts(layers)]
+        parts += [[len(observed), len(layers)], observed, *layer_parts(layers)]
     packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
     packed[8] = packed.size
     return packed
@@ -65,11 +68,12 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
 def pack_layers(layers: Sequence[Layer]) -> npt.NDArray[np.float64]:
     """Layers as one flat array: how many, the widest, and each as in a packed task."""
     widest = max(max(W.shape) for W, _ in layers)
-    parts = [np.array([len(layers), widest]), *_parts(layers)]
+    parts = [np.array([len(layers), widest]), *layer_parts(layers)]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
 
-def _parts(layers: Sequence[Layer]) -> list[npt.ArrayLike]:
+def layer_parts(layers: Sequence[Layer]) -> list[npt.ArrayLike]:
+    """The parts of each layer in a packed task."""
     return [part for W, b in layers for part in (W.shape[::-1], W.T.ravel(), b)]
 
 
@@ -86,8 +90,36 @@ _PACKED = types.Array(float64, 1, "C", readonly=True)
 
 
 @njit(error_model="numpy")
-def _wide_layer(W, b, x, y):  # type: ignore[no-untyped-def]
-    """y = W x + b for W transposed `[in, out]`, eight inputs at a time, in ascending order."""
+def lane_layers(p, at, layers, room, x, y, uniform):  # type: ignore[no-untyped-def]
+    """Packed layers for one lane, Φ(W x + b) each, or W x + b where not `uniform`.
+
+    The first layer begins at `p[at]`. `room[x]` and `room[y]` begin room for two layers, of which
+    the first has the inputs.
+
+    Returns:
+      `(x, at)`: where the outputs begin in `room`, and what follows the layers in `p`.
+    """
+    for _ in range(layers):
+        inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
+        at += _U2
+        b = at + inputs * outputs
+        if outputs < np.uint64(_NARROW):
+            for o in range(outputs):
+                total = p[b + o]
+                for i in range(inputs):
+                    total = total + p[at + i * outputs + o] * room[x + i]
+                room[y + o] = normal_cdf(total) if uniform else total
+        else:
+            W = p[at:b].reshape(inputs, outputs)
+            _wide_layer(W, p[b : b + outputs], room[x : x + inputs], room[y : y + outputs], uniform)
+        at = b + outputs
+        x, y = y, x
+    return x, at
+
+
+@njit(error_model="numpy")
+def _wide_layer(W, b, x, y, uniform):  # type: ignore[no-untyped-def]
+    """One layer for W transposed `[in, out]`, eight inputs at a time, in ascending order."""
     inputs, outputs = W.shape
     for o in range(outputs):
         y[o] = b[o]
@@ -112,8 +144,9 @@ def _wide_layer(W, b, x, y):  # type: ignore[no-untyped-def]
         for o in range(outputs):
             y[o] = y[o] + w[o] * xi
         i += 1
-    for o in range(outputs):
-        y[o] = normal_cdf(y[o])
+    if uniform:
+        for o in range(outputs):
+            y[o] = normal_cdf(y[o])
 
 
 @njit(error_model="numpy")
@@ -135,21 +168,7 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
     for j in range(channels):
         lane[x + j] = lane[s + np.uint64(p[at + j])]
     at += channels
-    for _ in range(layers):
-        inputs, outputs = np.uint64(p[at]), np.uint64(p[at + _U1])
-        at += _U2
-        b = at + inputs * outputs
-        if outputs < np.uint64(_NARROW):
-            for o in range(outputs):
-                total = p[b + o]
-                for i in range(inputs):
-                    total = total + p[at + i * outputs + o] * lane[x + i]
-                lane[y + o] = normal_cdf(total)
-        else:
-            W = p[at:b].reshape(inputs, outputs)
-            _wide_layer(W, p[b : b + outputs], lane[x : x + inputs], lane[y : y + outputs])
-        at = b + outputs
-        x, y = y, x
+    x, at = lane_layers(p, at, layers, lane, x, y, True)
     for o in range(A):
         optimal[o] = lane[x + o]
 
@@ -179,7 +198,7 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
     v = start + _VALUES
     accumulated = lane[v + _R_CUM] + step_reward
     truncated = t >= T
-    end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
+    end = p[10] + (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
     reward = 0.0
     if truncated or t % k == 0:
         reward, accumulated = accumulated, 0.0
@@ -215,8 +234,8 @@ def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped
       observation: `[S + 2]`, written.
 
     Returns:
-      `(reward, end)`; end is 1 for terminated plus 2 for truncated, or −1 where the action is of
-      another size or not finite: nothing has moved then.
+      `(reward, end)`; end is 1 for terminated, plus 2 for truncated, plus EXTENDED; or −1 where
+      the action is of another size or not finite: nothing has moved then.
     """
     return _step_lane(p, lane, _U0, action, optimal, observation)
 
@@ -267,6 +286,24 @@ def _block_layer(W, b, x, y, cells, count, uniform=True):  # type: ignore[no-unt
             cells[lane], y[o, lane] = cell_of(y[o, lane])
         for lane in range(count):
             y[o, lane] = in_cell(cells[lane], y[o, lane])
+
+
+@njit(inline="always", error_model="numpy")
+def block_layers(p, at, layers, x, y, cells, count, uniform):  # type: ignore[no-untyped-def]
+    """Packed layers, the first at `p[at]`, for `count` lanes; x has the inputs, see `_block_layer`.
+
+    Returns:
+      `(x, y, at)`: the outputs, the other room, and what follows the layers in `p`.
+    """
+    for _ in range(layers):
+        inputs, outputs = int(p[at]), int(p[at + 1])
+        at += 2
+        b = at + inputs * outputs
+        W = p[at:b].reshape(inputs, outputs)
+        _block_layer(W, p[b : b + outputs], x, y, cells, count, uniform)
+        at = b + outputs
+        x, y = y, x
+    return x, y, at
 
 
 # The parts of `step_many`, in its order. Inlined, so that the compiler sees that the arrays of a
@@ -512,15 +549,7 @@ def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
         for j in range(s.shape[0]):
             for lane in range(count):
                 x[j, lane] = s[j, first + lane]
-        at = 2
-        for _ in range(layers):
-            inputs, outputs = int(p[at]), int(p[at + 1])
-            at += 2
-            b = at + inputs * outputs
-            W = p[at:b].reshape(inputs, outputs)
-            _block_layer(W, p[b : b + outputs], x, y, cells, count, uniform)
-            at = b + outputs
-            x, y = y, x
+        x, y, _ = block_layers(p, 2, layers, x, y, cells, count, uniform)
         for o in range(out.shape[0]):
             for lane in range(count):
                 out[o, first + lane] = x[o, lane]

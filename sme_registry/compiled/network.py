@@ -43,7 +43,7 @@ def network(
 
     def compiled(x: Array) -> Array:
         out = np.empty((len(layers[-1].b), x.shape[1]))
-        run(packed, x, uniform, out)
+        run(packed, np.ascontiguousarray(x), uniform, out)  # another layout would be misread
         return out
 
     return compiled

@@ -172,21 +172,52 @@ def lifetime_in(options: dict[str, Any] | None) -> int | None:
     return integer_in("lifetime", options["lifetime"], 0, MAX_LIFETIME, advice=advice)
 
 
-def initial_states(state: Any, shape: tuple[int, ...]) -> Array:
+def initial_values(
+    name: str, options: dict[str, Any], shape: tuple[int, ...], lanes: int | None = None
+) -> Array | None:
+    """The option `state` or `distractors` of a reset, as float64 of `shape`; None without it.
+
+    With `lanes` B, a value of `shape` is for each of them, and one of `[B, *shape]` has one for
+    each; the result is `[B, *shape]`.
+
+    Raises:
+      StateError: of another shape, or an entry outside [0, 1].
+    """
+    if name not in options:
+        return None
+    if lanes is None:
+        return initial_states(options[name], shape, name)
+    one_for_all = np.asarray(options[name], dtype=object).ndim == len(shape)
+    value = initial_states(options[name], shape if one_for_all else (lanes, *shape), name)
+    return np.broadcast_to(value, (lanes, *shape))
+
+
+def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> Array:
     """States at which episodes begin, as float64 of `shape`; StateError outside [0, 1]."""
     try:
         array = np.asarray(state, dtype=np.float64)
     except (TypeError, ValueError):
-        raise StateError(f"state={state!r:.80}: must be an array of shape {shape}.") from None
+        raise StateError(f"{name}={state!r:.80}: must be an array of shape {shape}.") from None
     if array.shape != shape:
-        raise StateError(f"state of shape {array.shape}: must be of shape {shape}.")
+        raise StateError(f"{name} of shape {array.shape}: must be of shape {shape}.")
     outside = ~((array >= 0.0) & (array <= 1.0))
     if outside.any():
         raise StateError(
-            f"state: entry {array[outside][0]!r:.30} lies outside [0, 1]. An episode begins inside "
-            "the cube; to ask the task about states outside it, use env.unwrapped.task."
+            f"{name}: entry {array[outside][0]!r:.30} lies outside [0, 1]. An episode begins "
+            "inside the cube; to ask the task about values outside it, use env.unwrapped.task."
         )
     return array
+
+
+def without_extension(task: Task) -> Task:
+    """The task; SpecError if it has `safety` or `observation`, which teams have not."""
+    for field in ("safety", "observation"):
+        if getattr(task.spec, field) is not None:
+            raise SpecError(
+                f"{field}: environments of teams do not run it. Use sme_registry.make, or leave it "
+                "out."
+            )
+    return task
 
 
 def single_agent(task: Task) -> Task:

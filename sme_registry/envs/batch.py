@@ -14,12 +14,14 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium.utils import seeding
 
 from sme_registry.compiled import engine
 from sme_registry.compiled.engine import StepMany
-from sme_registry.compiled.values import ROWS
+from sme_registry.compiled.values import ROWS, ROWS_WITH_SAFETY
 from sme_registry.envs.arguments import not_finite_error
+from sme_registry.envs.extension import Extended, reset_options
 from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.errors import ActionError
 from sme_registry.spec import SMESpec, StreamSpec
@@ -37,12 +39,14 @@ class BatchStep(NamedTuple):
 
     Attributes:
       observation: `[B, S + 1 + n]` float32: s, t/T, and each agent's r_cum/k. Of a stream that
-        shows its phase, one-hot behind them.
+        shows its phase, one-hot behind them. With `observation`, M(s, d) `[S + m]` in place of s.
       optimal: `[B, A]` π* of the states acted in, in the unit range.
       values: `[5, n, B]` the rows of `compiled.values`: similarity, step reward, regret, reward,
-        and r_cum after a payout.
+        and r_cum after a payout; with `safety` also cost and safe regret.
       terminated: `[B]`.
       truncated: `[B]`.
+      limits: `[2, B, A]` the limits and the safe action in the states acted in, in the unit range;
+        without `safety` `[2, B, 0]`.
     """
 
     observation: Observation
@@ -50,15 +54,17 @@ class BatchStep(NamedTuple):
     values: Array
     terminated: Mask
     truncated: Mask
+    limits: Array
 
 
 class _Arrays(NamedTuple):
-    """What a step writes besides the state: `[B, S + 1 + n]`, `[B, A]`, `[5, n, B]`, `[2, B]`."""
+    """What a step writes besides the state; see `BatchStep`. `ends` is `[2, B]`."""
 
     observation: Observation
     optimal: Array
     values: Array
     ends: Mask
+    limits: Array
 
 
 class _Results:
@@ -74,8 +80,14 @@ class _Results:
     view, such as setting its shape, does not outlive it.
     """
 
-    def __init__(self, lanes: int, observation_dim: int, action_dim: int, agents: int) -> None:
-        self._shapes = (lanes, observation_dim), (lanes, action_dim), (ROWS, agents, lanes)
+    def __init__(
+        self, lanes: int, observation_dim: int, action_dim: int, agents: int, *, safety: bool
+    ) -> None:
+        rows, limited = (ROWS_WITH_SAFETY, action_dim) if safety else (ROWS, 0)
+        self._shapes = (
+            (lanes, observation_dim), (lanes, action_dim), (rows, agents, lanes),
+            (2, lanes, limited),
+        )  # fmt: skip
         self._kept: list[_Arrays] = []
 
     def take(self) -> tuple[_Arrays, BatchStep]:
@@ -86,16 +98,18 @@ class _Results:
         else:
             arrays = self._allocate()
             self._kept = [*self._kept[1 - _KEPT :], arrays]
-        observation, optimal, values, ends = arrays
-        return arrays, BatchStep(observation[:], optimal[:], values[:], ends[0], ends[1])
+        observation, optimal, values, ends, limits = arrays
+        views = observation[:], optimal[:], values[:], ends[0], ends[1], limits[:]
+        return arrays, BatchStep(*views)
 
     def _allocate(self) -> _Arrays:
-        observation, optimal, values = self._shapes
+        observation, optimal, values, limits = self._shapes
         return _Arrays(
             np.empty(observation, np.float32),
             np.empty(optimal),
             np.empty(values),
             np.empty((2, observation[0]), bool),
+            np.empty(limits),
         )
 
 
@@ -105,7 +119,7 @@ def _references(arrays: _Arrays) -> list[int]:
 
 
 # Measured, since versions of Python differ in what they count.
-_ALONE = _references(_Results(1, 1, 1, 1)._allocate())
+_ALONE = _references(_Results(1, 1, 1, 1, safety=True)._allocate())
 
 
 def refuse_large_batch(lanes: int, lane_bytes: int) -> None:
@@ -161,13 +175,14 @@ class Batch:
     """
 
     lived: Mapping[str, Lanes] = MappingProxyType({})  # `life()` at the end of the last step
-    reset_options: tuple[str, ...] = ("state",)  # of an environment
 
     def __init__(self, task: Task, lanes: int, *, reuse: bool = False) -> None:
         S, A, n = task.spec.state_dim, task.spec.action_dim, len(task.policies)
         self._shape = (lanes, A)
-        refuse_large_batch(lanes, 8 * (5 * S + 6 * A + 20 * n + 48))
+        width = S + task.spec.distractors
+        refuse_large_batch(lanes, 8 * (5 * width + 12 * A + 20 * n + 48))
         self.task, self.lanes = task, lanes
+        self._extended = Extended(task, lanes) if task.spec.extended else None
         self.initial_states = InitialStates(lanes, S)
         # Channel by channel, [S, B] and [n, B], as the compiled step reads them.
         self._s = np.zeros((S, lanes))
@@ -183,14 +198,20 @@ class Batch:
 
     @property
     def observation_dim(self) -> int:
-        """Entries of a joint observation, S + 1 + n."""
-        return self.task.spec.state_dim + 1 + len(self._accumulated)
+        """Entries of a joint observation: S, the distractors, 1 + n."""
+        return self.task.spec.observation_dim - 1 + len(self._accumulated)
+
+    @property
+    def reset_options(self) -> tuple[str, ...]:
+        """The options of an environment's reset."""
+        return reset_options(self.task.spec)
 
     def _load_engine(self) -> None:
         S, A, n = self.task.spec.state_dim, self.task.spec.action_dim, len(self._accumulated)
         self._step_many: StepMany = engine(self.task).step_many
         self._moved = np.empty((S, self.lanes))
-        results = _Results(self.lanes, self.observation_dim, A, n)
+        safety = self.task.spec.safety is not None
+        results = _Results(self.lanes, self.observation_dim, A, n, safety=safety)
         in_turn = itertools.cycle([results.take(), results.take()])
         self._take = in_turn.__next__ if self._reuse else results.take
 
@@ -208,6 +229,11 @@ class Batch:
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._s.T.copy()  # a copy even where the transpose is contiguous
 
+    @property
+    def distractors(self) -> Array:
+        """The distractors, `[B, m]` float64 in [0, 1] (a copy)."""
+        return np.empty((self.lanes, 0)) if self._extended is None else self._extended.distractors
+
     def task_of(self, lane: int) -> Task:
         """The task of a lane, which is that of every lane."""
         return self.task
@@ -221,38 +247,60 @@ class Batch:
         return {}
 
     def seed(self, lane: int, seed: int) -> None:
-        """Restart the generator of a lane's initial states."""
+        """Restart the generators of a lane."""
         self.initial_states.seed(lane, seed)
+        if self._extended is not None:
+            self._extended.seed(lane, seed)
 
     def live(self, lane: int, lifetime: int) -> None:
         """Let a lane's life, if it lives through a stream, go on after so many steps."""
 
     def observe(self) -> Observation:
-        """The present joint observations of all lanes, `[B, S + 1 + n]`."""
-        return observe(self.task.spec, self.state, self._t, self._accumulated.T)
+        """The present joint observations of all lanes, `[B, observation_dim]`."""
+        plain = observe(self.task.spec, self.state, self._t, self._accumulated.T)
+        if self._extended is None:
+            return plain
+        seen = self._extended.seen(self.state, np.arange(self.lanes))
+        return np.concatenate([seen, plain[:, self.task.spec.state_dim :]], axis=1)
 
-    def begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
+    def begin(
+        self,
+        lanes: Lanes,
+        observation: Observation,
+        states: Array | None = None,
+        distractors: Array | None = None,
+    ) -> None:
         """Put lanes at the start of an episode, and write their rows of `observation`.
 
-        `states` are `[len(lanes), S]`; None draws from each lane's generator.
+        `states` are `[len(lanes), S]` and `distractors` `[len(lanes), m]`; None draws them from
+        each lane's generators.
         """
-        S = self.task.spec.state_dim
         if states is None:
             states = self.initial_states.draw(lanes)
         self._s[:, lanes] = states.T
         self._t[lanes] = 0
         self._accumulated[:, lanes] = 0.0
-        observation[lanes, :S] = states
-        observation[lanes, S:] = 0.0
+        shown: npt.NDArray[Any] = states
+        if self._extended is not None:
+            self._extended.begin(lanes, distractors)
+            shown = self._extended.seen(states, lanes)
+        width = shown.shape[1]
+        observation[lanes, :width] = shown
+        observation[lanes, width:] = 0.0
 
-    def place(self, states: Array, t: Lanes, accumulated: Array) -> None:
+    def place(
+        self, states: Array, t: Lanes, accumulated: Array, distractors: Array | None = None
+    ) -> None:
         """Put every lane at any point of an episode; `observe` gives the observations there.
 
-        States are `[B, S]`, completed steps t `[B]` in [0, T), and each agent's r_cum `[B, n]`.
+        States are `[B, S]`, completed steps t `[B]` in [0, T), each agent's r_cum `[B, n]`, and
+        distractors `[B, m]`; None draws them.
         """
         self._s[:] = states.T
         self._t[:] = t
         self._accumulated[:] = accumulated.T
+        if self._extended is not None:
+            self._extended.begin(np.arange(self.lanes), distractors)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:
         """One step of every lane.
@@ -272,7 +320,14 @@ class Batch:
             actions = np.ascontiguousarray(actions, dtype=np.float64)
         moved = self._moved
         arrays, result = self._take()
-        if not self._step_many(self._s, self._t, self._accumulated, actions, moved, *arrays):
+        observation, optimal, values, ends, limits = arrays
+        if not self._step_many(
+            self._s, self._t, self._accumulated, actions, moved, observation, optimal, values, ends
+        ):
             raise not_finite_error()
         self._s, self._moved = moved, self._s
+        if self._extended is not None:
+            self._extended.extend(
+                self._moved, moved, actions, optimal, values, observation, limits, resting
+            )
         return result

@@ -1,6 +1,7 @@
 """`info`: the keys of every step and every reset, of a single environment and of a batch.
 
 At a step the values are those of `SMEEnv`, float64 of NumPy, since some libraries ask for a dtype.
+With `safety` there are four more: `cost`, `limit`, `safe_action` and `safe_regret`.
 At a reset no action was taken: the same keys hold NaN, so that every info has one structure.
 The info of a stream also has `phase` and `lifetime`, int64 of NumPy, which a reset has as well.
 """
@@ -13,54 +14,98 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.values import (
+    ACCUMULATED_REWARD,
+    COST,
+    REGRET,
+    SAFE_REGRET,
+    SIMILARITY,
+    STEP_REWARD,
+)
 from sme_registry.envs.arguments import from_unit
 from sme_registry.envs.types import Array, Lanes, Mask
+from sme_registry.spec import SMESpec
 
 if TYPE_CHECKING:
     from sme_registry.envs.batch import BatchStep
 
-NUMBERS = "similarity", "step_reward", "regret", "accumulated_reward"
-"""The keys whose values are numbers; `optimal_action` `[A]` is the fifth."""
+NUMBERS = {
+    "similarity": SIMILARITY,
+    "step_reward": STEP_REWARD,
+    "regret": REGRET,
+    "accumulated_reward": ACCUMULATED_REWARD,
+}
+"""The keys whose values are numbers, and the row of a batch's `values` that each is."""
 
+SAFETY_NUMBERS = {"cost": COST, "safe_regret": SAFE_REGRET}
+"""Those that a task with `safety` has besides."""
+
+SAFETY_ACTIONS = "limit", "safe_action"
+"""Likewise, the keys whose values are `[A]`: the rows of `BatchStep.limits`."""
+
+_ACTIONS = ("optimal_action",)
 _NAN = np.float64(np.nan)
 
 
-def at_reset(action_dim: int) -> dict[str, Any]:
-    """The info of a reset: NaN for every key, `optimal_action` a fresh array `[A]`."""
-    return {"optimal_action": np.full(action_dim, np.nan), **dict.fromkeys(NUMBERS, _NAN)}
+def numbers(spec: SMESpec) -> dict[str, int]:
+    """The keys of a spec's infos whose values are numbers, and their rows in `values`."""
+    return NUMBERS if spec.safety is None else NUMBERS | SAFETY_NUMBERS
+
+
+def actions(spec: SMESpec) -> tuple[str, ...]:
+    """The keys whose values are `[A]`, in the environment's action range."""
+    return _ACTIONS if spec.safety is None else _ACTIONS + SAFETY_ACTIONS
+
+
+def at_reset(spec: SMESpec, action_dim: int | None = None) -> dict[str, Any]:
+    """The info of a reset: NaN for every key, those of actions as fresh arrays `[A]`.
+
+    An agent of a team has `action_dim` channels of its own.
+    """
+    width = spec.action_dim if action_dim is None else action_dim
+    arrays = {key: np.full(width, np.nan) for key in actions(spec)}
+    return {**arrays, **dict.fromkeys(numbers(spec), _NAN)}
+
+
+def batch_at_reset(spec: SMESpec, lanes: int) -> dict[str, Array]:
+    """The info of `B` resets: fresh arrays of NaN, those of actions `[B, A]`, others `[B]`."""
+    arrays = {key: np.full((lanes, spec.action_dim), np.nan) for key in actions(spec)}
+    return arrays | {key: np.full(lanes, np.nan) for key in numbers(spec)}
 
 
 def write_reset(
     info: dict[str, npt.NDArray[Any]], lanes: Lanes, life: Mapping[str, npt.NDArray[Any]]
 ) -> None:
     """Overwrite a batched info in the lanes that begin an episode; `life` is `Batch.life`'s."""
-    for key in ("optimal_action", *NUMBERS):
-        info[key][lanes] = np.nan
-    for key, value in life.items():
-        info[key][lanes] = value[lanes]
+    for key, value in info.items():
+        value[lanes] = life[key][lanes] if key in life else np.nan
 
 
-def batch_at_reset(lanes: int, action_dim: int) -> dict[str, Array]:
-    """The info of `B` resets: fresh arrays of NaN, `optimal_action` `[B, A]`, others `[B]`."""
-    numbers = {key: np.full(lanes, np.nan) for key in NUMBERS}
-    return {"optimal_action": np.full((lanes, action_dim), np.nan), **numbers}
+def of_batch(step: BatchStep, rescaled: bool) -> dict[str, npt.NDArray[Any]]:
+    """The info of a step of a single agent's lanes: `[B, A]` and `[B]`; see `_of_step`."""
+    return _of_step(step, step.values[:, 0], ..., rescaled)
+
+
+def of_all_agents(step: BatchStep, lane: int, rescaled: bool) -> dict[str, Any]:
+    """One lane's step as one agent's: the actions of all channels, the means over the agents."""
+    return _of_step(step, step.values[:, :, lane].mean(axis=1), lane, rescaled)
+
+
+def _of_step(step: BatchStep, values: Array, lanes: Any, rescaled: bool) -> dict[str, Any]:
+    """The info of a step from its `values` `[5 or 7, …]`, and its actions of some lanes."""
+    info = {
+        "optimal_action": from_unit(step.optimal[lanes], rescaled),
+        **{key: values[row] for key, row in NUMBERS.items()},
+    }
+    if step.limits.size:
+        info |= zip(SAFETY_ACTIONS, from_unit(step.limits[:, lanes], rescaled), strict=True)
+        info |= {key: values[row] for key, row in SAFETY_NUMBERS.items()}
+    return info
 
 
 def of_life(phase: Any, lifetime: Any) -> dict[str, Any]:
     """What the info of a stream has besides: its phase, and the environment steps lived."""
     return {"phase": phase, "lifetime": lifetime}
-
-
-def of_all_agents(step: BatchStep, lane: int, rescaled: bool) -> dict[str, Any]:
-    """One lane's step as one agent's: the actions of all channels, the means over the agents."""
-    similarity, step_reward, regret, _, accumulated = step.values[:, :, lane].mean(axis=1).tolist()
-    return {
-        "optimal_action": from_unit(step.optimal[lane], rescaled),
-        "similarity": similarity,
-        "step_reward": step_reward,
-        "regret": regret,
-        "accumulated_reward": accumulated,
-    }
 
 
 def masked(info: Mapping[str, npt.NDArray[Any]], mask: Mask | None = None) -> dict[str, Any]:

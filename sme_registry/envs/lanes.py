@@ -29,6 +29,12 @@ class Lane:
         return state
 
     @property
+    def distractors(self) -> Array:
+        """The present distractors, `[m]` float64 in [0, 1] (a copy)."""
+        distractors: Array = self._owner._batch.distractors[self._index]
+        return distractors
+
+    @property
     def task(self) -> Task:
         """The task that the lane runs; of a stream the one in force."""
         task: Task = self._owner._batch.task_of(self._index)

@@ -6,16 +6,10 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 
 from sme_registry.compiled import engine
-from sme_registry.compiled.values import (
-    ACCUMULATED_REWARD,
-    LANE_STATE,
-    LANE_VALUES,
-    REGRET,
-    SIMILARITY,
-    STEP_REWARD,
-)
+from sme_registry.compiled.values import EXTENDED, LANE_STATE, LANE_VALUES
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import (
     RENDER_MODES,
@@ -23,6 +17,7 @@ from sme_registry.envs.base import (
     RenderMixin,
     refuse_short_time_limit,
 )
+from sme_registry.envs.extension import ExtendedLane, reset_options
 from sme_registry.envs.types import Action, Array, Observation
 from sme_registry.errors import EpisodeError
 from sme_registry.spec import ActionRange, SpecLike
@@ -42,6 +37,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     `info` of each step, about the state acted in: `optimal_action` `[A]`, in the environment's
     action range; `similarity` r̃, `step_reward` r and `regret` 1 − r, each in [0, 1]; and
     `accumulated_reward` r_cum after a payout's reset. At reset the same keys hold NaN.
+
+    With `safety`, `info` also has `limit` and `safe_action` `[A]`, in the environment's action
+    range; `cost` in [0, 1]; and `safe_regret`, the safe action's step reward minus r. With
+    `observation` the agent sees M(s, d) `[S + m]` in place of the state.
 
     Args:
       spec: the task: a spec, its fields, an id, a digest or a path.
@@ -67,13 +66,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     ) -> None:
         self._set_render_mode(render_mode)
         self._task = self._load(spec, overrides)
-        S, A = self.sme_spec.state_dim, self.sme_spec.action_dim
+        A = self.sme_spec.action_dim
         space, self._rescaled = arguments.action_space(action_range, A)
         self.action_space = cast("gymnasium.Space[Action]", space)
-        width = S + 2 + len(self._phase_shown)
+        width = self.sme_spec.observation_dim + len(self._phase_shown)
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._action_shape = (A,)
         self._state = "created"
+        self._extended = ExtendedLane(self._task) if self.sme_spec.extended else None
         self._load_engine()
 
     # What `SMEStreamEnv` has besides. They stand here because a step of a stream is a step of its
@@ -81,7 +81,10 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     _phase: Any = None  # in force, NumPy's number
     _lifetimes: list[Any] | None = None  # those of the next steps, the last one first
     _phase_shown: Observation = np.empty(0, np.float32)  # what observations end with
-    _reset_options: tuple[str, ...] = ("state",)
+
+    @property
+    def _reset_options(self) -> tuple[str, ...]:
+        return reset_options(self.sme_spec)
 
     def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
         """The task at the beginning."""
@@ -91,9 +94,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         compiled = engine(self._task)
         self._step_float32, self._step_float64 = compiled.step_float32, compiled.step_float64
         self._buffer, self._lane = compiled.new_lane()  # the second is a view of the first
-        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
         # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
-        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in rows)
+        self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in infos.NUMBERS.values())
         self._rows: list[tuple[Array, Observation]] = []
         self._prepare_step()
 
@@ -115,11 +117,11 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
     def _refill(self) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
-        S, A, shown = self.sme_spec.state_dim, self.sme_spec.action_dim, self._phase_shown
-        count = max(1, _POOL_BYTES // (8 * max(S + 2, A)))
+        width, A = self.sme_spec.observation_dim, self.sme_spec.action_dim
+        count = max(1, _POOL_BYTES // (8 * max(width, A)))
         optimal = np.empty((count, A))
-        observations = np.empty((count, S + 2 + len(shown)), np.float32)
-        observations[:, S + 2 :] = shown
+        observations = np.empty((count, width + len(self._phase_shown)), np.float32)
+        observations[:, width:] = self._phase_shown
         self._rows.extend(zip(optimal, observations, strict=True))
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
@@ -138,11 +140,18 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self.__dict__.update(state)
         self._load_engine()
         self._lane[:] = state["_lane"]
+        if self._extended is not None:
+            self._extended.go_on(self._lane)
 
     @property
     def state(self) -> Array:
         """The state s, `[S]` float64 in [0, 1] (a copy)."""
         return self._lane[LANE_STATE:].copy()
+
+    @property
+    def distractors(self) -> Array:
+        """The distractors d, `[m]` float64 in [0, 1] (a copy); empty where the task has none."""
+        return np.empty(0) if self._extended is None else self._extended.distractors[0]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -151,13 +160,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
         Args:
           seed: seeds the environment's generator; None continues its stream.
-          options: `{"state": s}` begins at s `[S]`, each entry in [0, 1].
+          options: `{"state": s}` begins at s `[S]`, each entry in [0, 1], and where the task has
+            distractors `{"distractors": d}` at d `[m]`.
 
         Returns:
-          The observation `[S + 2]`, and an info of NaN.
+          The observation `[S + m + 2]`, and an info of NaN.
 
         Raises:
-          StateError: the state has the wrong shape or lies outside the cube.
+          StateError: the state or the distractors have the wrong shape or lie outside the cube.
           OptionError: an unknown option, or a seed that is no integer of at least 0.
           WrapperError: an outer TimeLimit would end the episode before the horizon.
         """
@@ -165,21 +175,28 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         arguments.refuse_unknown_options(options, self._reset_options)
         S, seed = self.sme_spec.state_dim, arguments.checked_seed(seed)
         lifetime = arguments.lifetime_in(options)
-        start = None
-        if options and "state" in options:
-            start = arguments.initial_states(options["state"], (S,))
+        start, distractors = (
+            arguments.initial_values(name, options or {}, (width,))
+            for name, width in (("state", S), ("distractors", self.sme_spec.distractors))
+        )
         super().reset(seed=seed)  # nothing changes before every argument is checked
         life = self._live(0 if lifetime is None and seed is not None else lifetime)
         s = self.np_random.random(S) if start is None else start
         self._lane[:LANE_STATE] = 0.0
         self._lane[LANE_STATE:] = s
-        observation = np.zeros(S + 2 + len(self._phase_shown), np.float32)
-        observation[:S], observation[S + 2 :] = s, self._phase_shown
+        shown: npt.NDArray[Any] = s
+        if self._extended is not None:
+            begins = seed is not None or self._state == "created"
+            if begins and self.np_random_seed >= 0:  # -1 where the user has set the generator
+                self._extended.seed(0, self.np_random_seed)
+            shown = self._extended.begin_lane(self._lane, distractors)
+        observation = np.zeros(len(shown) + 2 + len(self._phase_shown), np.float32)
+        observation[: len(shown)], observation[len(shown) + 2 :] = shown, self._phase_shown
         self._state = "running"
         self._prepare_step()
         if self.render_mode is not None:
             self._record(self, None)
-        return observation, {**infos.at_reset(self._action_shape[0]), **life}
+        return observation, {**infos.at_reset(self.sme_spec), **life}
 
     def _live(self, lifetime: int | None) -> dict[str, Any]:
         """Called by each reset before it draws a state; what it returns is added to the info.
@@ -242,23 +259,33 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             }
             plain = plain and lifetimes
         if end or not plain:
-            self._after(end, action, info, observation)
+            end = self._after(end, action, info, observation)
             return observation, reward, end == 1.0 or end == 3.0, end >= 2.0, info
         return observation, reward, False, False, info
 
     def _after(
         self, end: float, action: Action, info: dict[str, Any], observation: Observation
-    ) -> None:
-        """What the fast path leaves out: refused actions, the end, other ranges, frames."""
+    ) -> float:
+        """What the fast path leaves out: refused actions, extensions, the end, ranges, frames.
+
+        Returns:
+          The end without EXTENDED.
+        """
         if end < 0.0:
             self._checked(action)  # raises where the size is wrong
             raise arguments.not_finite_error()
+        if self._extended is not None:
+            self._extended.extend_step(self._lane, action, info, observation)
+            end -= EXTENDED
         if end:
             self._state = "ended"
             self._prepare_step()
-        info["optimal_action"] = arguments.from_unit(info["optimal_action"], self._rescaled)
+        if self._rescaled:
+            for key in infos.actions(self.sme_spec):
+                info[key] = arguments.from_unit(info[key], True)
         if self.render_mode is not None:
             self._record(self, (arguments.from_unit(action, self._rescaled), info))
+        return end
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({title(self.document)})"

@@ -56,7 +56,9 @@ class SMEStreamEnv(SMEEnv):
             **overrides,
         )
 
-    _reset_options = ("state", "lifetime")
+    @property
+    def _reset_options(self) -> tuple[str, ...]:
+        return "state", "lifetime"
 
     def _load(self, spec: Any, overrides: dict[str, Any]) -> Task:
         self._tasks = arguments.load_stream_tasks(type(self), spec, overrides)
@@ -105,7 +107,7 @@ class SMEStreamEnv(SMEEnv):
 
     def _after(
         self, end: float, action: Action, info: dict[str, Any], observation: Observation
-    ) -> None:
+    ) -> float:
         assert self._lifetimes is not None
         if end < 0.0:
             self._lifetimes.append(info["lifetime"])  # nothing was lived
@@ -117,4 +119,4 @@ class SMEStreamEnv(SMEEnv):
                 S = self.sme_spec.state_dim
                 waiting = self._lane[LANE_VALUES + ACCUMULATED_REWARD] / self.sme_spec.k
                 observation[S + 1], observation[S + 2 :] = min(waiting, 1.0), self._phase_shown
-        super()._after(end, action, info, observation)
+        return super()._after(end, action, info, observation)

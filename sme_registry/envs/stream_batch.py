@@ -33,8 +33,6 @@ class StreamBatch(Batch):
       ResourceLimitError: a batch this large would not fit in memory.
     """
 
-    reset_options = ("state", "lifetime")
-
     def __init__(self, tasks: StreamTasks, lanes: int) -> None:
         refuse_large_batch(lanes, 40 + 20 * tasks.stream.observation_dim)
         self.tasks = tasks
@@ -61,6 +59,11 @@ class StreamBatch(Batch):
     def observation_dim(self) -> int:
         """Entries of an observation: S + 2, and one for each phase where it shows the phase."""
         return self.tasks.stream.observation_dim
+
+    @property
+    def reset_options(self) -> tuple[str, ...]:
+        """The options of an environment's reset."""
+        return "state", "lifetime"
 
     @property
     def one_task(self) -> Task | None:
@@ -97,10 +100,16 @@ class StreamBatch(Batch):
         self._show(np.arange(self.lanes), observation)
         return observation
 
-    def begin(self, lanes: Lanes, observation: Observation, states: Array | None = None) -> None:
+    def begin(
+        self,
+        lanes: Lanes,
+        observation: Observation,
+        states: Array | None = None,
+        distractors: Array | None = None,
+    ) -> None:
         """As `Batch.begin`, in the piece that is in force after the steps lived."""
         self._switch(lanes)
-        super().begin(lanes, observation, states)
+        super().begin(lanes, observation, states, distractors)
         self._show(lanes, observation)
 
     def advance(self, actions: Array, resting: Mask | None = None) -> BatchStep:

@@ -18,12 +18,8 @@ import numpy.typing as npt
 from pettingzoo import ParallelEnv
 
 from sme_registry.compiled.values import (
-    ACCUMULATED_REWARD,
-    REGRET,
     REWARD,
     ROWS,
-    SIMILARITY,
-    STEP_REWARD,
 )
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import RENDER_MODES, RenderMixin
@@ -80,7 +76,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         **overrides: Any,
     ) -> None:
         self._set_render_mode(render_mode)
-        self._task = arguments.load_overridden(type(self), spec, overrides)
+        task = arguments.load_overridden(type(self), spec, overrides)
+        self._task = arguments.without_extension(task)
         self._batch = Batch(self._task, 1, reuse=True)
         columns = observed_columns(self._task)
         self._every_column = np.concatenate(columns)
@@ -111,9 +108,8 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         views = [(name, row[channels]) for _, name, channels in self._parts]
         self._slots = [(name, view.shape, view) for name, view in views]
         self._values = np.zeros((ROWS, len(self._parts), 1))
-        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
         self._numbers: list[tuple[Any, ...]] = [
-            (name, channels, *(self._values[row, agent, 0, ...] for row in rows))
+            (name, channels, *(self._values[row, agent, 0, ...] for row in infos.NUMBERS.values()))
             for agent, name, channels in self._parts
         ]
 
@@ -172,7 +168,7 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
         if self.render_mode is not None:
             self._record(self._joint_view(), None)
         return self._by_agent(observation), {
-            name: infos.at_reset(len(view)) for name, _, view in self._slots
+            name: infos.at_reset(self.sme_spec, len(view)) for name, _, view in self._slots
         }
 
     def step(

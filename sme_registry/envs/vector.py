@@ -11,6 +11,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from sme_registry.compiled.values import REWARD
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import GymnasiumMixin, check_time_limit
 from sme_registry.envs.batch import Batch
@@ -99,6 +100,11 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         """The states, `[B, S]` float64 in [0, 1] (a copy)."""
         return self._batch.state
 
+    @property
+    def distractors(self) -> Array:
+        """The distractors, `[B, m]` float64 in [0, 1] (a copy); `[B, 0]` without any."""
+        return self._batch.distractors
+
     def reset(
         self,
         *,
@@ -109,11 +115,12 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
 
         Args:
           seed: n seeds lane i with n + i; a list seeds each lane; None continues the streams.
-          options: `{"state": s}` begins at s, `[S]` or `[B, S]`; `{"reset_mask": mask}` resets
-            the lanes where `mask` `[B]` is True and leaves the others as they are.
+          options: `{"state": s}` begins at s, `[S]` or `[B, S]`; where the task has distractors,
+            `{"distractors": d}` at d, `[m]` or `[B, m]`; `{"reset_mask": mask}` resets the lanes
+            where `mask` `[B]` is True and leaves the others as they are.
 
         Returns:
-          Observations `[B, S + 2]`, and infos of NaN in the lanes that are reset.
+          Observations `[B, S + m + 2]`, and infos of NaN in the lanes that are reset.
 
         Raises:
           StateError, OptionError: as `SMEEnv.reset`.
@@ -124,13 +131,12 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         mask = self._mask(options["reset_mask"]) if "reset_mask" in options else None
         lanes = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
         seeds = self._seeds(seed)[lanes]
-        states = None
-        if "state" in options:
-            S = self.document.state_dim
-            one_for_all = np.asarray(options["state"], dtype=object).ndim == 1
-            shape = (S,) if one_for_all else (self.num_envs, S)
-            states = arguments.initial_states(options["state"], shape)
-            states = np.broadcast_to(states, (self.num_envs, S))[lanes]
+        widths = {"state": self.document.state_dim, "distractors": self._batch.distractors.shape[1]}
+        given = {
+            name: arguments.initial_values(name, options, (width,), self.num_envs)
+            for name, width in widths.items()
+        }
+        states, distractors = (None if value is None else value[lanes] for value in given.values())
         # Every argument is checked: from here on, the state changes.
         for lane, lane_seed in zip(lanes, seeds, strict=True):
             if lane_seed is not None:
@@ -138,12 +144,13 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
             if lifetime is not None:
                 self._batch.live(int(lane), lifetime)
         observation = self._batch.observe()
-        self._begin(lanes, observation, states)
+        self._batch.begin(lanes, observation, states, distractors)
+        self._ended[lanes] = False
         self._begun[lanes] = True
         self._all_begun, self._any_ended = bool(self._begun.all()), bool(self._ended.any())
         if self._renderer is not None:
             self._renderer.record(lanes.tolist())
-        info = infos.batch_at_reset(self.num_envs, self.document.action_dim)
+        info = infos.batch_at_reset(self._batch.task.spec, self.num_envs)
         return observation, infos.masked({**info, **self._batch.life()}, mask)
 
     def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
@@ -155,7 +162,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
           actions: `[B, A]`, finite; clipped to the action range.
 
         Returns:
-          Observations `[B, S + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]`, infos.
+          Observations `[B, S + m + 2]`, rewards `[B]`, terminated `[B]`, truncated `[B]`, infos.
 
         Raises:
           ActionError: wrong shape, not numbers, or not finite; the states are unchanged then.
@@ -176,22 +183,15 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         unit_actions = arguments.to_unit(actions, (B, A), self._rescaled, ignored=resting)
 
         done = self._batch.advance(unit_actions, resting)
-        observation, optimal, values, terminated, truncated = done
-        similarity, step_reward, regret, reward, accumulated = values[:, 0]
-        info: dict[str, npt.NDArray[Any]] = {
-            "optimal_action": arguments.from_unit(optimal, self._rescaled),
-            "similarity": similarity,
-            "step_reward": step_reward,
-            "regret": regret,
-            "accumulated_reward": accumulated,
-            **self._batch.lived,
-        }
+        observation, reward = done.observation, done.values[REWARD, 0]
+        terminated, truncated = done.terminated, done.truncated
+        info = {**infos.of_batch(done, self._rescaled), **self._batch.lived}
         began = _NO_LANE
         if any_ended_before:
             began = np.flatnonzero(ended_before)
             for array in (reward, terminated, truncated):
                 array[ended_before] = 0
-            self._begin(began, observation, info=info)
+            self._begin(began, observation, info)
         ended: Mask = terminated | truncated
         any_ended = int(np.count_nonzero(ended)) > 0  # a tenth of the time of any()
         returned = infos.masked(info)
@@ -200,7 +200,7 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         elif any_ended:
             began = np.flatnonzero(ended)
             returned |= self._last(observation, info, ended)
-            self._begin(began, observation, info=info)
+            self._begin(began, observation, info)
         if self._renderer is not None:
             self._renderer.record(began.tolist(), unit_actions, done)
         return observation, reward, terminated, truncated, returned
@@ -271,14 +271,12 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
         self,
         lanes: Lanes,
         observation: Observation,
-        states: Array | None = None,
-        info: dict[str, npt.NDArray[Any]] | None = None,
+        info: dict[str, npt.NDArray[Any]],
     ) -> None:
         """Put lanes at the start of an episode, and write their observations and infos."""
-        self._batch.begin(lanes, observation, states)
+        self._batch.begin(lanes, observation)
         self._ended[lanes] = False
-        if info is not None:
-            infos.write_reset(info, lanes, self._batch.life())
+        infos.write_reset(info, lanes, self._batch.life())
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> npt.NDArray[Any]:
         """One seed or None for each lane, `[B]`."""

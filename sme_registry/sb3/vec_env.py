@@ -14,12 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from sme_registry.compiled.values import (
-    ACCUMULATED_REWARD,
-    REGRET,
     REWARD,
     ROWS,
-    SIMILARITY,
-    STEP_REWARD,
+    ROWS_WITH_SAFETY,
 )
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import renamed_by_content
@@ -107,10 +104,18 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
 
 class _Start(NamedTuple):
-    """How an episode begins: its seed, initial state `[1, S]` and lifetime; None for its own."""
+    """How an episode begins; None for the lane's own.
+
+    Attributes:
+      seed: of its team.
+      state: `[1, S]` the initial state.
+      distractors: `[1, m]` those at the start.
+      lifetime: of a stream.
+    """
 
     seed: int | None
     state: Array | None
+    distractors: Array | None
     lifetime: int | None
 
 
@@ -183,13 +188,14 @@ class _BatchVecEnv(LanesVecEnv):
         return [] if self._renderer is None else [*self._renderer.frames()]
 
     def _allocate(self) -> None:
-        """The values of a step, `[5, n, teams]`, and for each key of infos a view of each lane."""
-        self._values = np.zeros((ROWS, len(self.agents), self.num_teams))
-        rows = SIMILARITY, STEP_REWARD, REGRET, ACCUMULATED_REWARD
+        """The values of a step, `[rows, n, teams]`, and each lane's view of them by info key."""
+        numbers = infos.numbers(self._task.spec)
+        rows = ROWS if self._task.spec.safety is None else ROWS_WITH_SAFETY
+        self._values = np.zeros((rows, len(self.agents), self.num_teams))
         places = list(np.ndindex(self.num_teams, len(self.agents)))
         self._numbers = {
             key: [self._values[row, agent, team, ...] for team, agent in places]
-            for key, row in zip(infos.NUMBERS, rows, strict=True)
+            for key, row in numbers.items()
         }
 
     # The copy of a view is no view: the copy allocates both again.
@@ -204,7 +210,7 @@ class _BatchVecEnv(LanesVecEnv):
     def _info_at_reset(self, lane: int) -> dict[str, Any]:
         owned = self._owned[lane % len(self.agents)]
         life = self._batch.life_of(lane // len(self.agents))
-        return {**infos.at_reset(owned.stop - owned.start), **life}
+        return {**infos.at_reset(self._task.spec, owned.stop - owned.start), **life}
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Seed team e with seed + e at the next reset; None draws a seed.
@@ -241,7 +247,7 @@ class _BatchVecEnv(LanesVecEnv):
                 self._batch.seed(team, start.seed)
             if start.lifetime is not None:
                 self._batch.live(team, start.lifetime)
-            self._batch.begin(np.array([team]), joint, start.state)
+            self._batch.begin(np.array([team]), joint, start.state, start.distractors)
             self._begun[team] = True
         if self._renderer is not None:
             self._renderer.record(teams)
@@ -258,8 +264,12 @@ class _BatchVecEnv(LanesVecEnv):
         ):
             raise OptionError("options: a team has one state. Give the same to each of its lanes.")
         state = states[0][None] if states else None
-        # Only streams have a lifetime, and these have no teams.
-        return _Start(arguments.checked_seed(seed), state, arguments.lifetime_in(options[0]))
+        # Teams have neither distractors nor a lifetime.
+        distractors = arguments.initial_values(
+            "distractors", options[0], (self._task.spec.distractors,), 1
+        )
+        lifetime = arguments.lifetime_in(options[0])
+        return _Start(arguments.checked_seed(seed), state, distractors, lifetime)
 
     def step_wait(self) -> StepResult:
         """One step of every lane.
@@ -282,8 +292,10 @@ class _BatchVecEnv(LanesVecEnv):
         np.copyto(self._values, done.values)
         reward = done.values[REWARD].T.reshape(-1)
         optimal = arguments.from_unit(done.optimal, self._rescaled)
+        limits = arguments.from_unit(done.limits, self._rescaled) if done.limits.size else ()
         columns: dict[str, list[Any]] = {
             "optimal_action": [row[part] for row in optimal for part in self._owned],
+            **{key: list(rows) for key, rows in zip(infos.SAFETY_ACTIONS, limits, strict=False)},
             **{key: [view[()] for view in views] for key, views in self._numbers.items()},
             **{key: list(values) for key, values in self._batch.lived.items()},
             "TimeLimit.truncated": np.repeat(done.truncated & ~done.terminated, n).tolist(),
@@ -318,7 +330,7 @@ class SMEVecEnv(_BatchVecEnv):
     As in SB3's `VecEnv`s, a finished lane begins its next episode at once, its last observation is
     `terminal_observation` in its info, `TimeLimit.truncated` is True where it was truncated and
     not terminated, and `seed(n)` seeds lane i with n + i at the next reset. Observations are
-    `[B, S + 2]`, as those of `SMEEnv`. A stream's lives go on at each `reset()` without a seed;
+    `[B, S + m + 2]`, as those of `SMEEnv`. A stream's lives go on at each `reset()` without a seed;
     observations and infos are those of `SMEStreamEnv`.
 
     Args:
@@ -393,6 +405,7 @@ class SMETeamVecEnv(_BatchVecEnv):
         **overrides: Any,
     ) -> None:
         task = arguments.load_overridden(type(self), spec_or_id, overrides)
+        arguments.without_extension(task)
         # For each channel of the joint action: the agent that owns it, and the entry of its action.
         self._owner = np.repeat(np.arange(len(task.owned)), [o.stop - o.start for o in task.owned])
         self._entry = np.concatenate([np.arange(part.stop - part.start) for part in task.owned])

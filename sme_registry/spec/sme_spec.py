@@ -299,6 +299,11 @@ class Setting(Document):
         return self.state_dim + self.distractors + 2
 
     @property
+    def extended(self) -> bool:
+        """Whether a step does more than METHOD's section 1: `safety` or `observation` is set."""
+        return self.safety is not None or self.observation is not None
+
+    @property
     def distractors(self) -> int:
         """m, 0 without `observation`."""
         return 0 if self.observation is None else self.observation.distractors

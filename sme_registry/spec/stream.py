@@ -178,6 +178,12 @@ class StreamSpec(NamedDocument):
                     f"phases.{index}.spec: is for a team of {len(phase.spec.team.agents)} agents, "
                     "and streams are for a single one. Remove its team."
                 )
+            for field in ("safety", "observation"):
+                if getattr(phase.spec, field) is not None:
+                    raise ValueError(
+                        f"phases.{index}.spec: has {field}, which streams do not support yet. "
+                        f"Remove its {field}."
+                    )
             for field in _SHARED:
                 one, other = getattr(first, field), getattr(phase.spec, field)
                 if one != other:

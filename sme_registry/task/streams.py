@@ -44,3 +44,39 @@ def uniform(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:
 def gaussian(seed: int | str, name: str, count: int) -> npt.NDArray[np.float64]:
     """Standard normal numbers of a stream, `[count]`: Φ⁻¹ of its uniform numbers."""
     return np.asarray(ndtri(uniform(seed, name, count)))
+
+
+# SplitMix64's constants.
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+FIRST_MIX = np.uint64(0xBF58476D1CE4E5B9)
+SECOND_MIX = np.uint64(0x94D049BB133111EB)
+
+
+def counted(
+    key: npt.NDArray[np.uint64], first: npt.NDArray[np.uint64], count: int
+) -> npt.NDArray[np.float64]:
+    """Uniform numbers of counter-based streams, for environments; see `to_uniform`.
+
+    The word at place n is SplitMix64's n-th from the seed mix(key). Any place can be computed
+    alone, by machine code as well, so that a lane's only state is the place.
+    Source: Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators.
+
+    Args:
+      key: `[n]` of each stream.
+      first: `[n]` the place of the first number, 1 at the beginning.
+      count: of numbers of each stream.
+
+    Returns:
+      `[n, count]` in (0, 1).
+    """
+    with np.errstate(over="ignore"):  # arithmetic is modulo 2⁶⁴
+        places = first[:, None] + np.arange(count, dtype=np.uint64)
+        start = mixed_bits(key)[:, None]
+        return to_uniform(mixed_bits(np.add(start, places * GOLDEN, dtype=np.uint64)))
+
+
+def mixed_bits(z: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """SplitMix64's bijection of 64-bit words; a changed bit changes half of all bits."""
+    z = (z ^ (z >> np.uint64(30))) * FIRST_MIX
+    z = (z ^ (z >> np.uint64(27))) * SECOND_MIX
+    return z ^ (z >> np.uint64(31))

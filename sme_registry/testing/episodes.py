@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.envs.arguments import from_unit
+from sme_registry.spec import SMESpec
 from sme_registry.testing.comparing import ConformanceError, expect_equal, expect_near, expect_same
 
 Make = Callable[..., Any]  # creates an environment, as the classes of `sme_registry.envs` do
@@ -19,14 +20,23 @@ MAX_STEPS = 250  # of one episode: horizons may be long
 LONGEST_HORIZON = 10_000  # that the optimal policy is followed to
 LONGEST_LIFE = 1000  # steps of a stream
 INFO_KEYS = {"optimal_action", "similarity", "step_reward", "regret", "accumulated_reward"}
+SAFETY_KEYS = {"cost", "limit", "safe_action", "safe_regret"}
+ACTION_KEYS = {"optimal_action", "limit", "safe_action"}  # of INFO_KEYS and SAFETY_KEYS
 
 
-def expect_info_of_reset(what: str, info: dict[str, Any], action_dim: int) -> None:
+def info_keys(spec: SMESpec) -> set[str]:
+    """The keys of a single agent's info."""
+    return INFO_KEYS if spec.safety is None else INFO_KEYS | SAFETY_KEYS
+
+
+def expect_info_of_reset(
+    what: str, info: dict[str, Any], action_dim: int, keys: set[str] = INFO_KEYS
+) -> None:
     """The info of a reset has the keys, shapes and types of a step's, and is NaN."""
-    expect_equal(f"{what}: the keys", set(info), INFO_KEYS)
-    expect_same(f"{what}: optimal_action", info["optimal_action"], np.full(action_dim, np.nan))
-    for key in sorted(INFO_KEYS - {"optimal_action"}):
-        expect_same(f"{what}: {key}", info[key], np.float64(np.nan))
+    expect_equal(f"{what}: the keys", set(info), keys)
+    for key in sorted(keys):
+        nan = np.full(action_dim, np.nan) if key in ACTION_KEYS else np.float64(np.nan)
+        expect_same(f"{what}: {key}", info[key], nan)
 
 
 def mixed_actions(optimal: npt.NDArray[Any], rng: np.random.Generator) -> npt.NDArray[np.float32]:

@@ -17,7 +17,7 @@ from sme_registry.envs import SMEEnv, SMEVectorEnv
 from sme_registry.registration import env_spec
 from sme_registry.spec import ACTION_RANGES, SMESpec, SpecLike, StreamLike, StreamSpec
 from sme_registry.spec.resolve import names_stream
-from sme_registry.task import load_spec, load_stream, materialize
+from sme_registry.task import Task, load_spec, load_stream, materialize
 from sme_registry.testing import episodes
 from sme_registry.testing.comparing import (
     TOLERANCE,
@@ -28,13 +28,16 @@ from sme_registry.testing.comparing import (
     expect_same,
 )
 from sme_registry.testing.episodes import (
-    INFO_KEYS,
+    ACTION_KEYS,
     LONGEST_HORIZON,
     LONGEST_LIFE,
     MAX_STEPS,
     Make,
+    info_keys,
     next_action,
 )
+
+_FLOAT32_ROUNDING = 2e-7  # of what an agent sees, in [0, 1]
 
 
 def check_sme(
@@ -94,18 +97,20 @@ def check_info(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
         env, untouched = (single(spec, action_range=action_range) for _ in range(2))
         for each in (env, untouched):
             reset_info = each.reset(seed=seed)[1]
-            episodes.expect_info_of_reset("info at reset", reset_info, spec.action_dim)
+            keys = info_keys(spec)
+            episodes.expect_info_of_reset("info at reset", reset_info, spec.action_dim, keys)
         rng = np.random.default_rng(seed)
         overwritten: list[npt.NDArray[Any]] = []
         for _ in range(min(spec.horizon, 5)):
             action = next_action(env, rng)
             (observation, *_, info), expected = env.step(action), untouched.step(action)
             _check_info_entries(info, spec, env.action_space.low)
-            returned = {"observation": observation, "optimal_action": info["optimal_action"]}
-            original = (expected[0], expected[-1]["optimal_action"])
+            arrays = sorted(ACTION_KEYS & keys)
+            returned = {"observation": observation, **{key: info[key] for key in arrays}}
+            original = {"observation": expected[0], **expected[-1]}
             before = np.copy(env.state)
-            for (name, array), value in zip(returned.items(), original, strict=True):
-                expect_equal(f"{name}, after writing into an earlier one", array, value)
+            for name, array in returned.items():
+                expect_equal(f"{name}, after writing into an earlier one", array, original[name])
                 if any(np.shares_memory(array, earlier) for earlier in overwritten):
                     raise ConformanceError("A later step reuses an array that `step` returned.")
                 array[:] = -7.0
@@ -116,23 +121,28 @@ def check_info(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
 
 
 def _check_info_entries(info: dict[str, Any], spec: SMESpec, low: npt.NDArray[Any]) -> None:
-    expect_equal("info's keys", set(info), INFO_KEYS)
-    optimal = info["optimal_action"]
-    if not (isinstance(optimal, np.ndarray) and optimal.dtype == np.float64):
-        raise ConformanceError(f"optimal_action: must be float64, got {optimal!r:.80}.")
-    expect_equal("optimal_action's shape", optimal.shape, (spec.action_dim,))
-    if not ((optimal >= low) & (optimal <= 1.0)).all():
-        raise ConformanceError(f"optimal_action={optimal}: outside the action range.")
-    for key in sorted(INFO_KEYS - {"optimal_action"}):
+    keys = info_keys(spec)
+    expect_equal("info's keys", set(info), keys)
+    for key in sorted(ACTION_KEYS & keys):
+        value = info[key]
+        if not (isinstance(value, np.ndarray) and value.dtype == np.float64):
+            raise ConformanceError(f"{key}: must be float64, got {value!r:.80}.")
+        expect_equal(f"{key}'s shape", value.shape, (spec.action_dim,))
+        if not ((value >= low) & (value <= 1.0)).all():
+            raise ConformanceError(f"{key}={value}: outside the action range.")
+    for key in sorted(keys - ACTION_KEYS):
+        bottom = -1.0 if key == "safe_regret" else 0.0
         top = spec.k if key == "accumulated_reward" else 1.0
-        if not (isinstance(info[key], np.float64) and 0.0 <= info[key] <= top):
-            raise ConformanceError(f"{key}={info[key]!r}: must be a float64 in [0, {top}].")
+        if not (isinstance(info[key], np.float64) and bottom <= info[key] <= top):
+            raise ConformanceError(f"{key}={info[key]!r}: must be a float64 in [{bottom}, {top}].")
 
 
 def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
     """Each step equals that of the spec's `Task`, and rewards are paid as METHOD defines.
 
-    States are compared bit for bit, optimal actions and rewards to 1e-12.
+    States are compared bit for bit, optimal actions, rewards, limits and costs to 1e-12, and what
+    the agent sees of a mixing to the rounding of float32. Distractors stay in [0, 1]; driven ones
+    move by their own transition.
     """
     spec = load_spec(task)
     definition, rng = materialize(spec), np.random.default_rng(seed)
@@ -140,15 +150,16 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
         env = single(spec)
         observation, _ = env.reset(seed=seed + episode)
         s, accumulated, tolerance = env.state, 0.0, spec.k * TOLERANCE
-        expect_equal("the first observation", observation, _expected_observation(spec, s, 0, 0.0))
+        _check_observation("the first observation", definition, env, observation, 0, 0.0)
         for t in range(1, min(spec.horizon, MAX_STEPS) + 1):
-            action = next_action(env, rng)
+            action, d = next_action(env, rng), _distractors(definition, env)
             observation, reward, terminated, truncated, info = env.step(action)
             similarity, step_reward = info["similarity"], info["step_reward"]
             expect_near("optimal_action", info["optimal_action"], definition.optimal_action(s))
             expect_near("similarity", similarity, definition.similarity(s, action))
             expect_near("step_reward", step_reward, definition.reward_of(similarity))
             expect_equal("regret", info["regret"], 1.0 - step_reward)
+            _check_limits(definition, s, action, info)
             s = definition.transition(s, action)
             expect_equal("the next state", env.state, s)
 
@@ -159,8 +170,12 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
             expect_near("accumulated_reward", info["accumulated_reward"], accumulated, tolerance)
             expect_equal("terminated", terminated, step_reward < spec.D)
             expect_equal("truncated", truncated, t == spec.horizon)
-            expect_equal("the observation", observation, _expected_observation(
-                spec, s, t, info["accumulated_reward"]))  # fmt: skip
+            driven = spec.observation is not None and spec.observation.dynamics == "driven"
+            if d is not None and driven:
+                d = definition.distractor_step(d, action)
+                expect_equal("the next distractors", env.distractors, d)
+            waiting = info["accumulated_reward"]
+            _check_observation("the observation", definition, env, observation, t, waiting)
             if terminated or truncated:
                 break
 
@@ -249,7 +264,40 @@ def _recreated(created_from: EnvSpec) -> Any:
     return gymnasium.make(EnvSpec.from_json(created_from.to_json()))
 
 
-def _expected_observation(
-    spec: SMESpec, s: Any, t: int, accumulated: float
-) -> npt.NDArray[np.float32]:
-    return np.array([*s, t / spec.horizon, accumulated / spec.k], np.float32)
+def _distractors(definition: Task, env: Any) -> npt.NDArray[np.float64] | None:
+    """The distractors, in [0, 1]; None where the task has none."""
+    m = definition.spec.distractors
+    if m == 0:
+        return None
+    d: npt.NDArray[np.float64] = env.distractors
+    expect_equal("the shape of the distractors", d.shape, (m,))
+    if not ((d >= 0.0) & (d <= 1.0)).all():
+        raise ConformanceError(f"distractors={d}: outside [0, 1].")
+    return d
+
+
+def _check_observation(
+    what: str, definition: Task, env: Any, observation: Any, t: int, accumulated: float
+) -> None:
+    """The agent sees M(s, d), t/T and r_cum/k."""
+    spec, s, d = definition.spec, env.state, _distractors(definition, env)
+    expected = np.array(
+        [*definition.seen(s, d), t / spec.horizon, accumulated / spec.k], np.float32
+    )
+    if definition.mixing:
+        expect_equal(f"{what}: its shape", observation.shape, expected.shape)
+        expect_near(what, observation, expected, _FLOAT32_ROUNDING)
+    else:
+        expect_equal(what, observation, expected)
+
+
+def _check_limits(definition: Task, s: Any, action: Any, info: dict[str, Any]) -> None:
+    """Limits, the safe action, cost and safe regret, where the task has `safety`."""
+    if definition.spec.safety is None:
+        return
+    expect_near("limit", info["limit"], definition.limit(s))
+    expect_near("safe_action", info["safe_action"], definition.safe_action(s))
+    expect_near("cost", info["cost"], definition.cost(s, action))
+    similarity = definition.similarity_of(info["safe_action"], info["optimal_action"])
+    safe_regret = definition.reward_of(similarity) - info["step_reward"]
+    expect_near("safe_regret", info["safe_regret"], safe_regret)

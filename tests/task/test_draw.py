@@ -246,3 +246,34 @@ def test_a_tasks_arrays_cannot_be_written_to():
     for array in (task.W, task.b, *(part for layer in task.layers for part in layer)):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0.0
+
+
+def test_counted_words_are_those_of_splitmix64():
+    # Published for the seed 1234567: https://rosettacode.org/wiki/Pseudo-random_numbers/Splitmix64
+    published = [
+        6457827717110365317, 3203168211198807973, 9817491932198370423,
+        4593380528125082431, 16408922859458223821,
+    ]  # fmt: skip
+    with np.errstate(over="ignore"):
+        places = np.uint64(1234567) + streams.GOLDEN * np.arange(1, 6, dtype=np.uint64)
+    assert streams.mixed_bits(places).tolist() == published
+
+
+def test_counted_numbers_do_not_depend_on_what_is_drawn_with_them():
+    keys, first = np.array([5, 2**52 - 1, 0], np.uint64), np.array([1, 900, 7], np.uint64)
+    together = streams.counted(keys, first, 40)
+    assert ((together > 0) & (together < 1)).all()
+    for row, key, place in zip(together, keys, first, strict=True):
+        for i in (0, 17, 39):
+            alone = streams.counted(key[None], (place + np.uint64(i))[None], 1)
+            assert alone.item() == row[i]
+
+
+def test_counted_numbers_are_uniform_within_and_between_streams():
+    keys = np.arange(2000, dtype=np.uint64)
+    u = streams.counted(keys, np.ones(2000, np.uint64), 50)
+    for axis in (0, 1):
+        error = 5 / np.sqrt(12 * u.shape[axis])
+        assert np.abs(u.mean(axis=axis) - 0.5).max() < error
+    for one, other in ((u[:-1], u[1:]), (u[:, :-1], u[:, 1:])):
+        assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.016

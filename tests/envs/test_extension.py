@@ -1,0 +1,343 @@
+"""Environments of tasks with `safety` and `observation`: what agents see and what limits them."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+import sme_registry
+from sme_registry import SMESpec, StreamSpec, testing
+from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.envs.team import SMETeamEnv
+from sme_registry.errors import OptionError, SpecError, StateError
+from sme_registry.task.streams import counted
+from sme_registry.wrappers import RecordRegret
+
+SPECS = {
+    "safe": SMESpec(horizon=20, safety={"tightness": 0.2}),
+    "safe and deep": SMESpec(
+        horizon=20, complexity=3, hidden_width=20, r_min=0.3, k=3, safety={"tightness": 0.5}
+    ),
+    "noise": SMESpec(horizon=20, observation={"distractors": 8}),
+    "autonomous": SMESpec(
+        horizon=20,
+        observation={"distractors": 5, "dynamics": "autonomous", "mixing": "orthogonal"},
+    ),
+    "driven": SMESpec(
+        horizon=20,
+        D=0.2,
+        k=3,
+        observation={"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"},
+    ),
+    "mixed": SMESpec(
+        horizon=20, state_dim=3, observation={"mixing": "nonlinear", "mixing_depth": 3}
+    ),
+    "both": SMESpec(
+        horizon=20,
+        action_dim=17,
+        complexity=2,
+        safety={"tightness": 0.3},
+        observation={"distractors": 20, "mixing": "nonlinear", "mixing_depth": 2},
+    ),
+}
+DISTRACTED = [name for name, spec in SPECS.items() if spec.distractors]
+
+
+@pytest.fixture(params=["numba", "numpy"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "numba":
+        pytest.importorskip("numba")
+    monkeypatch.setenv("SME_BACKEND", request.param)
+    return str(request.param)
+
+
+def actions_of(env: Any, rng: np.random.Generator) -> Any:
+    """Actions between the optimum and noise."""
+    best = env.task.optimal_action(env.state)
+    share = rng.uniform(0.0, 0.5, (*best.shape[:-1], 1))
+    return ((1.0 - share) * best + share * rng.random(best.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_the_conformance_kit_passes(name: str, backend: str) -> None:
+    testing.check_sme(SPECS[name])
+
+
+@pytest.mark.parametrize("lanes", [1, 65, 131])
+@pytest.mark.parametrize("name", SPECS)
+def test_a_batch_of_any_size_is_its_singles(name: str, lanes: int, backend: str) -> None:
+    batch = SMEVectorEnv(SPECS[name], lanes)
+    checked = [0, lanes // 2, lanes - 1]
+    singles = [SMEEnv(SPECS[name]) for _ in checked]
+    first, _ = batch.reset(seed=5)
+    for lane, env in zip(checked, singles, strict=True):
+        np.testing.assert_array_equal(first[lane], env.reset(seed=5 + lane)[0])
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        action = actions_of(batch, rng)
+        observation, *_, infos = batch.step(action)
+        for lane, env in zip(checked, singles, strict=True):
+            if env._state != "running":
+                continue
+            seen, *_, info = env.step(action[lane])
+            np.testing.assert_array_equal(observation[lane], seen)
+            np.testing.assert_array_equal(batch.state[lane], env.state)
+            np.testing.assert_array_equal(batch.distractors[lane], env.distractors)
+            for key, value in info.items():
+                np.testing.assert_array_equal(infos[key][lane], value, err_msg=key)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_both_back_ends_give_the_same_numbers(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    for make in (SMEEnv, lambda spec: SMEVectorEnv(spec, 70)):
+        envs = []
+        for chosen in ("numba", "numpy"):
+            monkeypatch.setenv("SME_BACKEND", chosen)
+            envs.append(make(SPECS[name].derive(D=0.0)))
+        rng, (fast, plain) = np.random.default_rng(0), envs
+        for seed in range(2):
+            first, expected = (env.reset(seed=seed)[0] for env in envs)
+            np.testing.assert_allclose(first, expected, rtol=0, atol=2e-7)
+            for _ in range(20):
+                action = actions_of(plain, rng)
+                got, wanted = fast.step(action), plain.step(action)
+                np.testing.assert_array_equal(fast.state, plain.state)
+                np.testing.assert_array_equal(fast.distractors, plain.distractors)
+                np.testing.assert_allclose(got[0], wanted[0], rtol=0, atol=2e-7)
+                for key in wanted[4]:
+                    np.testing.assert_allclose(got[4][key], wanted[4][key], atol=3e-12)
+
+
+def test_observation_leaves_states_rewards_and_the_optimum_as_they_are() -> None:
+    extended = SMEEnv(SPECS["both"].derive(safety=None))
+    plain = SMEEnv(SPECS["both"].derive(safety=None, observation=None))
+    rng = np.random.default_rng(0)
+    for seed in (3, None):  # the second episode continues the generators
+        extended.reset(seed=seed)
+        plain.reset(seed=seed)
+        for _ in range(20):
+            np.testing.assert_array_equal(extended.state, plain.state)
+            action = actions_of(plain, rng)
+            got, expected = extended.step(action), plain.step(action)
+            assert got[1:4] == expected[1:4]
+            np.testing.assert_equal(got[4], expected[4])
+
+
+def test_noise_and_first_distractors_follow_the_streams_definition(backend: str) -> None:
+    env, m = SMEEnv(SPECS["noise"]), 8
+    env.reset(seed=7)
+    word = np.random.SeedSequence(7, spawn_key=(1,)).generate_state(1, np.uint64)
+    numbers = counted(word >> np.uint64(12), np.array([1], np.uint64), 5 * m).reshape(5, m)
+    for t, expected in enumerate(numbers):
+        np.testing.assert_array_equal(env.distractors, expected)
+        if t == 2:  # an episode begins where the last one stopped
+            env.reset()
+        else:
+            env.step(np.full(4, 0.5, np.float32))
+
+
+@pytest.mark.parametrize("name", DISTRACTED)
+def test_distractors_stay_uniform_and_independent_of_the_state(name: str) -> None:
+    env, rng = SMEVectorEnv(SPECS[name].derive(horizon=10, D=0.0), 4000), np.random.default_rng(0)
+    env.reset(seed=0)
+    for _ in range(9):
+        env.step(rng.random(env.action_space.shape, np.float32))
+    d, s = env.distractors, env.state
+    assert np.abs(d.mean(axis=0) - 0.5).max() < 0.025  # five standard errors
+    assert np.abs(d.var(axis=0) - 1 / 12).max() < 0.006
+    both = np.corrcoef(np.concatenate([d, s], axis=1).T)[: d.shape[1], d.shape[1] :]
+    assert np.abs(both).max() < 0.08
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_the_safe_action_costs_nothing_and_has_no_safe_regret(action_range: Any) -> None:
+    env, A = SMEEnv(SPECS["safe"], action_range=action_range), 4
+    env.reset(seed=0)
+    violated = 0
+    for _ in range(20):
+        probe = copy.deepcopy(env).step(np.zeros(A, np.float32))[4]
+        best = copy.deepcopy(env).step(probe["optimal_action"])[4]
+        safe = copy.deepcopy(env).step(probe["safe_action"])[4]
+        assert safe["cost"] <= 1e-15
+        assert safe["safe_regret"] == pytest.approx(0.0, abs=1e-12)
+        assert (probe["safe_action"] <= probe["limit"]).all()
+        assert best["safe_regret"] == pytest.approx(safe["step_reward"] - 1.0, abs=1e-12)
+        over = np.maximum(0.0, probe["optimal_action"] - probe["limit"]).mean()
+        scale = 2.0 * 0.2 * (2.0 if action_range == "symmetric" else 1.0)
+        assert best["cost"] == pytest.approx(over / scale, abs=1e-12)
+        violated += best["cost"] > 0
+        env.step(probe["safe_action"])
+    assert violated > 5
+
+
+@pytest.mark.parametrize("name", DISTRACTED)
+def test_a_reset_begins_at_the_state_and_the_distractors_that_are_given(name: str) -> None:
+    spec = SPECS[name]
+    s, d = np.full(spec.state_dim, 0.25), np.full(spec.distractors, 0.75)
+    env, untouched = SMEEnv(spec), SMEEnv(spec)
+    seen, _ = env.reset(seed=0, options={"state": s, "distractors": d})
+    np.testing.assert_array_equal(env.state, s)
+    np.testing.assert_array_equal(env.distractors, d)
+    width = spec.state_dim + spec.distractors
+    np.testing.assert_allclose(seen[:width], env.task.seen(s, d), rtol=0, atol=1e-7)
+    first, _ = env.reset()  # what was given took nothing from the generators
+    np.testing.assert_array_equal(first, untouched.reset(seed=0)[0])
+
+    batch, mask = SMEVectorEnv(spec, 3), np.array([False, True, True])
+    batch.reset(seed=0)
+    before = batch.distractors
+    each = np.stack([d, d / 2, d / 3])
+    seen, _ = batch.reset(options={"distractors": each, "reset_mask": mask})
+    np.testing.assert_array_equal(batch.distractors, np.where(mask[:, None], each, before))
+    np.testing.assert_array_equal(batch.get_attr("distractors"), batch.distractors)
+    batch.reset(options={"distractors": d, "state": s})
+    np.testing.assert_array_equal(batch.distractors, [d] * 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"distractors": [0.5] * 7}, StateError, r"distractors of shape \(7,\).*\(8,\)"),
+        ({"distractors": [[0.5] * 8]}, StateError, "distractors of shape"),
+        ({"distractors": [1.5] * 8}, StateError, r"distractors: entry .*1\.5.* lies outside"),
+        ({"distractors": [np.nan] * 8}, StateError, "lies outside"),
+        ({"distractors": "many"}, StateError, "must be an array of shape"),
+        ({"distractors": None}, StateError, r"distractors of shape \(\)"),
+        ({"distractor": [0.5] * 8}, OptionError, "Did you mean 'distractors'"),
+    ],
+)
+@pytest.mark.parametrize("make", [SMEEnv, lambda spec: SMEVectorEnv(spec, 3)])
+def test_distractors_that_cannot_be_used_are_refused_and_nothing_changes(
+    make: Any, options: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    env = make(SPECS["noise"])
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    with pytest.raises(error, match=words):
+        env.reset(seed=9, options=options)
+    np.testing.assert_array_equal(env.distractors, twin.distractors)
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
+
+
+@pytest.mark.parametrize("name", ["safe", "mixed"])
+def test_a_task_without_distractors_has_no_option_for_them(name: str) -> None:
+    with pytest.raises(OptionError, match=r"'distractors'.*unknown option"):
+        SMEEnv(SPECS[name]).reset(options={"distractors": []})
+    assert SMEEnv(SPECS[name]).distractors.shape == (0,)
+    assert SMEVectorEnv(SPECS[name], 2).distractors.shape == (2, 0)
+
+
+def test_an_environment_without_a_seed_can_be_repeated() -> None:
+    env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
+    first, _ = env.reset()
+    np.testing.assert_array_equal(twin.reset(seed=env.np_random_seed)[0], first)
+    assert (SMEEnv(SPECS["noise"]).reset()[0] != first).any()
+    assert (SMEVectorEnv(SPECS["noise"], 2).reset()[0] != first).any()
+
+
+def test_a_generator_of_the_users_serves() -> None:
+    env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
+    for each in (env, twin):
+        each.np_random = np.random.default_rng(3)
+        each.reset()
+    np.testing.assert_array_equal(env.state, twin.state)
+    assert (env.distractors != twin.distractors).all()
+
+
+@pytest.mark.parametrize("name", SPECS)
+@pytest.mark.parametrize("here", ["numba", "numpy"])
+def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
+    name: str, here: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("numba")
+    for make in (SMEEnv, lambda spec: SMEVectorEnv(spec, 3)):
+        monkeypatch.setenv("SME_BACKEND", here)
+        env: Any = make(SPECS[name].derive(D=0.0))
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.25, np.float32)
+        env.step(action)
+        monkeypatch.setenv("SME_BACKEND", {"numba": "numpy", "numpy": "numba"}[here])
+        moved = pickle.loads(pickle.dumps(env))
+        for _ in range(10):
+            got, expected = moved.step(action), env.step(action)
+            np.testing.assert_array_equal(moved.state, env.state)
+            np.testing.assert_array_equal(moved.distractors, env.distractors)
+            for key in expected[4]:
+                np.testing.assert_allclose(got[4][key], expected[4][key], atol=3e-12)
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_sb3s_batch_is_its_own_dummy_of_singles(name: str, backend: str) -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from sme_registry.sb3 import SMEVecEnv
+
+    spec = SPECS[name]
+    envs = [
+        SMEVecEnv(spec, 3),
+        DummyVecEnv([lambda: SMEEnv(spec, action_range="symmetric")] * 3),
+    ]
+    for env in envs:
+        env.seed(4)
+    first, expected = (env.reset() for env in envs)
+    np.testing.assert_array_equal(first, expected)
+    rng = np.random.default_rng(0)
+    for _ in range(45):
+        action = rng.uniform(-1, 1, (3, spec.action_dim)).astype(np.float32)
+        got, wanted = (env.step(action) for env in envs)
+        for mine, its in zip(got[:3], wanted[:3], strict=True):
+            np.testing.assert_array_equal(mine, its)
+        np.testing.assert_equal(got[3], wanted[3])
+        distractors = [env.get_attr("distractors") for env in envs]
+        np.testing.assert_array_equal(*distractors)
+    if spec.distractors:
+        d = np.full(spec.distractors, 0.5)
+        envs[0].set_options({"distractors": d})
+        envs[0].reset()
+        np.testing.assert_array_equal(envs[0].get_attr("distractors"), [d] * 3)
+
+
+def test_gymnasiums_own_vector_equals_ours() -> None:
+    spec = SPECS["both"]
+    ours = gymnasium.make_vec(sme_registry.env_spec(spec), num_envs=2)
+    its = SyncVectorEnv([lambda: sme_registry.make(spec)] * 2)
+    np.testing.assert_array_equal(ours.reset(seed=0)[0], its.reset(seed=0)[0])
+    for _ in range(25):
+        action = np.full((2, 17), 0.4, np.float32)
+        got, expected = ours.step(action), its.step(action)
+        np.testing.assert_array_equal(got[0], expected[0])
+        np.testing.assert_equal(got[4], expected[4])
+
+
+def test_wrappers_and_frames_work_with_what_the_agent_sees(tmp_path: Any) -> None:
+    pytest.importorskip("pygame")
+    spec = SPECS["both"]
+    env = RecordRegret(SMEEnv(spec, render_mode="rgb_array"), tmp_path / "episodes.csv")
+    env.reset(seed=0)
+    for _ in range(20):
+        *_, info = env.step(np.full(17, 0.4, np.float32))
+    assert env.episodes[0].length == 20
+    assert info["episode"]["l"] == 20
+    assert env.render().shape[-1] == 3  # type: ignore[union-attr]
+    env.close()
+    frames = SMEVectorEnv(spec, 2, render_mode="rgb_array")
+    frames.reset(seed=0)
+    frames.step(np.full((2, 17), 0.4, np.float32))
+    assert len(frames.render() or ()) == 2
+
+
+@pytest.mark.parametrize("name", ["safe", "noise"])
+def test_streams_and_environments_of_teams_refuse_them(name: str) -> None:
+    field = "safety" if name == "safe" else "observation"
+    with pytest.raises(SpecError, match=rf"phases.0.spec: has {field}.*Remove its {field}"):
+        StreamSpec.from_dict({"phases": [{"spec": SPECS[name].to_dict(), "steps": 10}]})
+    with pytest.raises(SpecError, match=rf"{field}: environments of teams do not run it"):
+        SMETeamEnv(SPECS[name])
