@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sme_registry.spec import StudyPlan, SuiteClass
+from sme_registry.spec import ObservationSpec, StudyPlan, SuiteClass
 
 ALL = "all classes"
 SEVERAL = "several axes"
@@ -21,6 +21,8 @@ AXES = {
     "horizon": ("T", "horizon T"),
     "hidden_width": ("H", "hidden width H"),
     "rotation": ("θ", "rotation θ"),
+    "safety.tightness": ("τ", "tightness τ"),
+    "observation": ("observation", "observation"),
     "policy_init": ("policy_init", "policy_init"),
 }
 
@@ -32,10 +34,11 @@ class ClassInfo:
     Attributes:
       name: in the plan.
       axis: the field in which it differs from the first class, dotted within a team
-        (`team.reward`); "" for the first; `SEVERAL`. `policy_init` counts only if nothing else
-        differs: deep tasks need another one.
+        (`team.reward`) or an observation; "" for the first; `SEVERAL`. `policy_init` counts only
+        if nothing else differs: deep tasks need another one.
       label: `k = 25`; for several axes each of them.
-      setting: the value of every field, those within a team by their dotted names.
+      setting: the value of every field, those within other fields by their dotted names. The
+        tightness is 0 without safety, where no limit is ever broken.
     """
 
     name: str
@@ -120,21 +123,36 @@ def setting_label(field: str, value: Any, *, with_symbol: bool = True) -> str:
 
 
 def _class_info(member: SuiteClass, first: SuiteClass) -> ClassInfo:
-    setting, base = (_flat(each.setting.every_field()) for each in (member, first))
-    differing = [name for name in AXES if setting[name] != base[name]]
-    team = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == "team"]
-    team = [name for name in team if setting.get(name) != base.get(name)]
-    if len(team) == 1 and member.setting.team is not None and first.setting.team is not None:
-        differing += team
-    elif team:
-        differing.append("team")
+    setting, base = _setting(member), _setting(first)
+    plain = [name for name in AXES if name != "observation"]
+    differing = [name for name in plain if setting[name] != base[name]]
+    for field in ("observation", "team"):
+        within = [n for n in dict.fromkeys((*base, *setting)) if n.partition(".")[0] == field]
+        within = [name for name in within if setting.get(name) != base.get(name)]
+        both = getattr(member.setting, field) and getattr(first.setting, field)
+        differing += within if len(within) == 1 and both else [field] * bool(within)
     if len(differing) > 1 and "policy_init" in differing:
         differing.remove("policy_init")
     agents = 0 if member.setting.team is None else len(member.setting.team.agents)
     setting["team"] = f"{agents} agents" if agents else "none"
+    setting["observation"] = _observation(member.setting.observation)
     axis = differing[0] if len(differing) == 1 else SEVERAL if differing else ""
     label = ", ".join(setting_label(name, setting[name]) for name in differing)
     return ClassInfo(member.name, axis, label, setting)
+
+
+def _setting(member: SuiteClass) -> dict[str, Any]:
+    return {"safety.tightness": 0.0} | _flat(member.setting.every_field())
+
+
+def _observation(observation: ObservationSpec | None) -> str:
+    """An observation in words: `32 driven, nonlinear 1`."""
+    if observation is None:
+        return "state"
+    distractors = f"{observation.distractors} {observation.dynamics}"
+    mixing = " ".join(str(part) for part in (observation.mixing, observation.mixing_depth) if part)
+    parts = [distractors] * bool(observation.distractors) + [mixing] * (mixing != "none")
+    return ", ".join(parts)
 
 
 def _flat(fields: Any, prefix: str = "") -> dict[str, Any]:

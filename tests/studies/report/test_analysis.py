@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 
 from sme_registry import statistics
+from sme_registry.spec import StudyPlan
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import tables
 from sme_registry.studies.report.analysis import Analysis, analyse
-from sme_registry.studies.report.classes import ALL, SEVERAL
+from sme_registry.studies.report.classes import ALL, SEVERAL, class_infos
 from sme_registry.studies.report.frames import window
 from sme_registry.studies.report.tables import METRICS
 
@@ -75,6 +76,34 @@ def test_a_class_has_the_axis_in_which_it_differs_from_the_first(study):
         ("r_min", "r_min = 0.5"),
         ("complexity", "L = 10"),  # policy_init differs, too: it goes with the depth
         (SEVERAL, "S = 2, A = 2, L = 10"),
+    ]
+
+
+def infos_of(*settings: dict[str, Any]) -> list[tuple[str, str]]:
+    classes = [{"name": f"c{i}", "setting": each, "seeds": [0]} for i, each in enumerate(settings)]
+    plan = StudyPlan.from_dict({"classes": classes, "algorithms": [{"name": "A", "uses": "PPO"}]})
+    return [(info.axis, info.label) for info in class_infos(plan).values()]
+
+
+def test_limits_and_observations_are_axes() -> None:
+    safe = {"safety": {"tightness": 0.2}}
+    assert infos_of({}, safe, safe | {"complexity": 10}) == [
+        ("", ""),
+        ("safety.tightness", "τ = 0.2"),
+        (SEVERAL, "L = 10, τ = 0.2"),
+    ]
+    driven = {"distractors": 32, "dynamics": "driven"}
+    mixed = {"mixing": "nonlinear", "mixing_depth": 3}
+    seen = [{"observation": each} for each in (driven, mixed, driven | mixed)]
+    assert infos_of({}, *seen)[1:] == [
+        ("observation", "observation = 32 driven"),
+        ("observation", "observation = nonlinear 3"),
+        ("observation", "observation = 32 driven, nonlinear 3"),
+    ]
+    assert infos_of({"observation": driven | {"dynamics": "noise"}}, *seen)[1:] == [
+        ("observation.dynamics", "observation.dynamics = driven"),
+        ("observation", "observation = nonlinear 3"),
+        ("observation", "observation = 32 driven, nonlinear 3"),
     ]
 
 
