@@ -26,6 +26,8 @@ from sme_registry.spec import (
 )
 from sme_registry.spec.resolve import ResolvedSpec, resolve
 from sme_registry.task import materialize
+from sme_registry.task.certify_observation import observation_checks
+from sme_registry.task.certify_safety import safety_checks
 
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
 PROTOCOLS = catalogue.entries(ProtocolFile)
@@ -102,11 +104,14 @@ def test_the_catalogue_has_the_tasks_that_the_design_names():
         "Default": [""], "StateDim": [2, 4, 16, 32, 64], "ActionDim": [1, 2, 8, 16],
         "Interval": [5, 10, 25, 100], "MinReward": [25, 50, 75], "Survival": [10, 25, 50],
         "Complexity": [2, 3, 5, 10, 20, 50], "Plane": [1, 10, 50], "Team": [2, 4, 8],
-        "TeamShared": [2, 4, 8],
+        "TeamShared": [2, 4, 8], "Safety": ["05", 10, 20, 40],
+        "Distract": ["8Noise", "32Noise", "32Autonomous", "32Driven"],
+        "Mixed": ["Linear", "Nonlinear1", "Nonlinear3"], "HardSafeMixed": [""],
     }  # fmt: skip
     expected = {f"{family}{value}" for family, values in families.items() for value in values}
     assert expected <= {file.name for file in ENVS}
-    assert {"smoke", "paper-ablations", "core", "teams"} <= {file.name for file in SUITES}
+    suites = {"smoke", "paper-ablations", "core", "teams", "safety", "representation"}
+    assert suites <= {file.name for file in SUITES}
     assert "paper" in {file.name for file in PROTOCOLS}
 
 
@@ -212,6 +217,32 @@ def test_suites_have_the_sizes_that_the_design_states():
     assert by_name["core"] == [10] * 6
 
 
+def test_the_suites_of_safety_and_observation_change_one_axis_of_the_default():
+    by_name = {file.name: file.suite for file in SUITES}
+    for name, axis in (("safety", "safety"), ("representation", "observation")):
+        plain, *others = by_name[name].classes
+        assert getattr(plain.setting, axis) is None
+        for member in others:
+            assert getattr(member.setting, axis) is not None
+            changed = member.setting.to_dict()
+            del changed[axis]
+            depth = {"complexity": member.setting.complexity} if member.name == "deep" else {}
+            assert changed == plain.setting.to_dict() | depth
+        assert {len(member.seeds) for member in by_name[name].classes} == {10}
+
+
+NEW_AXES = [file for file in ENVS if file.spec.safety or file.spec.observation]
+
+
+@pytest.mark.parametrize("file", NEW_AXES, ids=ids(NEW_AXES))
+def test_tasks_with_safety_or_observation_are_the_default_otherwise_and_certified(file):
+    init = "unit_variance" if file.spec.safety else "semi_orthogonal"
+    assert file.spec.derive(safety=None, observation=None) == SMESpec(policy_init=init)
+    task = materialize(file.spec)
+    checks = (*safety_checks(task, 0, 4_000), *observation_checks(task, 0, 4_000))
+    assert {check.outcome for check in checks} <= {"passed", "reported"}
+
+
 def test_core_uses_unit_variance_where_layers_widen():
     core = next(file.suite for file in SUITES if file.name == "core")
     for member in core.classes:
@@ -222,7 +253,8 @@ def test_core_uses_unit_variance_where_layers_widen():
 
 
 def test_a_released_name_never_changes_its_digest():
-    for kind in KINDS:
+    assert set(RELEASED) == {kind.content for kind in (*KINDS, StreamFile)}
+    for kind in (*KINDS, StreamFile):
         for file in catalogue.entries(kind):
             assert RELEASED[file.content][file.versioned_name] == file.digest
         assert sorted(RELEASED[kind.content]) == sorted(catalogue.names(kind))
