@@ -25,6 +25,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
     [
         "README.md", "docs/specs.md", "docs/streams.md", "docs/teams.md", "docs/training.md",
         "docs/datasets.md", "docs/figures.md", "docs/frameworks.md", "docs/retention.md",
+        "docs/safety_and_observation.md",
     ],
 )  # fmt: skip
 def test_the_python_of_a_page_runs_from_top_to_bottom(

@@ -32,6 +32,8 @@ from sme_registry.task.certify_safety import safety_checks
 ENVS, SUITES = catalogue.entries(EnvFile), catalogue.entries(SuiteFile)
 PROTOCOLS = catalogue.entries(ProtocolFile)
 RELEASED = json.loads((Path(__file__).parents[1] / "golden" / "digests.json").read_text())
+NEW_AXES = [file for file in ENVS if file.spec.safety or file.spec.observation]
+WITHOUT = [file for file in ENVS if file not in NEW_AXES]
 KINDS = (EnvFile, SuiteFile, ProtocolFile, StudyFile)
 EVERY_FILE = [(kind, path) for kind in KINDS for path in catalogue.paths(kind)]
 
@@ -177,12 +179,17 @@ def test_the_schema_of_a_spec_states_what_is_refused_elsewhere():
     assert fields["seed"]["anyOf"][1]["pattern"] == "^0x[0-9a-fA-F]{1,64}$"
 
 
-@pytest.mark.parametrize("file", ENVS, ids=ids(ENVS))
+def published(file):
+    """The task of a file, found by its name and with its published numbers."""
+    assert resolve(file.versioned_name) == ResolvedSpec(file.spec, file.fingerprint)
+    task = materialize(file.spec, file.fingerprint)
+    assert task.W.shape == (file.spec.action_dim, file.spec.state_dim)
+    return task
+
+
+@pytest.mark.parametrize("file", WITHOUT, ids=ids(WITHOUT))
 def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
-    spec, fingerprint = file.spec, file.fingerprint
-    assert resolve(file.versioned_name) == ResolvedSpec(spec, fingerprint)
-    task = materialize(spec, fingerprint)
-    assert task.W.shape == (spec.action_dim, spec.state_dim)
+    spec, task = file.spec, published(file)
     env = sme_registry.make_parallel(file.versioned_name)
     assert env.sme_spec == spec
     _, infos = env.reset(seed=1)
@@ -197,6 +204,24 @@ def test_a_task_is_drawn_with_its_published_numbers_and_stepped(file):
         assert not terminated[name]
         seen = env.state()[list(channels)].astype(np.float32)
         np.testing.assert_array_equal(observations[name][:-2], seen)
+    env.close()
+
+
+@pytest.mark.parametrize("file", NEW_AXES, ids=ids(NEW_AXES))
+def test_a_task_with_limits_or_an_observation_is_stepped_with_its_published_numbers(file):
+    task, env = published(file), sme_registry.make(file.versioned_name)
+    assert env.unwrapped.sme_spec == file.spec
+    assert env.observation_space.shape == (file.spec.observation_dim,)
+    env.reset(seed=1)
+    s = env.unwrapped.state
+    observation, _, _, _, info = env.step(task.safe_action(s).astype(np.float32))
+    np.testing.assert_array_equal(env.unwrapped.state, task.transition(s, task.safe_action(s)))
+    seen = task.seen(env.unwrapped.state, env.unwrapped.distractors)
+    np.testing.assert_allclose(observation[:-2], seen, rtol=0, atol=1e-6)
+    if file.spec.safety is not None:
+        np.testing.assert_allclose(info["limit"], task.limit(s), rtol=0, atol=1e-12)
+        assert info["cost"] < 1e-6  # the safe action, rounded to float32
+        assert abs(info["safe_regret"]) < 1e-6
     env.close()
 
 
@@ -229,9 +254,6 @@ def test_the_suites_of_safety_and_observation_change_one_axis_of_the_default():
             depth = {"complexity": member.setting.complexity} if member.name == "deep" else {}
             assert changed == plain.setting.to_dict() | depth
         assert {len(member.seeds) for member in by_name[name].classes} == {10}
-
-
-NEW_AXES = [file for file in ENVS if file.spec.safety or file.spec.observation]
 
 
 @pytest.mark.parametrize("file", NEW_AXES, ids=ids(NEW_AXES))
