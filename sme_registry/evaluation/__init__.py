@@ -11,6 +11,7 @@ from sme_registry.evaluation.continual import (
     reference_regret,
 )
 from sme_registry.evaluation.evaluate import evaluate, evaluate_many, resolve_protocol
+from sme_registry.evaluation.observation import Invariance, LayerProbe, ObservationReport
 from sme_registry.evaluation.policies import (
     OfflinePolicy,
     Perceptron,
@@ -21,21 +22,23 @@ from sme_registry.evaluation.policies import (
     load_sb3,
 )
 from sme_registry.evaluation.references import reference_policy
-from sme_registry.evaluation.report import (
-    AgentReport,
-    ChannelReport,
-    EvaluationReport,
-    RegionReport,
-)
+from sme_registry.evaluation.region_report import ChannelReport, RegionReport
+from sme_registry.evaluation.report import AgentReport, EvaluationReport
+from sme_registry.evaluation.safety import SafetyReport, SafetyScore
 
 __all__ = [
     "AgentReport",
     "ChannelReport",
     "EvaluationReport",
+    "Invariance",
+    "LayerProbe",
+    "ObservationReport",
     "OfflinePolicy",
     "Perceptron",
     "Policy",
     "RegionReport",
+    "SafetyReport",
+    "SafetyScore",
     "StreamReport",
     "TeamPolicy",
     "across_seeds",

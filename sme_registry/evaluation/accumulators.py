@@ -10,9 +10,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.evaluation.regions import region_name
-from sme_registry.evaluation.report import ChannelReport, RegionReport
+from sme_registry.evaluation.region_report import ChannelReport, RegionReport
 from sme_registry.task.draw import Array
+
+WHOLE = ""
+"""The scope of all action channels, among the agents' names."""
 
 
 class Accumulator:
@@ -43,9 +45,13 @@ class Accumulator:
         self._sums += sums
         self._clipped += clipped
 
+    def relative_to(self, other: Accumulator) -> float:
+        """The mean divided by that of another policy."""
+        return self._mean / other._mean
+
     def report(
         self,
-        region: int,
+        name: str,
         edges: tuple[float, float],
         constant_half: Accumulator,
         wd: Accumulator,
@@ -54,14 +60,14 @@ class Accumulator:
         similarity, wd_similarity = 1.0 - self._mean, 1.0 - wd._mean
         channels = zip(self._sums, constant_half._sums, strict=True)
         return RegionReport(
-            name=region_name(region),
+            name=name,
             epsilon_low=edges[0],
             epsilon_high=edges[1],
             states=self._states,
             similarity=similarity,
             similarity_sd=math.sqrt(self._squares / (self._states - 1)),
             mae=self._mean,
-            normalised_regret=self._mean / constant_half._mean,
+            normalised_regret=self.relative_to(constant_half),
             similarity_decay=(wd_similarity - similarity) / wd_similarity,
             similarity_loss=100.0 * (wd_similarity - similarity),
             clipped_share=self._clipped / (self._states * len(self._sums)),

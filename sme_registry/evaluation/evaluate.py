@@ -10,24 +10,26 @@ references, most of the cost of an evaluation: `evaluate_many` computes them onc
 
 from __future__ import annotations
 
-import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from sme_registry.compiled import Engine, engine
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
-from sme_registry.evaluation.accumulators import Errors
-from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
-from sme_registry.evaluation.regions import Observations, Uniform, observations
-from sme_registry.evaluation.report import (
-    AgentReport,
-    EvaluationReport,
-    RegionReport,
+from sme_registry.evaluation.accumulators import WHOLE
+from sme_registry.evaluation.measure import Key, Measured, Progress, Subject, measure
+from sme_registry.evaluation.observation import (
+    Invariance,
+    ObservationReport,
+    probe_layers,
 )
+from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
+from sme_registry.evaluation.region_report import RegionReport
+from sme_registry.evaluation.regions import region_name
+from sme_registry.evaluation.report import AgentReport, EvaluationReport
+from sme_registry.evaluation.safety import SafetyReport, SafetyScore
 from sme_registry.io import versions
 from sme_registry.spec import (
     EvaluationProtocol,
@@ -38,9 +40,6 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.task import Task, load_spec, materialize
-from sme_registry.task.draw import Array
-
-Progress = Callable[[int, int], None]
 
 
 def evaluate(
@@ -115,7 +114,7 @@ def evaluate_many(
       As `evaluate`, except for invalid actions.
     """
     protocol = resolve_protocol(protocol)
-    subjects: list[_Subject] = []
+    subjects: list[Subject] = []
     groups: dict[str, list[int]] = {}
     for index, (policy, task) in enumerate(policies):
         spec = load_spec(task)
@@ -123,9 +122,9 @@ def evaluate_many(
         groups.setdefault(same_draw(spec), []).append(index)
 
     reports: dict[int, EvaluationReport | PolicyError] = {}
-    states = protocol.states_per_region * len(protocol.edges)
+    total = protocol.states_per_region * len(protocol.edges)
     for number, group in enumerate(groups.values()):
-        done = _offset(progress, number * states, len(groups) * states)
+        done = _offset(progress, number * total, len(groups) * total)
         together = _evaluate_together([subjects[index] for index in group], protocol, done)
         reports |= zip(group, together, strict=True)
     return [reports[index] for index in range(len(subjects))]
@@ -150,24 +149,7 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     return catalogue.find(ProtocolFile, path).protocol
 
 
-_Subject = tuple[Policy | TeamPolicy, SMESpec]
 _POLICY_LIBRARIES = ("torch", "stable_baselines3", "onnxruntime")
-_WHOLE = ""  # the key of all action channels among the agents' names
-
-
-class _Batch(NamedTuple):
-    """States and their optimal actions: `[B, S]`, `[B, A]`.
-
-    `observations` `[B, S + 2]` float32 are those of each horizon.
-    """
-
-    observations: dict[int, Observations]
-    s: Array
-    optimal: Array
-
-
-# The key of a policy is its index, that of a reference its name.
-_ErrorsByKey = dict[int | str, Errors]
 
 
 def same_draw(spec: SMESpec) -> str:
@@ -187,27 +169,28 @@ def _offset(progress: Progress | None, before: int, total: int) -> Progress:
 
 
 def _evaluate_together(
-    subjects: Sequence[_Subject], protocol: EvaluationProtocol, progress: Progress
+    subjects: Sequence[Subject], protocol: EvaluationProtocol, progress: Progress
 ) -> list[EvaluationReport | PolicyError]:
     """The reports of policies on tasks of the same draw, or why there is none."""
     specs = [spec for _, spec in subjects]
     task = materialize(specs[0])
     oracle = engine(task)
-    channels = {_WHOLE: slice(0, task.spec.action_dim)}
+    channels = {WHOLE: slice(0, task.spec.action_dim)}
     if task.spec.team is not None:
         channels |= zip(task.names, task.owned, strict=True)
 
     failed: dict[int, PolicyError] = {}
-    measured = list(_measure(subjects, task, oracle, protocol, channels, progress, failed))
+    measured = list(measure(subjects, task, oracle, protocol, channels, progress, failed))
 
-    def regions(key: int | str, scope: str) -> tuple[RegionReport, ...]:
+    def regions(key: Key, scope: str) -> tuple[RegionReport, ...]:
         return _region_reports(measured, protocol, key, scope)
 
     reports: list[EvaluationReport | PolicyError] = []
     others: dict[str, dict[str, tuple[RegionReport, ...]]] = {}
     if len(failed) < len(subjects):
         others = {
-            scope: {key: regions(key, scope) for key in references.NAMES} for scope in channels
+            scope: {key: regions(key, scope) for key in references.names(task.spec)}
+            for scope in channels
         }
     for index, (policy, spec) in enumerate(subjects):
         if index in failed:
@@ -217,7 +200,12 @@ def _evaluate_together(
             scope: AgentReport(regions=regions(index, scope), references=others[scope])
             for scope in channels
         }
-        whole = by_agent.pop(_WHOLE)
+        whole = by_agent.pop(WHOLE)
+        try:
+            observation = _observation_report(measured, protocol, index, policy, task, spec)
+        except PolicyError as error:
+            reports.append(error)
+            continue
         reports.append(
             EvaluationReport(
                 policy=policy.name,
@@ -230,95 +218,69 @@ def _evaluate_together(
                 regions=whole.regions,
                 references=whole.references,
                 agents=by_agent,
+                safety=_safety_report(measured, index, spec),
+                observation=observation,
                 versions=versions_behind(oracle),
             )
         )
     return reports
 
 
-def _measure(
-    subjects: Sequence[_Subject],
-    task: Task,
-    oracle: Engine,
-    protocol: EvaluationProtocol,
-    channels: dict[str, slice],
-    progress: Progress,
-    failed: dict[int, PolicyError],
-) -> Iterator[_ErrorsByKey]:
-    """The errors of the policies and of each reference, region after region.
-
-    Writes the policies that fail to `failed`, and ends once all have.
-    """
-    horizons = {spec.horizon: spec for _, spec in subjects}
-    fitted: references.References | None = None
-    total, done = protocol.states_per_region * len(protocol.edges), 0
-    for region in range(len(protocol.edges)):
-        batches = _batches(horizons, oracle, protocol, region)
-        if fitted is None:
-            fitted, batches = _fit_references(batches, task)
-        errors: _ErrorsByKey = {
-            key: Errors(channels) for key in (*range(len(subjects)), *references.NAMES)
-        }
-        random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
-        for batch in batches:
-            for index, unclipped in _actions(subjects, batch, failed):
-                a = np.clip(unclipped, 0.0, 1.0)
-                errors[index].add(a, batch.optimal, a != unclipped)
-            if len(failed) == len(subjects):
-                return
-            others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
-            for name, a in others.items():
-                errors[name].add(a, batch.optimal)
-            done += len(batch.s)
-            progress(done, total)
-        yield errors
-
-
-def _actions(
-    subjects: Sequence[_Subject], batch: _Batch, failed: dict[int, PolicyError]
-) -> Iterator[tuple[int, Array]]:
-    """The actions of each policy that has not failed, not clipped; writes those that now fail."""
-    for index, (policy, spec) in enumerate(subjects):
-        if index not in failed:
-            try:
-                # A copy, since a policy may write into its observations.
-                yield index, policy(batch.observations[spec.horizon].copy())
-            except PolicyError as error:
-                failed[index] = error
-
-
 def _region_reports(
-    measured: list[_ErrorsByKey], protocol: EvaluationProtocol, key: int | str, scope: str
+    measured: list[Measured], protocol: EvaluationProtocol, key: Key, scope: str
 ) -> tuple[RegionReport, ...]:
     """The regions of a policy or a reference, over the channels of a scope."""
+    wd = measured[0].errors[key][scope]
     return tuple(
-        errors[key][scope].report(
-            region, edges, errors["constant_half"][scope], measured[0][key][scope]
-        )
-        for region, (edges, errors) in enumerate(zip(protocol.edges, measured, strict=True))
+        errors[key][scope].report(region_name(region), edges, errors["constant_half"][scope], wd)
+        for region, (edges, (errors, *_)) in enumerate(zip(protocol.edges, measured, strict=True))
     )
 
 
-def _batches(
-    horizons: dict[int, SMESpec], oracle: Engine, protocol: EvaluationProtocol, region: int
-) -> Iterator[_Batch]:
-    """The states of a region, with the observations that tasks of each horizon make of them."""
-    of_each = [observations(protocol, region, spec) for spec in horizons.values()]
-    S = next(iter(horizons.values())).state_dim
-    for parts in zip(*of_each, strict=True):
-        s = parts[0][:, :S].astype(np.float64)
-        yield _Batch(dict(zip(horizons, parts, strict=True)), s, oracle.optimal_action(s))
+def _safety_report(measured: list[Measured], index: int, spec: SMESpec) -> SafetyReport | None:
+    """The safety of a policy and of the references, by its task's r_min; None without safety."""
+    if spec.safety is None:
+        return None
+
+    def scores(key: Key) -> tuple[SafetyScore, ...]:
+        return tuple(
+            each.safety[key, spec.r_min].score(region_name(region))
+            for region, each in enumerate(measured)
+        )
+
+    others = {name: scores(name) for name in references.names(spec)}
+    return SafetyReport(regions=scores(index), references=others)
 
 
-def _fit_references(
-    batches: Iterator[_Batch], task: Task
-) -> tuple[references.References, Iterator[_Batch]]:
-    """The references fitted on the first states, and all batches from the first one on."""
-    count = references.fit_states(task.spec)
-    first: list[_Batch] = []
-    while sum(len(batch.s) for batch in first) < count and (batch := next(batches, None)):
-        first.append(batch)
-    s = np.concatenate([batch.s for batch in first])[:count]
-    optimal = np.concatenate([batch.optimal for batch in first])[:count]
-    agents = zip(task.observed, task.owned, strict=True)
-    return references.fit(s, optimal, agents), itertools.chain(first, batches)
+def _observation_report(
+    measured: list[Measured],
+    protocol: EvaluationProtocol,
+    index: int,
+    policy: Policy | TeamPolicy,
+    task: Task,
+    spec: SMESpec,
+) -> ObservationReport | None:
+    """What a policy makes of its observation; None where that is the state.
+
+    Raises:
+      PolicyError: outputs of its hidden layers are not finite.
+    """
+    if spec.observation is None:
+        return None
+    hidden = None if isinstance(policy, TeamPolicy) else policy.hidden
+    halves = [errors["constant_half"][WHOLE] for errors, *_ in measured]
+    wd = measured[0].errors[index][WHOLE]
+    invariance, shells = [], []
+    for region, (half, each) in enumerate(zip(halves, measured, strict=True)):
+        if each.distraction is not None:
+            change = each.distraction.changes[index][WHOLE].relative_to(half)
+            invariance.append(Invariance(name=region_name(region), invariance=change))
+            shells += [errors[index][WHOLE] for errors in each.distraction.shells]
+    return ObservationReport(
+        invariance=tuple(invariance),
+        distractor_regions=tuple(
+            errors.report(f"d-{region_name(region)}", protocol.edges[region], halves[0], wd)
+            for region, errors in enumerate(shells, start=1)
+        ),
+        probes=() if hidden is None else probe_layers(hidden, replace(task, spec=spec), protocol),
+    )

@@ -7,12 +7,19 @@ best_constant          the constant action with the smallest mean |a − a*|: th
 constant_half          a = ½: normalised regret 1
 uniform_random         a ~ U([0, 1]^A), a new draw in each state
 
+and on a task with limits ℓ of tightness τ (METHOD, section 8), both of cost 0:
+
+safe_optimal           min(π*(s), ℓ(s)), the best action within the limits
+shrunk_optimal         min(π*(s), 1 − 2τ): the optimum cut off at the lowest limit that any state
+                       can have, a margin below ℓ(s) that needs no knowledge of ℓ
+
 The two fitted ones are fitted on the states of WD, at most `FIT_STATES` of them (all of them under
 paper-v1), and used unchanged in every other region. In WD they are evaluated on the states they
 were fitted on, which flatters them unless there are many times more states than state_dim.
 
-An agent's reference uses only what the agent observes: no agent that observes a part of the state
-could execute a linear map of the whole state.
+All act on the state, also where the task's agent sees another observation. An agent's reference
+uses only the channels that the agent observes: no agent that observes a part of the state could
+execute a linear map of the whole state.
 """
 
 from __future__ import annotations
@@ -25,6 +32,7 @@ import numpy as np
 
 from sme_registry.compiled import engine
 from sme_registry.envs.types import Observation
+from sme_registry.errors import SpecError
 from sme_registry.spec import SMESpec
 from sme_registry.task import materialize
 from sme_registry.task.draw import Array
@@ -32,8 +40,14 @@ from sme_registry.task.draw import Array
 Act = Callable[[Observation], Any]
 
 NAMES = ("optimal", "linear_least_squares", "best_constant", "constant_half", "uniform_random")
+SAFE_NAMES = ("safe_optimal", "shrunk_optimal")
 FIT_STATES = 2**16
 _FIT_NUMBERS = 2**24  # of the states and actions kept for the fit, 128 MiB as float64
+
+
+def names(spec: SMESpec) -> tuple[str, ...]:
+    """The references of a task's reports."""
+    return NAMES if spec.safety is None else (*NAMES, *SAFE_NAMES)
 
 
 def fit_states(spec: SMESpec) -> int:
@@ -75,6 +89,16 @@ class References:
         }
 
 
+def safe_actions(spec: SMESpec, optimal: Array, limit: Array) -> dict[str, Array]:
+    """The actions `[B, A]` of `SAFE_NAMES`, from π*(s) and the limits, `[B, A]` each."""
+    assert spec.safety is not None
+    lowest = 1.0 - 2.0 * spec.safety.tightness
+    return {
+        "safe_optimal": np.minimum(optimal, limit),
+        "shrunk_optimal": np.minimum(optimal, lowest),
+    }
+
+
 def fit(
     s: Array, optimal: Array, agents: Iterable[tuple[Sequence[int], slice]] | None = None
 ) -> References:
@@ -104,7 +128,7 @@ SHORT_NAMES = {
     "constant": "constant_half",
     "random": "uniform_random",
 }
-POLICIES = (*NAMES, *SHORT_NAMES)
+POLICIES = (*NAMES, *SAFE_NAMES, *SHORT_NAMES)
 """Names that `reference_policy` accepts: the reports' names, and short ones."""
 
 
@@ -118,16 +142,21 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
       spec: the task.
 
     Returns:
-      A function from observations `[B, S + 2]` to actions `[B, A]` of the unit range; for a team,
-      one for each agent.
+      A function from observations `[B, O]` to actions `[B, A]` of the unit range; for a team, one
+      for each agent. Where the agent sees a mixing, it inverts the mixing first.
+
+    Raises:
+      SpecError: a policy of `SAFE_NAMES`, and the task has no limits.
     """
     joint, S = _joint_policy(SHORT_NAMES.get(name, name), spec), spec.state_dim
+    task = materialize(spec)
 
     def of_agent(observed: Sequence[int], owned: slice) -> Act:
         def act(observations: Observation) -> Array:
             # The agent's channels of the joint action do not depend on what it does not observe.
             s = np.zeros((len(observations), S))
-            s[:, observed] = observations[:, : len(observed)]
+            x = task.unmixed(observations[:, :-2]) if task.mixing else observations
+            s[:, observed] = x[:, : len(observed)]
             return joint(s)[:, owned]
 
         act.__name__ = name
@@ -135,7 +164,6 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
 
     if spec.team is None:
         return of_agent(range(S), slice(spec.action_dim))
-    task = materialize(spec)
     agents = zip(task.names, task.observed, task.owned, strict=True)
     return {agent: of_agent(observed, owned) for agent, observed, owned in agents}
 
@@ -150,6 +178,14 @@ def _joint_policy(name: str, spec: SMESpec) -> Callable[[Array], Array]:
         generator = np.random.default_rng(0)
         return lambda s: generator.random((len(s), spec.action_dim))
     task = materialize(spec)
+    if name in SAFE_NAMES:
+        if spec.safety is None:
+            raise SpecError(
+                f"policy={name!r}: needs a task with safety, and this one has no limits. Give "
+                "'optimal', or add safety to the task."
+            )
+        optimal_action = engine(task).optimal_action
+        return lambda s: safe_actions(spec, optimal_action(s), task.limit(s))[name]
     s = np.random.default_rng(0).random((fit_states(spec), spec.state_dim))
     agents = zip(task.observed, task.owned, strict=True)
     fitted = fit(s, engine(task).optimal_action(s), agents)

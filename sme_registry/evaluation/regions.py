@@ -14,17 +14,22 @@ one inside the outer cube.
 
 Each region has named streams of the protocol's seed and reads a fixed number of words per state
 from each. Its states therefore depend neither on other regions nor on the batch size.
+
+A task with distractors (METHOD, section 9; `m` of them) has two kinds of shells: s in a shell with
+d uniform in the cube, and s in the cube with d in a shell of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.task import Task, materialize
 from sme_registry.task.draw import Array
 from sme_registry.task.streams import bit_generator, to_uniform
 
@@ -42,7 +47,7 @@ def region_name(region: int) -> str:
 def batch_rows(spec: SMESpec) -> int:
     """How many states are in memory at once; fewer if a state is large."""
     others = len(spec.team.agents) - 1 if spec.team is not None else 0
-    width = spec.state_dim + spec.action_dim + spec.hidden_width + others
+    width = spec.state_dim + spec.distractors + spec.action_dim + spec.hidden_width + others
     return max(1, min(BATCH_ROWS, BATCH_NUMBERS // width))
 
 
@@ -51,37 +56,70 @@ def expansion(s: Array) -> Array:
     return np.asarray(2.0 * np.abs(s - 0.5).max(axis=-1) - 1.0)
 
 
-def observations(
+class States(NamedTuple):
+    """A batch of states, and what else an observation of them shows.
+
+    Attributes:
+      s: `[B, S]` float32.
+      d: `[B, m]` distractors.
+      time: `[B]` uniform numbers in (0, 1), from which t/T follows.
+    """
+
+    s: Observations
+    d: Array
+    time: Array
+
+    def seen(self, task: Task, d: Array | None = None) -> npt.NDArray[Any]:
+        """What the task's agent sees of the state, `[B, S + m]`; of `d` in place of its own."""
+        if task.spec.observation is None:
+            return self.s
+        return task.seen(self.s, self.d if d is None else d)
+
+    def observation(self, x: npt.NDArray[Any], horizon: int) -> Observations:
+        """x `[B, n]`, then t/T in {0, …, T − 1}/T, then r_cum/k = 0: `[B, n + 2]` float32."""
+        batch = np.zeros((len(x), x.shape[1] + 2), dtype=np.float32)
+        batch[:, :-2] = x
+        batch[:, -2] = np.floor(self.time * horizon) / horizon
+        return batch
+
+
+def states(
     protocol: EvaluationProtocol, region: int, spec: SMESpec, rows: int | None = None
-) -> Iterator[Observations]:
-    """The observations of a region, batch by batch.
+) -> Iterator[States]:
+    """The states of a region, batch by batch, with distractors uniform in the cube.
 
     Args:
       protocol: the protocol.
       region: 0 for WD, m for OOD m.
-      spec: the task, for state_dim and horizon.
+      spec: the task, for state_dim and the number of distractors.
       rows: states per batch; None takes `batch_rows`. The states do not depend on it.
-
-    Yields:
-      `[B, S + 2]` float32: the state, then t/T in {0, …, T − 1}/T, then r_cum/k = 0.
 
     Raises:
       OptionError: no float32 number lies between the faces of this shell.
     """
-    S, T = spec.state_dim, spec.horizon
     stream = f"evaluation/{region}"
-    coordinates = Uniform(protocol.seed, f"{stream}/coordinates")
+    points = Points(protocol, region, spec.state_dim, stream)
     times = Uniform(protocol.seed, f"{stream}/time")
-    shell = _Shell(protocol, region, S) if region > 0 else None
-
+    distractors = Uniform(protocol.seed, f"{stream}/distractors")
     rows = batch_rows(spec) if rows is None else rows
     for first in range(0, protocol.states_per_region, rows):
         count = min(rows, protocol.states_per_region - first)
-        batch = np.zeros((count, S + 2), dtype=np.float32)
-        u = coordinates(count, S)
-        batch[:, :S] = u if shell is None else shell.states(u)
-        batch[:, S] = np.floor(times(count) * T) / T
-        yield batch
+        yield States(points(count), distractors(count, spec.distractors), times(count))
+
+
+def observations(
+    protocol: EvaluationProtocol, region: int, spec: SMESpec, rows: int | None = None
+) -> Iterator[Observations]:
+    """The observations of the `states` of a region, `[B, S + m + 2]` float32, batch by batch.
+
+    They are (x, t/T, r_cum/k), of which x is the state, or what the agent sees in its place.
+
+    Raises:
+      OptionError: no float32 number lies between the faces of this shell.
+    """
+    task = materialize(spec)
+    for batch in states(protocol, region, spec, rows):
+        yield batch.observation(batch.seen(task), spec.horizon)
 
 
 class Uniform:
@@ -95,14 +133,38 @@ class Uniform:
         return to_uniform(self._bits.random_raw(int(np.prod(shape)))).reshape(shape)
 
 
+class Points:
+    """Points of a region, uniform by volume: of the cube or of a shell in any dimension.
+
+    Args:
+      protocol: the protocol.
+      region: 0 for WD, m for OOD m.
+      dim: coordinates of a point.
+      stream: begins the names of its random streams.
+
+    Raises:
+      OptionError: no float32 number lies between the faces of this shell.
+    """
+
+    def __init__(self, protocol: EvaluationProtocol, region: int, dim: int, stream: str) -> None:
+        self._dim = dim
+        self._coordinates = Uniform(protocol.seed, f"{stream}/coordinates")
+        self._shell = _Shell(protocol, region, dim, stream) if region > 0 else None
+
+    def __call__(self, count: int) -> Observations:
+        """The next points, `[count, dim]` float32."""
+        u = self._coordinates(count, self._dim)
+        return u.astype(np.float32) if self._shell is None else self._shell.points(u)
+
+
 class _Shell:
     """Samples the shell between two cubes, with its own streams for radius and face."""
 
-    def __init__(self, protocol: EvaluationProtocol, region: int, state_dim: int) -> None:
+    def __init__(self, protocol: EvaluationProtocol, region: int, dim: int, stream: str) -> None:
         low, high = protocol.edges[region]
-        self._dim = state_dim
+        self._dim = dim
         self._outer = (1.0 + high) / 2.0
-        self._inner_share = ((1.0 + low) / (1.0 + high)) ** state_dim
+        self._inner_share = ((1.0 + low) / (1.0 + high)) ** dim
         self._nearest = np.nextafter(_last_within(low), np.float32(np.inf))
         self._furthest = _last_within(high)
         if not self._nearest <= self._furthest:
@@ -110,11 +172,11 @@ class _Shell:
                 f"epsilons: no float32 observation lies in the shell ({low!r}, {high!r}]. "
                 "Give levels further apart."
             )
-        self._radius = Uniform(protocol.seed, f"evaluation/{region}/radius")
-        self._face = Uniform(protocol.seed, f"evaluation/{region}/face")
+        self._radius = Uniform(protocol.seed, f"{stream}/radius")
+        self._face = Uniform(protocol.seed, f"{stream}/face")
 
-    def states(self, u: Array) -> Observations:
-        """States `[B, S]` from uniform numbers `[B, S]` for their coordinates."""
+    def points(self, u: Array) -> Observations:
+        """Points `[B, dim]` from uniform numbers `[B, dim]` for their coordinates."""
         count = len(u)
         volume = self._inner_share + self._radius(count) * (1.0 - self._inner_share)
         R = self._outer * volume ** (1.0 / self._dim)

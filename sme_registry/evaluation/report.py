@@ -17,14 +17,17 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
+from sme_registry.evaluation.observation import ObservationReport
+from sme_registry.evaluation.region_report import RegionReports
 from sme_registry.evaluation.report_file import ReportFile
+from sme_registry.evaluation.safety import SafetyReport
 from sme_registry.io import require_packages, write_atomically
 from sme_registry.spec import EvaluationProtocol, SMESpec, catalogue
-from sme_registry.spec.document import Integer, Real, StrictModel
+from sme_registry.spec.document import StrictModel
 
 if TYPE_CHECKING:
     import pandas
@@ -45,53 +48,6 @@ LABELS = {
 }
 
 
-class ChannelReport(StrictModel):
-    """One action channel in one region.
-
-    Attributes:
-      mae: mean |a − a*| of the channel, in [0, 1].
-      normalised_regret: `mae` divided by mean |½ − a*| of the channel.
-    """
-
-    mae: Real
-    normalised_regret: Real
-
-
-class RegionReport(StrictModel):
-    """One policy in one region.
-
-    Attributes:
-      name: `WD`, `OOD 1`, …
-      epsilon_low: ε of the inner face, which belongs to the region inside; 0 for WD.
-      epsilon_high: ε of the outer face, which belongs to this region; 0 for WD.
-      states: number of states.
-      similarity: mean r̃.
-      similarity_sd: standard deviation of r̃ over states (not over seeds).
-      mae: mean |a − a*| = 1 − r̃.
-      normalised_regret: 0 for the optimum, 1 for the constant ½; can be above 1.
-      similarity_decay: (r̃_WD − r̃) / r̃_WD; 0 in WD, negative if the policy is better outside.
-      similarity_loss: 100 (r̃_WD − r̃), in points of similarity.
-      clipped_share: share of action entries that were outside the action range and clipped.
-      channels: each action channel, in order.
-    """
-
-    name: str
-    epsilon_low: Real
-    epsilon_high: Real
-    states: Integer
-    similarity: Real
-    similarity_sd: Real
-    mae: Real
-    normalised_regret: Real
-    similarity_decay: Real
-    similarity_loss: Real
-    clipped_share: Real
-    channels: Annotated[tuple[ChannelReport, ...], Field(strict=False)]
-
-
-_Regions = Annotated[tuple[RegionReport, ...], Field(strict=False, min_length=1)]
-
-
 class AgentReport(StrictModel):
     """One agent of a team: every region over the action channels that it owns.
 
@@ -100,8 +56,8 @@ class AgentReport(StrictModel):
       references: the same regions for each reference policy, over the same channels.
     """
 
-    regions: _Regions
-    references: dict[str, _Regions]
+    regions: RegionReports
+    references: dict[str, RegionReports]
 
 
 class EvaluationReport(ReportFile):
@@ -122,6 +78,8 @@ class EvaluationReport(ReportFile):
       regions: WD, then OOD 1, 2, …
       references: the same regions for each reference policy; `evaluation.references` defines them.
       agents: each agent of a team by its name, over the channels that it owns, in their order.
+      safety: of a task with limits; None, and left out of the JSON, for other tasks.
+      observation: of a task with `observation`; None, and left out of the JSON, for other tasks.
       versions: of Python and the packages that the numbers depend on.
     """
 
@@ -135,15 +93,17 @@ class EvaluationReport(ReportFile):
     task: str = ""
     protocol: EvaluationProtocol
     protocol_digest: str
-    regions: _Regions
-    references: dict[str, _Regions]
+    regions: RegionReports
+    references: dict[str, RegionReports]
     agents: dict[str, AgentReport] = Field(default_factory=dict)
+    safety: SafetyReport | None = None
+    observation: ObservationReport | None = None
     versions: dict[str, str]
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         plain: dict[str, Any] = handler(self)
-        for field in ("agents", "task"):
+        for field in ("agents", "task", "safety", "observation"):
             if not plain[field]:
                 del plain[field]
         return plain
@@ -239,7 +199,9 @@ class EvaluationReport(ReportFile):
             caption=NOT_COMPARABLE,
         )
 
-        def row(label: str, field: str, pattern: str, regions: _Regions = self.regions) -> None:
+        def row(
+            label: str, field: str, pattern: str, regions: RegionReports = self.regions
+        ) -> None:
             values = [format(getattr(region, field), pattern) for region in regions]
             table.add_row(label, *values, style="bold" if regions is self.regions else None)
 

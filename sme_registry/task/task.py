@@ -31,7 +31,7 @@ from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from sme_registry.errors import ActionError, StateError
 from sme_registry.spec import SMESpec
@@ -146,7 +146,7 @@ class Task:
         s = self._states(s)
         if self.spec.safety is None:
             return np.ones((*s.shape[:-1], self.spec.action_dim))
-        return 1.0 - 2.0 * self.spec.safety.tightness * through(self.limiting, s)
+        return self.limit_of(through(self.limiting, s))
 
     def safe_action(self, s: npt.ArrayLike) -> Array:
         """min(π*, ℓ), `[B, A]` or `[A]`: of all actions of cost 0 the one of the highest reward.
@@ -160,6 +160,11 @@ class Task:
         """The mean excess over the limits, over 2τ: `[B]` or a scalar, in [0, 1]."""
         s, a = self._pairs(s, a)
         return self.cost_of(a, self.limit(s))
+
+    def limit_of(self, v: Array) -> Array:
+        """ℓ = 1 − 2τ v of the outputs of v, of any shape."""
+        assert self.spec.safety is not None
+        return 1.0 - 2.0 * self.spec.safety.tightness * v
 
     def cost_of(self, a: Array, limit: Array) -> Array:
         """The cost of actions in [0, 1] under limits, `[..., A]` each."""
@@ -197,6 +202,23 @@ class Task:
             ((W, b),) = self.mixing
             return x @ W.T + b
         return through(self.mixing, x)
+
+    def unmixed(self, x: npt.ArrayLike) -> Array:
+        """The state and distractors behind what the agent sees, M⁻¹(x): `[B, S + m]` or `[S + m]`.
+
+        Exact up to rounding: of float32 observations to about 1e-7 times the condition number of
+        M. A uniform layer's outputs of 0 or 1, which rounding can give, count as 2⁻²⁵ from them.
+
+        Args:
+          x: `[B, S + m]` or `[S + m]` what the agent sees, without t/T and r_cum/k.
+        """
+        y = _checked(x, self.spec.state_dim + self.spec.distractors, "observation", StateError)
+        for W, b in reversed(self.mixing):
+            assert self.spec.observation is not None
+            if self.spec.observation.mixing == "nonlinear":
+                y = ndtri(np.clip(y, 2.0**-25, 1.0 - 2.0**-25))
+            y = np.asarray(np.linalg.solve(W, (y - b).T).T, dtype=np.float64)
+        return y
 
     def reward_of(self, similarity: npt.ArrayLike) -> Array:
         """The step reward r of similarities r̃, of any shape."""

@@ -42,7 +42,7 @@ def numpy_policy(
       action_range: of the policy's actions; None takes the model's own action space.
 
     Returns:
-      A callable from observations `[B, S + 2]` (of a stream that shows the phase, with its
+      A callable from observations `[B, O]` (of a stream that shows the phase, with its
       one-hot) to actions `[B, A]` in units of the unit range, which the environment clips.
 
     Raises:
@@ -56,7 +56,7 @@ def numpy_policy(
     policy = as_policy(model, spec, action_range=action_range, observed_phases=observed)
     if not isinstance(policy, Policy):
         raise SpecError("team: must be null here. Evaluate a team with `evaluate`.")
-    return _fast(policy, model, spec.state_dim + 2 + observed)
+    return _fast(policy, model, spec.observation_dim + observed)
 
 
 def numpy_team_policy(model: Any, spec: SMESpec, *, action_range: str | None = None) -> TeamPolicy:
@@ -90,7 +90,9 @@ def _fast(policy: Policy, model: Any, observation_dim: int) -> Policy:
     same = expected.shape == actions.shape and np.allclose(
         actions, expected, rtol=_TOLERANCE, atol=_TOLERANCE
     )
-    return replace(policy, act=perceptron, episodes=None) if same else policy
+    if not same:
+        return policy
+    return replace(policy, act=perceptron, episodes=None, hidden=perceptron.hidden)
 
 
 def _perceptron(network: Any) -> Perceptron | None:

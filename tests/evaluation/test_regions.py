@@ -56,9 +56,9 @@ def test_a_state_beside_the_opposite_face_is_not_rounded_over_it():
     # The float32 grid is finer below 0 than above 1, so both faces must be brought to the same E.
     protocol = EvaluationProtocol(epsilons=(0.2, 0.2000005))
     low, high = protocol.edges[2]
-    shell = _Shell(protocol, 2, 8)
+    shell = _Shell(protocol, 2, 8, "a stream")
     for u in (2.0**-53, 1.0 - 2.0**-53):
-        E = expansion(shell.states(np.full((20_000, 8), u)).astype(np.float64))
+        E = expansion(shell.points(np.full((20_000, 8), u)).astype(np.float64))
         assert (low < E).all()
         assert (high >= E).all()
 

@@ -20,7 +20,8 @@ from sme_registry.evaluation.continual.retention import (
     prepared,
     refuse_other_count,
 )
-from sme_registry.evaluation.evaluate import Progress, resolve_protocol, versions_behind
+from sme_registry.evaluation.evaluate import resolve_protocol, versions_behind
+from sme_registry.evaluation.measure import Progress
 from sme_registry.evaluation.policies import Policy
 from sme_registry.spec import ProtocolLike, StreamLike, StreamSpec
 from sme_registry.task import load_stream

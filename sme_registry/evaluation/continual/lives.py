@@ -21,7 +21,8 @@ import numpy.typing as npt
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret, dynamic_regret
 from sme_registry.evaluation.continual.retention import final_specs, prepared, refuse_other_count
-from sme_registry.evaluation.evaluate import Progress, same_draw
+from sme_registry.evaluation.evaluate import same_draw
+from sme_registry.evaluation.measure import Progress
 from sme_registry.evaluation.policies import Policy
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.evaluation.rollouts import rollouts, start_states

@@ -20,7 +20,8 @@ import numpy as np
 from sme_registry.compiled import Engine, engine
 from sme_registry.envs.types import Observation
 from sme_registry.errors import OptionError, PolicyError, UnknownNameError
-from sme_registry.evaluation.evaluate import Progress, same_draw
+from sme_registry.evaluation.evaluate import same_draw
+from sme_registry.evaluation.measure import Progress
 from sme_registry.evaluation.policies import Policy, as_policy
 from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, observations
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +15,7 @@ from sme_registry.errors import PolicyError, UnknownNameError, did_you_mean
 from sme_registry.evaluation.policies import modules, sb3
 from sme_registry.evaluation.policies.npz import OfflinePolicy
 from sme_registry.evaluation.policies.onnx import load_onnx
+from sme_registry.evaluation.policies.perceptron import Perceptron
 from sme_registry.evaluation.policies.policy import (
     Interface,
     Member,
@@ -99,9 +100,14 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
     `observed_phases` are the phases of a stream that the policy observes, for a single agent.
     """
     if spec.team is None:
-        S, A = spec.state_dim, spec.action_dim
+        S, A, m = spec.state_dim, spec.action_dim, spec.distractors
+        distractors = f", {m} distractors" if m else ""
         observed = f" and {observed_phases} observed phases" if observed_phases else ""
-        return Interface(S + 2 + observed_phases, A, f"state_dim={S}, action_dim={A}{observed}")
+        return Interface(
+            spec.observation_dim + observed_phases,
+            A,
+            f"state_dim={S}, action_dim={A}{distractors}{observed}",
+        )
     agents = draw.agents(spec)
     observation_dim = spec.state_dim + 2 + len(agents)
     action_dim = max(agent.action_dim for agent in agents)
@@ -175,6 +181,7 @@ def _prepare(
         name = Path(policy).stem if name is None else name
         policy = _load(Path(policy), interface)
     act, episodes = policy, None
+    hidden: Callable[[Observation], Iterable[Any]] | None = None
     if hasattr(policy, "predict"):
         interface.check(
             "policy",
@@ -184,8 +191,13 @@ def _prepare(
         sb3.check_not_normalised(policy)
         act, action_range = sb3.predictor(policy), action_range or sb3.action_range_of(policy)
         episodes = sb3.episode_predictor(policy)
+        network = sb3.torch_policy(policy)
+        hidden = None if network is None else modules.hidden_layers(act, network)
     elif modules.is_module(policy):
         act = modules.module_predictor(policy)
+        hidden = modules.hidden_layers(act, policy)
+    elif isinstance(policy, Perceptron | OfflinePolicy):
+        hidden = policy.hidden
     elif not callable(policy):
         raise PolicyError(
             f"policy={policy!r:.80}: must be {interface.alternatives}a callable from observations "
@@ -200,6 +212,7 @@ def _prepare(
         interface.action_dim,
         interface.hint,
         episodes,
+        hidden,
     )
 
 

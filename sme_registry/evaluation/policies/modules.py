@@ -42,6 +42,37 @@ def module_predictor(module: Any) -> Callable[[Observation], Any]:
     return act
 
 
+def hidden_layers(
+    act: Callable[[Observation], Any], module: Any
+) -> Callable[[Observation], list[Any]]:
+    """The outputs of a module's hidden layers: the inputs of its linear layers but the first one's.
+
+    So an activation counts as part of its layer, whether it is a module or a function.
+
+    Args:
+      act: acts by calling the module.
+      module: the module, or one of which it is a part.
+    """
+    linear = [part for part in module.modules() if isinstance(part, _torch().nn.Linear)]
+
+    def hidden(observations: Observation) -> list[Any]:
+        inputs: list[Any] = []
+
+        def keep(_: Any, arguments: tuple[Any, ...]) -> None:
+            # Two heads of a network, such as mean and spread, have the same input.
+            inputs.extend(x for x in arguments[:1] if not any(x is known for known in inputs))
+
+        hooks = [part.register_forward_pre_hook(keep) for part in linear]
+        try:
+            act(observations)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        return [without_tensor(x) for x in inputs[1:]]
+
+    return hidden
+
+
 def without_tensor(returned: Any) -> Any:
     """What a policy returned; a tensor, on any device, with or without gradient, as an array."""
     torch = _torch()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,15 +72,21 @@ class OfflinePolicy:
                 f"observations of shape {x.shape}: must be [B, {self.observation_dim}]. Evaluate "
                 "the policy on the task it was trained for."
             )
-        *inner, (W, b) = self.layers
-        for weight, bias in inner:
-            x = x @ weight.T
-            x += bias
-            np.maximum(x, 0.0, out=x)
+        *_, x = x, *self.hidden(x)
+        W, b = self.layers[-1]
         u: npt.NDArray[np.float32] = np.tanh(x @ W.T + b)
         u += 1.0
         u *= 0.5
         return u
+
+    def hidden(self, observations: npt.NDArray[np.float32]) -> Iterator[npt.NDArray[np.float32]]:
+        """The outputs `[B, H]` of each hidden layer."""
+        x = observations
+        for W, b in self.layers[:-1]:
+            x = x @ W.T
+            x += b
+            np.maximum(x, 0.0, out=x)
+            yield x
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the file completely or not at all; equal policies give equal bytes.

@@ -95,6 +95,10 @@ class Perceptron:
             ACTIVATIONS[activation](x, out=x)
             yield x
 
+    def hidden(self, observations: Observation) -> list[Weights]:
+        """The outputs `[B, out]` of each layer but the last."""
+        return list(self.outputs(observations))[:-1]
+
     def __call__(self, observations: Observation) -> Weights:
         """Actions `[B, A]` float32, not clipped."""
         *_, x = self.outputs(observations)

@@ -9,7 +9,7 @@ is no team policy: under partial observation no agent could execute it.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -62,6 +62,8 @@ class Policy:
       hint: a sentence about its interface, which error messages end with.
       episodes: a new `act` for a batch of episodes that start together: it keeps the state of a
         recurrent policy from call to call, row by row. None: it has no state.
+      hidden: observations to the outputs `[B, H]` of each hidden layer of its network, in order;
+        None of an unknown one.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Policy:
     action_dim: int
     hint: str = ""
     episodes: Callable[[], Callable[[Observation], Any]] | None = None
+    hidden: Callable[[Observation], Iterable[Any]] | None = None
 
     def start(self) -> Policy:
         """This policy at the start of a batch of episodes; a recurrent one keeps its state."""
@@ -84,7 +87,11 @@ class Policy:
 
         # `policy` has converted its actions to the unit range, and named its own errors.
         return replace(
-            self, action_range="unit", act=shown(self), episodes=lambda: shown(self.start())
+            self,
+            action_range="unit",
+            act=shown(self),
+            episodes=lambda: shown(self.start()),
+            hidden=None,
         )
 
     def __call__(self, observations: Observation) -> Array:

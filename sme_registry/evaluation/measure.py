@@ -1,0 +1,211 @@
+"""`measure`: policies and references in every region, batch by batch.
+
+Policies whose tasks have the same draw share states, optimal actions and references.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.compiled import Engine
+from sme_registry.compiled.network import network
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import references
+from sme_registry.evaluation.accumulators import Errors
+from sme_registry.evaluation.observation import Distraction
+from sme_registry.evaluation.policies import Policy, TeamPolicy
+from sme_registry.evaluation.regions import Observations, States, Uniform, states
+from sme_registry.evaluation.safety import SafetyAccumulator
+from sme_registry.spec import EvaluationProtocol, SMESpec
+from sme_registry.task import Task
+from sme_registry.task.draw import Array
+
+Progress = Callable[[int, int], None]
+
+Subject = tuple[Policy | TeamPolicy, SMESpec]
+"""A policy and its task."""
+
+Key = int | str
+"""The index of a policy, or the name of a reference."""
+
+
+class _Batch(NamedTuple):
+    """A batch of states, and what is the same for all policies in them.
+
+    Attributes:
+      states: of the region.
+      observations: `[B, O]` float32, those of each horizon.
+      s: `[B, S]` the states in float64.
+      optimal: `[B, A]` π*(s).
+      limit: `[B, A]` ℓ(s); None without safety.
+    """
+
+    states: States
+    observations: dict[int, Observations]
+    s: Array
+    optimal: Array
+    limit: Array | None
+
+    def shown(self, x: npt.NDArray[Any]) -> dict[int, Observations]:
+        """The observations of each horizon, of what agents see `[B, S + m]`."""
+        return {T: self.states.observation(x, T) for T in self.observations}
+
+
+class Measured(NamedTuple):
+    """What was measured in one region.
+
+    Attributes:
+      errors: of each policy and reference.
+      safety: of each policy and reference, by its r_min; empty without safety.
+      distraction: of each policy; None without distractors.
+    """
+
+    errors: dict[Key, Errors]
+    safety: dict[tuple[Key, float], SafetyAccumulator]
+    distraction: Distraction | None
+
+    @classmethod
+    def begin(
+        cls,
+        subjects: Sequence[Subject],
+        task: Task,
+        protocol: EvaluationProtocol,
+        region: int,
+        channels: dict[str, slice],
+    ) -> Measured:
+        """Nothing measured yet; the arguments are those of `measure`."""
+        keys: list[Key] = [*range(len(subjects)), *references.names(task.spec)]
+        tasks = {spec.r_min: replace(task, spec=spec) for _, spec in subjects}
+        with_limits = {} if task.spec.safety is None else tasks
+        return cls(
+            errors={key: Errors(channels) for key in keys},
+            safety={
+                (key, r_min): SafetyAccumulator(own)
+                for key in keys
+                for r_min, own in with_limits.items()
+            },
+            distraction=Distraction(task, protocol, region, len(subjects))
+            if task.spec.distractors
+            else None,
+        )
+
+    def add_policies(
+        self, batch: _Batch, subjects: Sequence[Subject], failed: dict[int, PolicyError]
+    ) -> dict[Key, Array]:
+        """Add a batch of the policies; their actions `[B, A]` in [0, 1]."""
+        actions: dict[Key, Array] = {}
+        for index, unclipped in _actions(subjects, batch.observations, failed):
+            a = actions[index] = np.clip(unclipped, 0.0, 1.0)
+            self.errors[index].add(a, batch.optimal, a != unclipped)
+
+        def act(x: npt.NDArray[Any]) -> Iterator[tuple[int, Array]]:
+            return _actions(subjects, batch.shown(x), failed)
+
+        if self.distraction is not None:
+            self.distraction.add(batch.states, batch.optimal, actions, act)
+        return actions
+
+    def add_safety(self, batch: _Batch, actions: Mapping[Any, Array]) -> None:
+        """Add a batch of the policies and references, `[B, A]` or `[A]` in [0, 1]."""
+        for (key, _), scores in self.safety.items():
+            if key in actions and batch.limit is not None:
+                scores.add(actions[key], batch.optimal, batch.limit)
+
+
+def measure(
+    subjects: Sequence[Subject],
+    task: Task,
+    oracle: Engine,
+    protocol: EvaluationProtocol,
+    channels: dict[str, slice],
+    progress: Progress,
+    failed: dict[int, PolicyError],
+) -> Iterator[Measured]:
+    """What is measured of the policies and of each reference, region after region.
+
+    Args:
+      subjects: policies, each with its task; the tasks have the same draw.
+      task: one of their tasks.
+      oracle: its engine.
+      protocol: the regions.
+      channels: the action channels of each scope.
+      progress: called after each batch with the number of states done, and of all states.
+      failed: gets the errors of the policies that fail. The measurement ends once all have.
+    """
+    horizons = sorted({spec.horizon for _, spec in subjects})
+    fitted: references.References | None = None
+    total, done = protocol.states_per_region * len(protocol.edges), 0
+    for region in range(len(protocol.edges)):
+        batches = _batches(task, oracle, protocol, region, horizons)
+        if fitted is None:
+            fitted, batches = _fit_references(batches, task)
+        measured = Measured.begin(subjects, task, protocol, region, channels)
+        random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
+        for batch in batches:
+            actions = measured.add_policies(batch, subjects, failed)
+            if len(failed) == len(subjects):
+                return
+            others = fitted.actions(batch.s, batch.optimal, random(*batch.optimal.shape))
+            if batch.limit is not None:
+                others |= references.safe_actions(task.spec, batch.optimal, batch.limit)
+            for name, a in others.items():
+                measured.errors[name].add(a, batch.optimal)
+            measured.add_safety(batch, actions)
+            measured.add_safety(batch, others)
+            done += len(batch.s)
+            progress(done, total)
+        yield measured
+
+
+def _actions(
+    subjects: Sequence[Subject],
+    observations: dict[int, Observations],
+    failed: dict[int, PolicyError],
+) -> Iterator[tuple[int, Array]]:
+    """The actions of each policy that has not failed, not clipped; writes those that now fail."""
+    for index, (policy, spec) in enumerate(subjects):
+        if index not in failed:
+            try:
+                # A copy, since a policy may write into its observations.
+                yield index, policy(observations[spec.horizon].copy())
+            except PolicyError as error:
+                failed[index] = error
+
+
+def _batches(
+    task: Task, oracle: Engine, protocol: EvaluationProtocol, region: int, horizons: Sequence[int]
+) -> Iterator[_Batch]:
+    """The states of a region, with the observations that tasks of each horizon make of them."""
+    limit_of = _limit(task, oracle) if task.spec.safety is not None else lambda s: None
+    for drawn in states(protocol, region, task.spec):
+        x, s = drawn.seen(task), drawn.s.astype(np.float64)
+        shown = {T: drawn.observation(x, T) for T in horizons}
+        yield _Batch(drawn, shown, s, oracle.optimal_action(s), limit_of(s))
+
+
+def _limit(task: Task, oracle: Engine) -> Callable[[Array], Array]:
+    """ℓ of states `[B, S]`, by machine code where the oracle is."""
+    if oracle.backend == "numpy":
+        return task.limit
+    v = network(task.limiting)
+    return lambda s: task.limit_of(v(np.ascontiguousarray(s.T)).T)
+
+
+def _fit_references(
+    batches: Iterator[_Batch], task: Task
+) -> tuple[references.References, Iterator[_Batch]]:
+    """The references fitted on the first states, and all batches from the first one on."""
+    count = references.fit_states(task.spec)
+    first: list[_Batch] = []
+    while sum(len(batch.s) for batch in first) < count and (batch := next(batches, None)):
+        first.append(batch)
+    s = np.concatenate([batch.s for batch in first])[:count]
+    optimal = np.concatenate([batch.optimal for batch in first])[:count]
+    agents = zip(task.observed, task.owned, strict=True)
+    return references.fit(s, optimal, agents), itertools.chain(first, batches)
