@@ -18,13 +18,13 @@ from sme_registry.cli.arguments import (
     changes,
 )
 from sme_registry.cli.evaluate_stream import Life, evaluate_life
-from sme_registry.cli.files import can_draw, print_written
+from sme_registry.cli.files import can_draw, print_tables, print_written
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.io import refuse_existing
 from sme_registry.spec import EnvFile, StreamFile, StreamSpec, catalogue
 from sme_registry.task import load_document
-from sme_registry.terminal import Progress, err, out, print_json
+from sme_registry.terminal import Progress, err, print_json
 
 
 def _complete_policy(incomplete: str) -> list[str]:
@@ -131,7 +131,7 @@ def evaluate(
     if json:
         print_json(report.to_dict())
     else:
-        out().print(report.table())
+        print_tables(report.tables())
     print_written(files)
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.evaluation.observation import ObservationReport
-from sme_registry.evaluation.region_report import RegionReports
+from sme_registry.evaluation.region_report import RegionReport, RegionReports
 from sme_registry.evaluation.report_file import ReportFile
 from sme_registry.evaluation.safety import SafetyReport
 from sme_registry.io import require_packages, write_atomically
@@ -45,6 +45,8 @@ LABELS = {
     "best_constant": "best constant",
     "constant_half": "constant ½",
     "uniform_random": "random",
+    "safe_optimal": "safe optimum",
+    "shrunk_optimal": "optimum ≤ 1 − 2τ",
 }
 
 
@@ -135,7 +137,9 @@ class EvaluationReport(ReportFile):
         Returns:
           One row for each policy and region: `policy`; `reference`, whether it is a reference
           policy; `agent`, empty for the whole team or the single agent; `region`; then the columns
-          `epsilon_low` to `clipped_share` of `RegionReport`.
+          `epsilon_low` to `clipped_share` of `RegionReport`. Of a task with limits also those of
+          `SafetyScore`; of one with distractors `invariance`, which is 0 for the references, and
+          the policy's regions d-OOD 1, 2, …
 
         Raises:
           MissingDependencyError: pandas is not installed.
@@ -147,16 +151,24 @@ class EvaluationReport(ReportFile):
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         scopes: dict[str, AgentReport | EvaluationReport] = {"": self, **self.agents}
-        return (
-            {"policy": policy, "reference": is_reference, "agent": agent, "region": region.name}
-            | region.model_dump(exclude={"name", "channels"})
-            for agent, scope in scopes.items()
-            for policy, is_reference, regions in (
-                (self.policy, False, scope.regions),
-                *((name, True, regions) for name, regions in scope.references.items()),
-            )
-            for region in regions
-        )
+        for agent, scope in scopes.items():
+            for policy, regions in {"": scope.regions, **scope.references}.items():
+                who = {"policy": policy or self.policy, "reference": bool(policy), "agent": agent}
+                for index, region in enumerate(regions):
+                    yield who | _columns(region) | self._extensions(policy, index)
+        for region in () if self.observation is None else self.observation.distractor_regions:
+            yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
+
+    def _extensions(self, reference: str, index: int) -> dict[str, float]:
+        """The columns of safety and distractors of a reference, or of the policy, in a region."""
+        columns: dict[str, float] = {}
+        if self.safety is not None:
+            scores = self.safety.references.get(reference, self.safety.regions)
+            columns |= scores[index].model_dump(exclude={"name"})
+        if self.observation is not None and self.observation.invariance:
+            own = 0.0 if reference else self.observation.invariance[index].invariance
+            columns["invariance"] = own
+        return columns
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows of `to_frame` as CSV, completely or not at all; pandas is not required.
@@ -178,49 +190,20 @@ class EvaluationReport(ReportFile):
         )
 
     def table(self) -> Table:
-        """The report as a table of 80 columns: a column for each region, a row for each policy.
+        """The regions as a table of 80 columns: a column for each region, a row for each policy.
 
         For a team, it shows the whole team, then three rows for each agent.
         """
-        from rich.markup import escape
+        from sme_registry.evaluation import tables
 
-        from sme_registry.terminal import Table
+        return tables.of_regions(self)
 
-        spec, policy = self.spec, escape(self.policy)
-        team = f", {len(self.agents)} agents" if self.agents else ""
-        table = Table(
-            f"{policy} on {escape(self.title)} (S={spec.state_dim}, "
-            f"A={spec.action_dim}, L={spec.complexity}{team})\n"
-            f"{spec.digest}\n{self.regions[0].states:,} states per region; "
-            f"WD regret {self.wd_regret:.3f}, OOD regret {self.ood_regret:.3f}, "
-            f"OOD decay {self.ood_decay:.3f}",
-            {"": "name"}
-            | {f"{region.name}\nε ≤ {region.epsilon_high:g}": "number" for region in self.regions},
-            caption=NOT_COMPARABLE,
-        )
+    def tables(self) -> list[Table]:
+        """`table`, and those of safety, of distractors and of probes where there are any."""
+        from sme_registry.evaluation import tables
 
-        def row(
-            label: str, field: str, pattern: str, regions: RegionReports = self.regions
-        ) -> None:
-            values = [format(getattr(region, field), pattern) for region in regions]
-            table.add_row(label, *values, style="bold" if regions is self.regions else None)
+        return tables.of_report(self)
 
-        for heading, field in (
-            ("similarity r̃", "similarity"),
-            ("normalised regret", "normalised_regret"),
-        ):
-            table.add_row(heading, style="italic")
-            for name, regions in {policy: self.regions, **self.references}.items():
-                row(f"  {LABELS.get(name, name)}", field, ".3f", regions)
-            table.add_section()
-        row("SD of r̃ over states", "similarity_sd", ".3f")
-        row("similarity decay", "similarity_decay", ".1%")
-        row("similarity loss, pts", "similarity_loss", ".1f")
-        row("actions clipped", "clipped_share", ".1%")
-        for agent, report in self.agents.items():
-            table.add_section()
-            row(f"{agent}  r̃", "similarity", ".3f", report.regions)
-            row("  normalised regret", "normalised_regret", ".3f", report.regions)
-            if linear := report.references.get("linear_least_squares"):
-                row(f"  of {LABELS['linear_least_squares']}", "normalised_regret", ".3f", linear)
-        return table
+
+def _columns(region: RegionReport) -> dict[str, Any]:
+    return {"region": region.name} | region.model_dump(exclude={"name", "channels"})

@@ -60,13 +60,13 @@ class ReportFile(StrictModel):
         return [self.table()]
 
     def _repr_html_(self) -> str:
-        """The table, for notebooks."""
+        """The tables, for notebooks."""
         from sme_registry.terminal.html import table_html
 
-        return table_html(self.table())
+        return "\n".join(map(table_html, self.tables()))
 
     def __str__(self) -> str:
-        return as_text(self.table())
+        return "\n\n".join(map(as_text, self.tables()))
 
 
 def as_text(table: Table) -> str:

@@ -1,4 +1,4 @@
-"""Figures: regret in training, decay outside the cube, similarity over the plane, streams.
+"""Figures: training, decay outside the cube, maps of the plane, safety, distraction, streams.
 
 Each function returns a Matplotlib `Figure`. It writes a file where it gets a `path`, PNG, PDF or
 SVG by its ending, and draws in the caller's axes where it gets `ax`. `save_figure` writes any
@@ -8,6 +8,8 @@ figure.
 from sme_registry.plots.curves import learning_curve, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
+from sme_registry.plots.observation import layer_probes, sensitivity_bars
+from sme_registry.plots.safety import reward_against_cost
 from sme_registry.plots.streams import (
     dynamic_regret_curve,
     performance_curve,
@@ -19,11 +21,14 @@ from sme_registry.plots.style import save_figure
 __all__ = [
     "decay_curve",
     "dynamic_regret_curve",
+    "layer_probes",
     "learning_curve",
     "performance_curve",
     "plasticity_curve",
     "retention_map",
+    "reward_against_cost",
     "save_figure",
+    "sensitivity_bars",
     "similarity_map",
     "training_curve",
 ]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.evaluation.report import LABELS
+from sme_registry.plots.methods import Method, Reports, levels, methods_of, only_title
 from sme_registry.plots.style import (
     COLOURS,
     GREY,
@@ -24,7 +24,6 @@ from sme_registry.plots.style import (
     look,
     name_bands,
 )
-from sme_registry.spec import catalogue
 from sme_registry.statistics import iqm
 
 if TYPE_CHECKING:
@@ -32,22 +31,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Measure = Literal["similarity", "normalised_regret"]
-Report = EvaluationReport | str | os.PathLike[str]
-Reports = Report | Sequence[Report] | Mapping[str, Report | Sequence[Report]]
-
-_EVALUATION = "evaluation.json"
-
 _MEASURES = {
     "similarity": "similarity r̃  (1 = optimal)",
     "normalised_regret": "normalised regret  (1 = constant ½)",
 }
-
-
-class _Method(NamedTuple):
-    """One line: a report, or the reports of a method's runs."""
-
-    label: str
-    reports: list[EvaluationReport]
 
 
 def decay_curve(
@@ -84,7 +71,7 @@ def decay_curve(
       SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
     """
-    methods = _methods(reports)
+    methods = methods_of(reports)
     everything = [report for method in methods for report in method.reports]
     if not measures or any(measure not in _MEASURES for measure in measures):
         raise OptionError(f"measures={measures!r:.70}: must be among {', '.join(_MEASURES)}.")
@@ -100,66 +87,18 @@ def decay_curve(
             if len(everything) > len(methods):
                 name_bands(axes, "quartiles of runs (line: IQM)")
             _label_axes(axes, everything, measure)
-        tasks = catalogue.titles(report.spec.named(report.task) for report in everything)
-        if title is None and len(tasks) == 1:
-            (title,) = tasks.values()
+        title = only_title(everything) if title is None else title
         if ax is None and title:
             entitle(figure_of(panels[0]), title)
     return figure_of(panels[0])
-
-
-def _methods(reports: Reports) -> list[_Method]:
-    """The lines to draw; those of equal labels on different tasks are told apart by their task."""
-    if isinstance(reports, Mapping):
-        methods = [_Method(name, _reports(runs)) for name, runs in reports.items()]
-        for method in methods:
-            if len({_levels(report) for report in method.reports}) > 1:
-                raise OptionError(
-                    f"reports[{method.label!r}]: have different regions. Evaluate all runs of a "
-                    "method with one protocol."
-                )
-    else:
-        everything = _reports(reports)
-        specs = {r.spec_digest: r.spec.named(r.task) for r in everything}
-        tasks = catalogue.titles(specs.values())
-        methods = [
-            _Method(r.policy if len(tasks) == 1 else f"{r.policy}, {tasks[r.spec_digest]}", [r])
-            for r in everything
-        ]
-    if not methods or not all(method.reports for method in methods):
-        raise OptionError("reports: must be one or more evaluation reports. Give one.")
-    return methods
-
-
-def _reports(given: Report | Iterable[Report]) -> list[EvaluationReport]:
-    """One report or several, those given by their paths read."""
-    if isinstance(given, EvaluationReport | str | os.PathLike) or not isinstance(given, Iterable):
-        given = [given]
-    reports = []
-    for each in given:
-        if isinstance(each, str | os.PathLike):
-            path = Path(each) / _EVALUATION if Path(each).is_dir() else Path(each)
-            reports.append(EvaluationReport.read(path))
-        elif isinstance(each, EvaluationReport):
-            reports.append(each)
-        else:
-            raise OptionError(
-                f"reports={each!r:.60}: must be an EvaluationReport, the path of an "
-                f"{_EVALUATION}, or the folder of a run."
-            )
-    return reports
-
-
-def _levels(report: EvaluationReport) -> tuple[float, ...]:
-    return tuple(region.epsilon_high for region in report.regions)
 
 
 def _values(regions: Any, measure: str) -> list[float]:
     return [getattr(region, measure) for region in regions]
 
 
-def _draw_method(axes: Axes, method: _Method, measure: str, style: Mapping[str, Any]) -> None:
-    x = _levels(method.reports[0])
+def _draw_method(axes: Axes, method: Method, measure: str, style: Mapping[str, Any]) -> None:
+    x = levels(method.reports[0])
     runs = np.array([_values(report.regions, measure) for report in method.reports])
     label = literal(method.label)
     if len(runs) > 1:
@@ -179,11 +118,11 @@ def _draw_agents(axes: Axes, report: EvaluationReport, measure: str) -> None:
             style |= {"color": COLOURS[5], "label": "" if index else each}
         else:
             style |= {**look(index + 1), "label": literal(name)}
-        axes.plot(_levels(report), _values(agent.regions, measure), **style)
+        axes.plot(levels(report), _values(agent.regions, measure), **style)
 
 
 def _draw_references(
-    axes: Axes, methods: Sequence[_Method], measure: str, *, averaged: bool
+    axes: Axes, methods: Sequence[Method], measure: str, *, averaged: bool
 ) -> None:
     """The references of each task, or their means over all tasks, with one entry in the legend."""
     tasks: dict[str, tuple[int, EvaluationReport]] = {}
@@ -191,23 +130,25 @@ def _draw_references(
         for report in method.reports:
             tasks.setdefault(report.spec_digest, (index, report))
     first = methods[0].reports[0]
-    alike = [report for _, report in tasks.values() if _levels(report) == _levels(first)]
+    alike = [report for _, report in tasks.values() if levels(report) == levels(first)]
     if averaged:
         for name in first.references:
+            if not all(name in report.references for report in alike):
+                continue  # of safety, where only some tasks have limits
             runs = [_values(report.references[name], measure) for report in alike]
             mean = np.mean(runs, axis=0)
-            draw_reference(axes, name, _levels(first), mean, LABELS.get(name, name))
+            draw_reference(axes, name, levels(first), mean, LABELS.get(name, name))
         return
     for index, report in tasks.values():
         colour = GREY if len(tasks) == 1 else COLOURS[index % len(COLOURS)]
         for name, regions in report.references.items():
             label = LABELS.get(name, name) if report is first else "_another task"
             values = _values(regions, measure)
-            draw_reference(axes, name, _levels(report), values, label, colour)
+            draw_reference(axes, name, levels(report), values, label, colour)
 
 
 def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -> None:
-    levels = sorted({level for report in reports for level in _levels(report)})
+    levels = sorted({level for report in reports for level in levels(report)})
     dims = sorted({report.spec.state_dim for report in reports})
     warning = (
         "different S: these levels are not comparable"

@@ -11,6 +11,8 @@ from sme_registry.evaluation.continual import Visit
 from sme_registry.plots.curves import Run, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
+from sme_registry.plots.observation import layer_probes, sensitivity_bars
+from sme_registry.plots.safety import reward_against_cost
 from sme_registry.plots.streams import (
     dynamic_regret_curve,
     performance_curve,
@@ -26,8 +28,15 @@ _OF_STREAMS: dict[str, Callable[[StreamReport], Any]] = {
     "dynamic_regret_curve": dynamic_regret_curve,
     "plasticity_curve": plasticity_curve,
 }
+_OF_EXTENSIONS: dict[str, Callable[[EvaluationReport], Any]] = {
+    "reward_against_cost": reward_against_cost,
+    "sensitivity_bars": sensitivity_bars,
+    "layer_probes": layer_probes,
+}
 FILES = tuple(
-    f"{name}.{ending}" for name in (_TRAINING, _DECAY, _MAP, *_OF_STREAMS) for ending in WRITTEN
+    f"{name}.{ending}"
+    for name in (_TRAINING, _DECAY, _MAP, *_OF_EXTENSIONS, *_OF_STREAMS)
+    for ending in WRITTEN
 )
 
 
@@ -62,7 +71,9 @@ def write_stream(report: StreamReport, folder: Path) -> list[Path]:
 
 
 def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None) -> list[Path]:
-    """Write the decay curve and, of a policy with two state channels, the similarity map.
+    """Write the figures of an evaluation for which its report has the numbers.
+
+    They are the decay curve, and of a policy that observes two state channels the similarity map.
 
     Args:
       report: of the policy.
@@ -75,7 +86,17 @@ def write_evaluation(report: EvaluationReport, folder: Path, policy: Any = None)
     """
     files = save_figure(decay_curve(report), folder / _DECAY, WRITTEN)
     spec = report.spec.named(report.task)
-    if policy is not None and spec.state_dim == 2 and spec.team is None:
+    observation = report.observation
+    known = {
+        "reward_against_cost": report.safety is not None,
+        "sensitivity_bars": observation is not None and bool(observation.invariance),
+        "layer_probes": observation is not None and bool(observation.probes),
+    }
+    for name, draw in _OF_EXTENSIONS.items():
+        if known[name]:
+            files += save_figure(draw(report), folder / name, WRITTEN)
+    alone = spec.team is None and spec.observation is None
+    if policy is not None and spec.state_dim == 2 and alone:
         action_range: Any = report.action_range
         figure = similarity_map(policy, spec, action_range=action_range, name=report.policy)
         files += save_figure(figure, folder / _MAP, WRITTEN)

@@ -57,7 +57,8 @@ def similarity_map(
       The figure.
 
     Raises:
-      OptionError: the task has no two state channels, or an argument is out of range.
+      OptionError: the task has no two state channels or its agent does not observe the state, or
+        an argument is out of range.
       PolicyError: the policy cannot be loaded, or its actions are invalid.
       UnknownNameError, SpecError: the task does not exist, or a field is out of range.
       MissingDependencyError: Matplotlib is not installed.
@@ -66,6 +67,11 @@ def similarity_map(
     if spec.state_dim != 2:
         raise OptionError(
             f"state_dim={spec.state_dim}: must be 2 for a map. Use a task such as SME/Plane1-v1."
+        )
+    if spec.observation is not None:
+        raise OptionError(
+            "observation: must be absent for a map, because the policy sees more than the two "
+            "state channels. Use a task without it."
         )
     if not 0.0 < epsilon <= 100.0:
         raise OptionError(f"epsilon={epsilon!r:.40}: must be in (0, 100].")

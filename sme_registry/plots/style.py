@@ -40,6 +40,8 @@ REFERENCE_DASHES: dict[str, Any] = {
     "best_constant": (0, (3, 1, 1, 1)),
     "constant_half": (0, (4, 4)),
     "uniform_random": (0, (1, 2)),
+    "safe_optimal": (0, (8, 2, 1, 2)),
+    "shrunk_optimal": (0, (2, 1)),
 }
 _DPI = 160
 _LABEL_WIDTH = 60  # letters in a line of a legend

@@ -18,7 +18,7 @@ from sme_registry.evaluation.continual.dynamic_regret import DynamicRegret
 from sme_registry.evaluation.continual.lives import expected_regret
 from sme_registry.evaluation.regions import region_name
 from sme_registry.evaluation.report import EvaluationReport
-from sme_registry.evaluation.report_file import ReportFile, as_text
+from sme_registry.evaluation.report_file import ReportFile
 from sme_registry.spec import (
     ActionRange,
     EvaluationProtocol,
@@ -277,9 +277,6 @@ class StreamReport(ReportFile):
             f"<StreamReport: {self.policy} on {self.title}, {len(self.visits)} visits, "
             f"average performance {final:.3f}>"
         )
-
-    def __str__(self) -> str:
-        return "\n\n".join(map(as_text, self.tables()))
 
     def table(self) -> Table:
         """The metrics at the end of the life: a column for each region."""

@@ -1,0 +1,191 @@
+"""`sensitivity_bars` and `layer_probes`: what distracts a policy, and what its layers keep."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport, ObservationReport
+from sme_registry.plots.methods import Reports, methods_of, only_title
+from sme_registry.plots.style import (
+    COLOURS,
+    GREY,
+    canvas,
+    draw_band,
+    entitle,
+    figure_of,
+    literal,
+    look,
+    name_bands,
+)
+from sme_registry.statistics import iqm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BARS = {
+    "in the cube": "wd_regret",
+    "states outside": "ood_regret",
+    "distractors outside": "distractor_regret",
+    "other distractors": "invariance",
+}
+_ALL_BARS = 0.8  # width of a group, of which groups are 1 apart
+
+
+def sensitivity_bars(
+    reports: Reports,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> Figure:
+    """Draw how policies bear changes of their observation: four groups of bars, one bar per method.
+
+    Normalised regret in the cube, with the states outside (mean over the OOD shells), and with the
+    distractors outside (mean over the d-OOD shells); and invariance in the cube, by how much
+    other distractors move the actions, on the same scale.
+
+    Args:
+      reports: of tasks with distractors; as in `decay_curve`. In a mapping a bar is the IQM over
+        runs, and its line spans their quartiles.
+      path: a file to write, .png, .pdf or .svg; None writes none.
+      title: above a new figure; None takes the task's name if there is only one task.
+      ax: the axes to draw in, without title and legend; None for a new figure.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError: no report, a report of a task without distractors, an unknown suffix, or the
+        file cannot be written.
+      SpecError: a file is not a report; see `EvaluationReport.read`.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    methods = methods_of(reports)
+    everything = [report for method in methods for report in method.reports]
+    width = _ALL_BARS / len(methods)
+    with canvas(ax, (max(6.4, 1.2 + 1.5 * len(methods)), 3.9), path) as (axes,):
+        axes.axhline(1.0, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)), label="constant ½")
+        for index, method in enumerate(methods):
+            runs = np.array([_sensitivities(report) for report in method.reports])
+            x = np.arange(len(_BARS)) - _ALL_BARS / 2 + width * (index + 0.5)
+            heights, several = iqm(runs), len(runs) > 1
+            axes.bar(
+                x, heights, width, color=COLOURS[index % len(COLOURS)], edgecolor="white",
+                hatch="" if index < len(COLOURS) else "////",
+                label=literal(method.label) + (f" (n = {len(runs)})" if several else ""),
+            )  # fmt: skip
+            if several:
+                axes.vlines(x, *np.quantile(runs, [0.25, 0.75], axis=0), color="black")
+            elif len(methods) <= 3:
+                for at, height in zip(x, heights, strict=True):
+                    axes.annotate(
+                        f"{height:.2f}", (at, height), (0, 2), textcoords="offset points",
+                        ha="center", fontsize=8,
+                    )  # fmt: skip
+        axes.set_xticks(range(len(_BARS)), list(_BARS))
+        axes.grid(visible=False, axis="x")
+        axes.set_ylabel("normalised regret\n(right: change of the action)")
+        title = only_title(everything) if title is None else title
+        if ax is None and title:
+            entitle(figure_of(axes), title)
+    return figure_of(axes)
+
+
+def layer_probes(
+    reports: Reports,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    title: str | None = None,
+    ax: Axes | Sequence[Axes] | None = None,
+) -> Figure:
+    """Draw what a linear map recovers from each layer: R² of the state, and of the distractors.
+
+    Args:
+      reports: whose policies have probes; as in `decay_curve`. In a mapping a line is the IQM over
+        runs, which must have equally many layers, and a band spans their quartiles.
+      path: a file to write, .png, .pdf or .svg; None writes none.
+      title: above a new figure; None takes the task's name if there is only one task.
+      ax: two axes to draw in, without title and legend; None for a new figure.
+
+    Returns:
+      The figure: the state on the left, the distractors on the right, empty where there are none.
+
+    Raises:
+      OptionError: no report, a report without probes, runs of a method with different numbers of
+        layers, an unknown suffix, another number of axes than two, or the file cannot be written.
+      SpecError: a file is not a report; see `EvaluationReport.read`.
+      MissingDependencyError: Matplotlib is not installed.
+    """
+    methods = methods_of(reports)
+    everything = [report for method in methods for report in method.reports]
+    curves = [(each.label, _r2(each.label, each.reports)) for each in methods]
+    with canvas(ax, (9.0, 3.9), path, panels=2) as panels:
+        for panel, axes in enumerate(panels):
+            for index, (label, runs) in enumerate(curves):
+                r2 = runs[:, :, panel]
+                if np.isnan(r2).any():
+                    continue
+                x, several = np.arange(r2.shape[1]), len(r2) > 1
+                if several:
+                    low, high = np.quantile(r2, [0.25, 0.75], axis=0)
+                    draw_band(axes, x, low, high, look(index)["color"])
+                suffix = f" (n = {len(r2)})" if several else ""
+                axes.plot(x, iqm(r2), **look(index), linewidth=2, label=literal(label) + suffix)
+            if len(everything) > len(methods):
+                name_bands(axes, "quartiles of runs (line: IQM)")
+            layers = max(runs.shape[1] for _, runs in curves)
+            axes.set_xticks(range(layers), ["observation", *map(str, range(1, layers))])
+            axes.set_xlabel("hidden layer")
+            axes.set_ylabel("held-out R²  (1 = recovered by a linear map)")
+            axes.set_title(("of the state", "of the distractors")[panel])
+            axes.set_ylim(min(-0.03, axes.get_ylim()[0]), 1.03)
+        title = only_title(everything) if title is None else title
+        if ax is None and title:
+            entitle(figure_of(panels[0]), title)
+    return figure_of(panels[0])
+
+
+def _observation(report: EvaluationReport, field: str, need: str) -> ObservationReport:
+    observation = report.observation
+    if observation is None or not getattr(observation, field):
+        raise OptionError(f"reports: that of {report.policy!r} on {report.title} {need}.")
+    return observation
+
+
+def _sensitivities(report: EvaluationReport) -> list[float]:
+    """The heights of `_BARS`."""
+    observation = _observation(
+        report, "invariance", "is of a task without distractors. Give reports of tasks with some"
+    )
+    outside = [each.normalised_regret for each in observation.distractor_regions]
+    values = {
+        "wd_regret": report.wd_regret,
+        "ood_regret": report.ood_regret,
+        "distractor_regret": sum(outside) / len(outside),
+        "invariance": observation.invariance[0].invariance,
+    }
+    return [values[name] for name in _BARS.values()]
+
+
+def _r2(label: str, reports: Iterable[EvaluationReport]) -> Any:
+    """R² of the state and of the distractors (NaN without any), `[runs, layers, 2]`."""
+    need = (
+        "has no probes. Evaluate a policy whose network is known, such as a model or a PyTorch "
+        "module, on a task with observation"
+    )
+    runs = [
+        [(each.state_r2, each.distractor_r2) for each in _observation(r, "probes", need).probes]
+        for r in reports
+    ]
+    if len({len(run) for run in runs}) > 1:
+        raise OptionError(
+            f"reports[{label!r}]: their networks have different numbers of layers. Give each kind "
+            "of network as a method of its own."
+        )
+    return np.array(runs, dtype=np.float64)
