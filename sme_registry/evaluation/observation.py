@@ -144,7 +144,7 @@ def probe_layers(
     def probe(layer: int, h: Array) -> LayerProbe:
         if not np.isfinite(h).all():
             raise PolicyError(f"hidden layer {layer}: has outputs that are NaN or infinite.")
-        r2 = _held_out_r2(h.astype(np.float64), targets)
+        r2 = held_out_r2(h.astype(np.float64), targets)
         s_r2, d_r2 = r2[: task.spec.state_dim], r2[task.spec.state_dim :]
         return LayerProbe(
             layer=layer,
@@ -160,7 +160,7 @@ def probe_layers(
     return tuple(probe(layer, h) for layer, h in enumerate(layers()))
 
 
-def _held_out_r2(h: Array, y: Array) -> Array:
+def held_out_r2(h: Array, y: Array) -> Array:
     """R² of each column of y `[n, c]` from h `[n, H]`: `[c]`; see the module."""
     half = len(h) // 2
     design = np.concatenate([h, np.ones((len(h), 1))], axis=1)

@@ -148,7 +148,7 @@ def _draw_references(
 
 
 def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -> None:
-    levels = sorted({level for report in reports for level in levels(report)})
+    marks = sorted({level for report in reports for level in levels(report)})
     dims = sorted({report.spec.state_dim for report in reports})
     warning = (
         "different S: these levels are not comparable"
@@ -157,7 +157,7 @@ def _label_axes(axes: Axes, reports: Sequence[EvaluationReport], measure: str) -
     )
     axes.set_xlabel(f"outer expansion level ε of the region\n{warning}")
     axes.set_ylabel(_MEASURES[measure])
-    if len(levels) <= 12:
-        axes.set_xticks(levels, [f"{level:g}" if level > 0 else "WD" for level in levels])
+    if len(marks) <= 12:
+        axes.set_xticks(marks, [f"{level:g}" if level > 0 else "WD" for level in marks])
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.5) if measure == "similarity" else 0.0 - 0.03 * high, high)

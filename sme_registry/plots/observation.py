@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BARS = {
-    "in the cube": "wd_regret",
-    "states outside": "ood_regret",
-    "distractors outside": "distractor_regret",
-    "other distractors": "invariance",
+    "regret:\nall in the cube": "wd_regret",
+    "regret:\nstates outside": "ood_regret",
+    "regret:\ndistractors outside": "distractor_regret",
+    "invariance:\nother distractors": "invariance",
 }
 _ALL_BARS = 0.8  # width of a group, of which groups are 1 apart
 
@@ -70,7 +70,10 @@ def sensitivity_bars(
     everything = [report for method in methods for report in method.reports]
     width = _ALL_BARS / len(methods)
     with canvas(ax, (max(6.4, 1.2 + 1.5 * len(methods)), 3.9), path) as (axes,):
-        axes.axhline(1.0, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)), label="constant ½")
+        axes.hlines(  # not over invariance, where the constant ½ is at 0
+            1.0, -0.5, len(_BARS) - 1.5, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)),
+            label="normalised regret of constant ½",
+        )  # fmt: skip
         for index, method in enumerate(methods):
             runs = np.array([_sensitivities(report) for report in method.reports])
             x = np.arange(len(_BARS)) - _ALL_BARS / 2 + width * (index + 0.5)
@@ -90,7 +93,7 @@ def sensitivity_bars(
                     )  # fmt: skip
         axes.set_xticks(range(len(_BARS)), list(_BARS))
         axes.grid(visible=False, axis="x")
-        axes.set_ylabel("normalised regret\n(right: change of the action)")
+        axes.set_ylabel("error or change of the action\n(unit: mean |½ − a*|)")
         title = only_title(everything) if title is None else title
         if ax is None and title:
             entitle(figure_of(axes), title)

@@ -65,7 +65,10 @@ def reward_against_cost(
                     *ends[-1], _MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
                     linestyle="none", zorder=2,
                 )  # fmt: skip
-            axes.plot(*zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5)
+            axes.plot(
+                *zip(*ends[:2], strict=True), color=GREY, linewidth=1.0, zorder=1.5,
+                label="mixtures of optimal and safe optimum",
+            )  # fmt: skip
             for index, method in enumerate(methods):
                 x, y = _points([_safety(report).regions for report in method.reports], place)
                 style, runs = look(index), f" (n = {len(x)})" if len(x) > 1 else ""

@@ -1,0 +1,252 @@
+"""Tasks whose agents do not see the state: invariance, two kinds of OOD, and linear probes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import Perceptron, evaluate_many, regions
+from sme_registry.evaluation.observation import held_out_r2
+from sme_registry.evaluation.regions import expansion
+from sme_registry.spec import EvaluationProtocol
+
+S, A, M = 4, 3, 5
+SPEC = SMESpec(state_dim=S, action_dim=A, observation={"distractors": M})
+MIXED = SPEC.derive(observation={"distractors": M, "mixing": "nonlinear", "mixing_depth": 2})
+PROTOCOL = EvaluationProtocol(states_per_region=2_000, epsilons=(0.5, 1.0))
+
+
+def distracted(observations):
+    """Reads a distractor for each action channel."""
+    return 0.25 + 0.3 * observations[:, :A] + 0.2 * observations[:, S : S + A]
+
+
+def ignorant(observations):
+    return observations[:, :A]
+
+
+@pytest.fixture(scope="module")
+def report():
+    return evaluate(distracted, SPEC, PROTOCOL)
+
+
+def drawn(region, spec=SPEC):
+    batches = list(regions.states(PROTOCOL, region, spec))
+    s, d = (np.concatenate([getattr(batch, name) for batch in batches]) for name in "sd")
+    return s.astype(np.float64), d
+
+
+def test_the_agent_observes_state_and_distractors_and_the_time(report):
+    shown = []
+    evaluate(lambda o: shown.append(o) or ignorant(o), SPEC, PROTOCOL)
+    s, d = drawn(0)
+    np.testing.assert_array_equal(shown[0][:, :S], s.astype(np.float32))
+    np.testing.assert_array_equal(shown[0][:, S : S + M], d.astype(np.float32))
+    assert shown[0].dtype == np.float32
+    assert shown[0].shape[1] == SPEC.observation_dim
+    assert set(np.round(shown[0][:, -2] * SPEC.horizon, 4)) <= set(range(SPEC.horizon))
+    assert (shown[0][:, -1] == 0.0).all()
+
+
+def test_states_are_those_of_the_task_without_distractors():
+    plain = evaluate(ignorant, SPEC.derive(observation=None), PROTOCOL)
+    seeing = evaluate(ignorant, SPEC, PROTOCOL)
+    assert seeing.regions == plain.regions
+    assert seeing.references == plain.references
+
+
+@pytest.mark.parametrize("region", [0, 1, 2])
+def test_distractors_are_uniform_in_the_cube_in_every_region_of_states(region):
+    s, d = drawn(region)
+    assert d.shape == (2_000, M)
+    assert ((d > 0.0) & (d < 1.0)).all()
+    assert d.mean(axis=0) == pytest.approx([0.5] * M, abs=0.03)
+    assert abs(np.corrcoef(s.T, d.T)[:S, S:]).max() < 0.08
+
+
+def test_invariance_is_exactly_0_for_a_policy_that_ignores_distractors():
+    observation = evaluate(ignorant, SPEC, PROTOCOL).observation
+    assert [each.name for each in observation.invariance] == ["WD", "OOD 1", "OOD 2"]
+    assert [each.invariance for each in observation.invariance] == [0.0] * 3
+
+
+def test_invariance_is_that_of_the_definition(report):
+    # a(s, d) − a(s, d') = 0.2 (d − d'), of which the mean absolute value is 0.2/3.
+    task = materialize(SPEC)
+    for region, each in enumerate(report.observation.invariance):
+        half = np.abs(0.5 - task.optimal_action(drawn(region)[0])).mean()
+        assert each.invariance == pytest.approx(0.2 / 3 / half, rel=0.03)
+
+
+def test_distractors_outside_the_cube_leave_the_states_inside(report):
+    shown = []
+    evaluate(lambda o: shown.append(o[:, :-2]) or ignorant(o), SPEC, PROTOCOL)
+    # In WD: the states, other distractors, and distractors in each of the shells.
+    inside, other, *outside = shown[:4]
+    np.testing.assert_array_equal(inside[:, :S], other[:, :S])
+    assert (inside[:, S:] != other[:, S:]).all()
+    for x, (low, high) in zip(outside, PROTOCOL.edges[1:], strict=True):
+        np.testing.assert_array_equal(x[:, :S], inside[:, :S])
+        E = expansion(x[:, S:].astype(np.float64))
+        assert ((low < E) & (high >= E)).all()
+    names = [region.name for region in report.observation.distractor_regions]
+    assert names == ["d-OOD 1", "d-OOD 2"]
+
+
+def test_regret_with_distractors_outside_is_that_of_the_definition():
+    shown = []
+    report = evaluate(lambda o: shown.append(o) or distracted(o), SPEC, PROTOCOL)
+    optimal = materialize(SPEC).optimal_action(drawn(0)[0])
+    for o, region in zip(shown[2:4], report.observation.distractor_regions, strict=True):
+        missed = np.abs(np.clip(distracted(o), 0.0, 1.0) - optimal).mean()
+        assert region.mae == pytest.approx(missed, abs=1e-7)
+        half = np.abs(0.5 - optimal).mean()
+        assert region.normalised_regret == pytest.approx(missed / half, abs=1e-6)
+    assert evaluate(ignorant, SPEC, PROTOCOL).observation.distractor_regions[1].mae == (
+        evaluate(ignorant, SPEC, PROTOCOL).regions[0].mae
+    )
+
+
+@pytest.mark.parametrize("mixing", ["none", "orthogonal", "nonlinear"])
+def test_the_optimum_is_attainable_through_every_mixing(mixing):
+    spec = SPEC.derive(observation={"distractors": M, "mixing": mixing})
+    report = evaluate("optimal", spec, PROTOCOL)
+    assert report.regions[0].normalised_regret < 1e-5
+    assert report.observation.invariance[0].invariance < 1e-5
+    assert max(region.normalised_regret for region in report.regions) < 1e-2
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_unmixing_inverts_what_the_agent_sees(depth):
+    task = materialize(SPEC.derive(observation={"mixing": "nonlinear", "mixing_depth": depth}))
+    s = np.random.default_rng(0).random((500, S))
+    np.testing.assert_allclose(task.unmixed(task.seen(s)), s, atol=1e-9)
+    np.testing.assert_allclose(task.unmixed(task.seen(s[0])), s[0], atol=1e-9)
+
+
+def test_without_distractors_there_is_neither_invariance_nor_a_second_kind_of_ood():
+    spec = SPEC.derive(observation={"mixing": "orthogonal"})
+    report = evaluate(Perceptron([(np.ones((S + 2, A)), np.zeros(A), "identity")]), spec, PROTOCOL)
+    assert report.observation.invariance == report.observation.distractor_regions == ()
+    [probe] = report.observation.probes  # a linear map has no hidden layer
+    assert (probe.layer, probe.units, probe.distractor_r2) == (0, S, None)
+    assert probe.state_r2 == pytest.approx(1.0, abs=1e-9)
+
+
+def network(W):
+    """One hidden layer, which keeps a linear image of the observation, and an output."""
+    output = np.full((W.shape[1], A), 0.1), np.zeros(A), "identity"
+    return Perceptron([(W, np.zeros(W.shape[1]), "identity"), output])
+
+
+def test_probes_find_what_a_layer_keeps_and_what_it_drops():
+    keeps_state = np.zeros((S + M + 2, S))
+    keeps_state[:S] = np.eye(S)
+    keeps_half = np.zeros((S + M + 2, 2))
+    keeps_half[:2] = np.eye(2)
+    for W, state_r2 in ((keeps_state, 1.0), (keeps_half, 0.5)):
+        observed, hidden = evaluate(network(W), SPEC, PROTOCOL).observation.probes
+        assert (observed.layer, observed.units, hidden.layer) == (0, S + M, 1)
+        assert hidden.units == W.shape[1]
+        assert observed.state_r2 == pytest.approx(1.0, abs=1e-9)
+        assert observed.distractor_r2 == pytest.approx(1.0, abs=1e-9)
+        assert hidden.state_r2 == pytest.approx(state_r2, abs=0.01)
+        assert hidden.distractor_r2 == pytest.approx(0.0, abs=0.01)
+
+
+def test_probes_are_held_out():
+    # 60 random units explain any target in 50 states, and nothing in the other 50.
+    random = np.random.default_rng(0)
+    r2 = held_out_r2(random.normal(size=(100, 60)), random.normal(size=(100, 8)))
+    assert r2.shape == (8,)
+    assert r2.mean() < 0.1
+
+
+def test_a_nonlinear_mixing_is_what_a_linear_map_cannot_undo():
+    W = np.zeros((S + M + 2, 1))
+    [seen, _] = evaluate(network(W), MIXED, PROTOCOL).observation.probes
+    assert 0.85 < seen.state_r2 < 0.97
+    assert 0.85 < seen.distractor_r2 < 0.97
+
+
+def test_policies_of_unknown_networks_have_no_probes(report):
+    assert report.observation.probes == ()
+
+
+def test_torch_modules_and_models_have_the_probes_of_their_layers():
+    torch = pytest.importorskip("torch")
+    sb3 = pytest.importorskip("stable_baselines3")
+    gym = pytest.importorskip("gymnasium")
+
+    class Functional(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.first, self.second = torch.nn.Linear(S + M + 2, 7), torch.nn.Linear(7, 6)
+            self.mean, self.spread = torch.nn.Linear(6, A), torch.nn.Linear(6, A)
+
+        def forward(self, o):
+            h = torch.relu(self.second(torch.tanh(self.first(o))))
+            return self.mean(h) + 0.0 * self.spread(h)
+
+    torch.manual_seed(0)
+    module = Functional()
+    probes = evaluate(module, SPEC, PROTOCOL).observation.probes
+    assert [(probe.layer, probe.units) for probe in probes] == [(0, S + M), (1, 7), (2, 6)]
+    arrays = [
+        (layer.weight.T.detach().numpy(), layer.bias.detach().numpy(), activation)
+        for layer, activation in (
+            (module.first, "tanh"), (module.second, "relu"), (module.mean, "identity"),
+        )
+    ]  # fmt: skip
+    same = evaluate(Perceptron(arrays), SPEC, PROTOCOL).observation.probes
+    for one, other in zip(probes, same, strict=True):
+        assert one.state_r2 == pytest.approx(other.state_r2, abs=1e-5)
+        assert one.distractor_r2 == pytest.approx(other.distractor_r2, abs=1e-5)
+
+    class Spaces(gym.Env):
+        observation_space = gym.spaces.Box(0.0, 1.0, (SPEC.observation_dim,))
+        action_space = gym.spaces.Box(0.0, 1.0, (A,))
+
+    for algorithm, widths in (("PPO", [64, 64]), ("SAC", [256, 256]), ("TD3", [400, 300])):
+        space = {"action_space": gym.spaces.Box(-1.0, 1.0, (A,))} if algorithm != "PPO" else {}
+        env = type("Env", (Spaces,), space)()
+        model = getattr(sb3, algorithm)("MlpPolicy", env, seed=0, device="cpu")
+        probes = evaluate(model, SPEC, PROTOCOL).observation.probes
+        assert [probe.units for probe in probes] == [S + M, *widths]
+        assert all(-0.1 < probe.state_r2 <= 1.0 for probe in probes)
+
+
+def test_a_policy_for_another_width_is_refused_with_the_number_of_distractors():
+    narrow = Perceptron([(np.ones((S + 2, A)), np.zeros(A), "identity")])
+    with pytest.raises(PolicyError):
+        evaluate(narrow, SPEC, PROTOCOL)
+
+
+def test_evaluating_together_gives_the_same_reports_and_the_report_survives_its_file(
+    report, tmp_path
+):
+    pairs = [(distracted, SPEC), (lambda o: o[:, :1], SPEC), (ignorant, SPEC.derive(horizon=9))]
+    first, failed, last = evaluate_many(pairs, PROTOCOL)
+    assert first == report
+    assert isinstance(failed, PolicyError)
+    assert last.observation == evaluate(ignorant, SPEC.derive(horizon=9), PROTOCOL).observation
+    report.write(tmp_path / "evaluation.json")
+    assert EvaluationReport.read(tmp_path / "evaluation.json") == report
+
+
+def test_the_table_and_the_frame_show_distractors_and_probes():
+    pytest.importorskip("pandas")
+    W = np.eye(S + M + 2)
+    report = evaluate(network(W), SPEC, PROTOCOL, name="net")
+    text = str(report)
+    assert f"{M} distractors" in text
+    assert "invariance" in text
+    assert "R² of the distractors" in text
+    frame = report.to_frame()
+    own = frame[~frame.reference].set_index("region")
+    assert own.loc["WD", "invariance"] == report.observation.invariance[0].invariance
+    outside = report.observation.distractor_regions[1]
+    assert own.loc["d-OOD 2", "normalised_regret"] == outside.normalised_regret
+    assert (frame[frame.reference].invariance == 0.0).all()
