@@ -23,7 +23,7 @@ from sme_registry.diagnosis.document import (
 )
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, references
-from sme_registry.evaluation.regions import expansion, observations, region_name
+from sme_registry.evaluation.regions import expansion, region_name, states
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
@@ -95,8 +95,9 @@ def sample(
     region: int,
 ) -> Sample:
     """A region's states with the actions of the policy and of the references."""
-    (observation,) = observations(protocol, region, task.spec, rows=protocol.states_per_region)
-    s = observation[:, : task.spec.state_dim].astype(np.float64)
+    (drawn,) = states(protocol, region, task.spec, rows=protocol.states_per_region)
+    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
+    s = drawn.s.astype(np.float64)
     optimal = engine(task).optimal_action(s)
     random = streams.uniform(protocol.seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))

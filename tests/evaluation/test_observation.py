@@ -229,7 +229,7 @@ def test_evaluating_together_gives_the_same_reports_and_the_report_survives_its_
 ):
     pairs = [(distracted, SPEC), (lambda o: o[:, :1], SPEC), (ignorant, SPEC.derive(horizon=9))]
     first, failed, last = evaluate_many(pairs, PROTOCOL)
-    assert first == report
+    assert (first.regions, first.observation) == (report.regions, report.observation)
     assert isinstance(failed, PolicyError)
     assert last.observation == evaluate(ignorant, SPEC.derive(horizon=9), PROTOCOL).observation
     report.write(tmp_path / "evaluation.json")
