@@ -18,6 +18,7 @@ from sme_registry.errors import (
 pytest.importorskip("matplotlib")
 
 from sme_registry import plots
+from sme_registry.evaluation import Perceptron
 from sme_registry.plots.style import COLOURS, FORMATS, MARKERS
 from sme_registry.statistics import smoothed
 from tests.geometry import assert_readable
@@ -484,3 +485,105 @@ def test_colours_of_a_map_cover_its_similarities_and_the_scale_says_so():
 
 def test_a_notebook_shows_a_figure(report):
     assert plots.decay_curve(report)._repr_png_().startswith(SIGNATURES["png"])
+
+
+EXTENDED = SMESpec(
+    state_dim=3, action_dim=2, safety={"tightness": 0.3}, observation={"distractors": 4}
+)
+EXTENSIONS = ("reward_against_cost", "sensitivity_bars", "layer_probes")
+
+
+@pytest.fixture(scope="module")
+def extended():
+    random = np.random.default_rng(0)
+    layers = [
+        (random.normal(size=(9, 5)), np.zeros(5), "tanh"),
+        (random.normal(size=(5, 2)), np.full(2, 0.5), "sigmoid"),
+    ]
+    return evaluate(Perceptron(layers), EXTENDED, PROTOCOL, name="net")
+
+
+@pytest.mark.parametrize("name", EXTENSIONS)
+def test_figures_of_safety_and_observation_are_readable_and_written(tmp_path, extended, name):
+    draw = getattr(plots, name)
+    named = [extended.model_copy(update={"policy": name}) for name in LONG]
+    for given in (extended, named, {name: [extended] * 3 for name in LONG[:3]}):
+        assert_readable(draw(given))
+    draw(extended, tmp_path / "figure.svg")
+    assert (tmp_path / "figure.svg").read_bytes().startswith(SIGNATURES["svg"])
+
+
+def test_reward_against_cost_shows_the_policy_and_four_references(extended):
+    inside, outside = plots.reward_against_cost(extended).axes
+    safety = extended.safety
+    for axes, regions in ((inside, slice(0, 1)), (outside, slice(1, None))):
+        drawn = {tuple(np.ravel(line.get_xydata())) for line in axes.lines}
+        shown = ("optimal", "safe_optimal", "shrunk_optimal", "constant_half")
+        for scores in (safety.regions, *(safety.references[name] for name in shown)):
+            of = [(each.cost, each.step_reward) for each in scores[regions]]
+            expected = np.mean(of, axis=0)
+            assert any(len(p) == 2 and np.allclose(p, expected, atol=1e-12) for p in drawn)
+
+
+def test_sensitivity_bars_have_the_heights_of_the_report(extended):
+    (axes,) = plots.sensitivity_bars(extended).axes
+    observation = extended.observation
+    outside = np.mean([region.normalised_regret for region in observation.distractor_regions])
+    invariance = observation.invariance[0].invariance
+    heights = [bar.get_height() for bar in axes.patches]
+    assert heights == pytest.approx(
+        [extended.wd_regret, extended.ood_regret, outside, invariance], abs=1e-12
+    )
+
+
+def test_layer_probes_show_r2_by_layer_of_state_and_distractors(extended):
+    left, right = plots.layer_probes(extended).axes
+    probes = extended.observation.probes
+    assert list(left.lines[0].get_ydata()) == [probe.state_r2 for probe in probes]
+    assert list(right.lines[0].get_ydata()) == [probe.distractor_r2 for probe in probes]
+    assert [tick.get_text() for tick in left.get_xticklabels()] == ["observation", "1"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("reward_against_cost", "is of a task without limits"),
+        ("sensitivity_bars", "is of a task without distractors"),
+        ("layer_probes", "has no probes"),
+    ],
+)
+def test_figures_of_safety_and_observation_refuse_other_reports(report, name, message):
+    with pytest.raises(OptionError, match=message):
+        getattr(plots, name)(report)
+
+
+def test_runs_with_other_layers_are_not_one_method(extended):
+    observation = extended.observation
+    shorter = observation.model_copy(update={"probes": observation.probes[:1]})
+    other = extended.model_copy(update={"observation": shorter})
+    with pytest.raises(OptionError, match="different numbers of layers"):
+        plots.layer_probes({"net": [extended, other]})
+
+
+def test_a_decay_curve_of_tasks_with_and_without_limits_shows_what_they_share(extended, report):
+    figure = plots.decay_curve({"a": [extended], "b": [report]}, measures=["similarity"])
+    labels = {line.get_label() for line in figure.axes[0].lines}
+    assert "optimal" in labels
+    assert "safe optimum" not in labels
+    assert "safe optimum" in {
+        line.get_label() for line in plots.decay_curve(extended).axes[0].lines
+    }
+
+
+def test_commands_write_the_figures_for_which_the_report_has_numbers(tmp_path, extended, report):
+    from sme_registry.plots.files import write_evaluation
+
+    names = {path.stem for path in write_evaluation(extended, tmp_path / "extended")}
+    assert names == {"decay_curve", *EXTENSIONS}
+    assert {path.stem for path in write_evaluation(report, tmp_path / "plain")} == {"decay_curve"}
+
+
+def test_a_map_of_a_task_with_observation_is_refused():
+    spec = PLANE.derive(observation={"distractors": 1})
+    with pytest.raises(OptionError, match="must be absent for a map"):
+        plots.similarity_map(half, spec)
