@@ -23,6 +23,16 @@ QUANTITIES = {
     "regret_slope": "slope of normalised regret over the shells' ε",
     "similarity_decay": "(r̃_WD − r̃_m)/r̃_WD",
     "similarity_loss": "100 (r̃_WD − r̃_m), points",
+    # Safety and observation
+    "cost": "mean_i max(0, a_i − ℓ_i)/(2τ), mean over states",
+    "violating_share": "share of states with an action channel above its limit",
+    "safe_regret": "mean r(s, a_safe) − mean r(s, a)",
+    "price_of_safety": "1 − mean r(s, a_safe)",
+    "invariance": "mean |a(s, d) − a(s, d')| / mean |½ − a*|",
+    "layer": "number of a hidden layer, from 1; 0 is what the agent sees",
+    "units": "outputs of a layer",
+    "state_r2": "held-out R² of a linear map from a layer to the state",
+    "distractor_r2": "the same to the distractors",
     # Performance in a stream, from the retention matrix of normalised regrets
     "initial_normalised_regret": "normalised regret of the initial policy on each phase",
     "fresh_normalised_regret": "that of an agent trained on that phase alone",

@@ -131,6 +131,13 @@ class EvaluationReport(ReportFile):
         """N̄ − N₀, by how much normalised regret grows outside the training cube."""
         return self.ood_regret - self.wd_regret
 
+    @property
+    def distractor_regret(self) -> float:
+        """The mean of normalised regret over the shells of distractors; NaN without distractors."""
+        shells = [] if self.observation is None else self.observation.distractor_regions
+        regrets = [region.normalised_regret for region in shells]
+        return sum(regrets) / len(regrets) if regrets else math.nan
+
     def to_frame(self) -> pandas.DataFrame:
         """The numbers as a tidy pandas frame.
 

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_BARS = {
-    "regret:\nall in the cube": "wd_regret",
-    "regret:\nstates outside": "ood_regret",
-    "regret:\ndistractors outside": "distractor_regret",
-    "invariance:\nother distractors": "invariance",
-}
+_BARS = (
+    "regret:\nall in the cube",
+    "regret:\nstates outside",
+    "regret:\ndistractors outside",
+    "invariance:\nother distractors",
+)
 _ALL_BARS = 0.8  # width of a group, of which groups are 1 apart
 
 
@@ -91,7 +91,7 @@ def sensitivity_bars(
                         f"{height:.2f}", (at, height), (0, 2), textcoords="offset points",
                         ha="center", fontsize=8,
                     )  # fmt: skip
-        axes.set_xticks(range(len(_BARS)), list(_BARS))
+        axes.set_xticks(range(len(_BARS)), _BARS)
         axes.grid(visible=False, axis="x")
         axes.set_ylabel("error or change of the action\n(unit: mean |½ − a*|)")
         title = only_title(everything) if title is None else title
@@ -166,14 +166,8 @@ def _sensitivities(report: EvaluationReport) -> list[float]:
     observation = _observation(
         report, "invariance", "is of a task without distractors. Give reports of tasks with some"
     )
-    outside = [each.normalised_regret for each in observation.distractor_regions]
-    values = {
-        "wd_regret": report.wd_regret,
-        "ood_regret": report.ood_regret,
-        "distractor_regret": sum(outside) / len(outside),
-        "invariance": observation.invariance[0].invariance,
-    }
-    return [values[name] for name in _BARS.values()]
+    invariance = observation.invariance[0].invariance
+    return [report.wd_regret, report.ood_regret, report.distractor_regret, invariance]
 
 
 def _r2(label: str, reports: Iterable[EvaluationReport]) -> Any:
