@@ -31,8 +31,11 @@ _HELP = {  # where the field's description is too short or missing
     "hidden_width": "H, width of the inner layers of the optimal policy",
     "policy_init": "'semi_orthogonal', or 'unit_variance', which also suits layers that widen",
     "rotation": "θ, radians: how far the optimal policy is rotated away from the one of θ = 0",
-    "safety": "Limits of the actions, such as '{\"tightness\": 0.2}'",
-    "observation": 'What the agent sees, such as \'{"distractors": 32, "mixing": "nonlinear"}\'',
+    "safety": "Limits of the actions: '{\"tightness\": 0.2}'; the tightness is in (0, 0.5]",
+    "observation": "What the agent sees, such as "
+    '\'{"distractors": 32, "dynamics": "driven", "mixing": "nonlinear", "mixing_depth": 1}\'. '
+    "dynamics is noise, autonomous or driven; mixing is none, orthogonal or nonlinear; "
+    "mixing_depth is 1, 2 or 3",
     "seed": "Seed of the draw: an integer, or hexadecimal 0x… for a sealed task",
 }
 
@@ -129,6 +132,8 @@ def new(
       sme new deep.json --complexity 20 --policy-init unit_variance --seed 7
 
       sme new sparse.json --from HardDeep --k 25 --description "Paid every 25 steps."
+
+      sme new safe.json --safety '{"tightness": 0.2}' --policy-init unit_variance
 
       sme new sealed.json --seed 0x9f86d081884c7d659a2feaa0c55ad015
 
