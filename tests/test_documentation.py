@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from sme_registry.spec import EnvFile, SMESpec, SuiteFile
+from sme_registry import load
+from sme_registry.spec import EnvFile, ObservationSpec, SafetySpec, SMESpec, SuiteFile
 from sme_registry.spec.catalogue import names
+from sme_registry.task.certify import certify
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -127,6 +129,31 @@ def test_the_table_of_fields_has_every_field_and_its_default() -> None:
     assert {name: number(text) for name, text in documented.items()} == {
         name: number(text) for name, text in fields.items()
     }
+
+
+def test_the_table_of_safety_and_observation_has_every_field() -> None:
+    page = (ROOT / "docs" / "safety_and_observation.md").read_text()
+    documented = re.findall(r"^\| `((?:safety|observation)\.\w+)` \|", page, re.M)
+    kinds = {"safety": SafetySpec, "observation": ObservationSpec}
+    fields = [f"{name}.{field}" for name, kind in kinds.items() for field in kind.model_fields]
+    assert documented == fields
+
+
+def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> None:
+    from sme_registry.cli import app as sme
+
+    page = (ROOT / "docs" / "safety_and_observation.md").read_text()
+    block = page.split("## One task from spec to certificate")[1]
+    command = block.split("```")[1].replace("\\\n", "").splitlines()[1]
+    arguments = shlex.split(command)[1:]
+    arguments[1] = str(tmp_path / arguments[1])
+    assert CliRunner().invoke(sme, arguments).exit_code == 0
+    checks = {check.name: check for check in certify(load(arguments[1])).checks}
+    table = re.findall(r"^\| `(\w+)`: .* \| ([\d.]+) \|$", block, re.M)
+    assert len(table) == 6
+    for name, value in table:
+        assert checks[name].outcome == "passed"
+        assert float(value) == pytest.approx(checks[name].value, rel=0.05)
 
 
 def specs_page() -> str:
