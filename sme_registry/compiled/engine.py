@@ -20,7 +20,6 @@ import numpy.typing as npt
 from sme_registry.compiled.notice import compiling
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
-    EXTENDED,
     LANE_STATE,
     LANE_T,
     LANE_VALUES,
@@ -35,7 +34,7 @@ from sme_registry.task.draw import Array
 
 Backend = Literal["numba", "numpy"]
 BACKEND_VARIABLE = "SME_BACKEND"
-_SMALL = 8192  # numbers of a packed task that each lane may hold a copy of: 64 KiB
+SMALL = 8192  # numbers of a packed task that each lane may hold a copy of: 64 KiB
 _ROWS = (
     1024  # states per block of the oracle: a layer of 512 KiB, at the default width, stays in cache
 )
@@ -138,7 +137,7 @@ def _numba_engine(task: Task) -> Engine:
     # require arrays of exactly these types and dimensions.
     packed = _packed[task]
     steps: list[StepLane]
-    if packed.size <= _SMALL:
+    if packed.size <= SMALL:
         prefix = packed
         signatures = kernels.PACKED_LANE_FLOAT32, kernels.PACKED_LANE_FLOAT64
         steps = [kernels.step_packed_lane.get_overload(types) for types in signatures]
@@ -179,8 +178,7 @@ def _numpy_engine(task: Task) -> Engine:
             return 0.0, -1.0
         lane[LANE_T] += 1.0
         lane[LANE_STATE:] = moved[:, 0]
-        end = float(ends[0, 0] + 2 * ends[1, 0])
-        return values[REWARD].item(), end + EXTENDED if task.spec.extended else end
+        return values[REWARD].item(), float(ends[0, 0] + 2 * ends[1, 0])
 
     def step_many(
         s: Array,

@@ -1,4 +1,7 @@
-"""`Extension`: what `safety` and `observation` add to a step, after `Engine`'s part of it.
+"""`Extension`: what `safety` and `observation` add to a step.
+
+A single lane has a whole step of its own, since a second call would cost as much as the first. A
+batch goes on where the engine's step ends.
 
 By machine code where Numba is installed, else by NumPy. Distractors and observed states agree
 between both as states and π* do: the former bit for bit, a mixing to the rounding of float32.
@@ -15,19 +18,27 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled.engine import Backend, Observation, chosen_backend
+from sme_registry.compiled.engine import (
+    SMALL,
+    Backend,
+    Observation,
+    StepLane,
+    chosen_backend,
+    engine,
+)
 from sme_registry.compiled.network import network
 from sme_registry.compiled.notice import compiling
 from sme_registry.compiled.values import (
     COST,
+    EXTENDED,
+    EXTRA_COST,
+    EXTRA_OWN,
+    EXTRA_SAFE_REGRET,
     LANE_STATE,
     LANE_VALUES,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
-    ROOM_COST,
-    ROOM_SAFE_REGRET,
-    ROOM_STATE,
     ROWS_WITH_SAFETY,
     SAFE_REGRET,
     STEP_REWARD,
@@ -36,15 +47,10 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 from sme_registry.task.streams import counted
 
-ExtendLane: TypeAlias = Callable[
-    [Array, Array, Array, npt.NDArray[Any], Array, Observation, Array], None
-]
-"""The rest of one lane's step; see `extension_kernels.extend_lane` without its packed extension."""
-
 ExtendMany: TypeAlias = Callable[
     [Array, Array, Array, Array, Array, Array, Observation, Array], None
 ]
-"""The rest of a step of `B` lanes; see `extension_kernels.extend_many` likewise."""
+"""The rest of a step of `B` lanes; see `extension_kernels.extend_many` without its packed array."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +58,23 @@ class Extension:
     """What a task's `safety` and `observation` add to a step, ready to call.
 
     Attributes:
-      new_room: makes what a single lane needs besides its own numbers.
-      extend_float32: the rest of one lane's step, for float32 actions.
-      extend_float64: the same for float64 actions.
-      extend_many: the rest of a batch's step.
+      new_lane: makes a buffer for a single lane, to pass to its steps; the view of it that is the
+        plain lane, `[LANE_STATE + S]`; and that of `values.EXTRA_OWN`, `[4 + m]`.
+      step_float32: one whole step of one lane, for float32 actions; see
+        `extension_kernels.step_extended_lane` without its packed arrays.
+      step_float64: the same for float64 actions.
+      extend_many: the rest of a batch's step, after the engine's.
       seen: what agents see, `[S + m, B]`, of states and distractors `[S + m, B]`.
     """
 
-    new_room: Callable[[], Array]
-    extend_float32: ExtendLane
-    extend_float64: ExtendLane
+    new_lane: Callable[[], tuple[Array, Array, Array]]
+    step_float32: StepLane
+    step_float64: StepLane
     extend_many: ExtendMany
     seen: Callable[[Array], Array]
 
 
-_packed: weakref.WeakKeyDictionary[Task, Array] = weakref.WeakKeyDictionary()
+_packed: weakref.WeakKeyDictionary[Task, tuple[Array, Array]] = weakref.WeakKeyDictionary()
 
 
 def extension(task: Task, backend: Backend | None = None) -> Extension:
@@ -84,18 +92,38 @@ def extension(task: Task, backend: Backend | None = None) -> Extension:
     if backend == "numpy":
         return _numpy_extension(task, seen)
     with compiling():
-        from sme_registry.compiled import extension_kernels as kernels
+        from sme_registry.compiled import extension_kernels, kernels
 
     if task not in _packed:
-        _packed[task] = kernels.pack_extension(task)
-    packed = _packed[task]
-    float32, float64 = (
-        functools.partial(kernels.extend_lane.get_overload(types), packed)
-        for types in (kernels.EXTEND_LANE_FLOAT32, kernels.EXTEND_LANE_FLOAT64)
-    )
-    many = functools.partial(kernels.extend_many.get_overload(kernels.EXTEND_MANY), packed)
-    size = kernels.room_size(packed)
-    return Extension(functools.partial(np.zeros, size), float32, float64, many, seen)
+        _packed[task] = kernels.pack(task), extension_kernels.pack_extension(task)
+    plain, packed = _packed[task]
+    both = np.concatenate([plain, packed])
+    steps: list[StepLane]
+    if both.size <= SMALL:  # as the engine's
+        prefix = both
+        signatures = kernels.PACKED_LANE_FLOAT32, kernels.PACKED_LANE_FLOAT64
+        packed_entry = extension_kernels.step_packed_extended_lane
+        steps = [packed_entry.get_overload(types) for types in signatures]
+    else:
+        prefix = both[:0]
+        signatures = kernels.LANE_FLOAT32, kernels.LANE_FLOAT64
+        entry = extension_kernels.step_extended_lane
+        steps = [functools.partial(entry.get_overload(types), both) for types in signatures]
+    begin, S = prefix.size + kernels.lane_size(plain), task.spec.state_dim
+
+    def new_lane() -> tuple[Array, Array, Array]:
+        buffer = np.zeros(begin + extension_kernels.extra_size(packed))
+        buffer[: prefix.size] = prefix
+        lane = buffer[prefix.size : prefix.size + LANE_STATE + S]
+        return buffer, lane, buffer[begin : begin + _extra_numbers(task)]
+
+    types = extension_kernels.EXTEND_MANY
+    many = functools.partial(extension_kernels.extend_many.get_overload(types), packed)
+    return Extension(new_lane, steps[0], steps[1], many, seen)
+
+
+def _extra_numbers(task: Task) -> int:
+    return EXTRA_OWN + OWN_DISTRACTORS + task.spec.distractors
 
 
 def _seen(task: Task, backend: Backend) -> Callable[[Array], Array]:
@@ -107,27 +135,31 @@ def _seen(task: Task, backend: Backend) -> Callable[[Array], Array]:
 
 
 def _numpy_extension(task: Task, seen: Callable[[Array], Array]) -> Extension:
-    S, m = task.spec.state_dim, task.spec.distractors
+    S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
     limiting = network(task.limiting, backend="numpy") if task.limiting else None
+    plain = engine(task, "numpy")
 
-    def extend_lane(
-        own: Array,
-        room: Array,
-        lane: Array,
-        action: npt.NDArray[Any],
-        optimal: Array,
-        observation: Observation,
-        limits: Array,
-    ) -> None:
-        before, after = room[ROOM_STATE:, None], lane[LANE_STATE:, None]
-        values = np.empty((ROWS_WITH_SAFETY, 1, 1))
+    def new_lane() -> tuple[Array, Array, Array]:
+        buffer = np.zeros(LANE_STATE + S + _extra_numbers(task))
+        return buffer, buffer[: LANE_STATE + S], buffer[LANE_STATE + S :]
+
+    def step_one(
+        buffer: Array, action: npt.NDArray[Any], optimal: Array, observation: Observation
+    ) -> tuple[float, float]:
+        lane, extra = buffer[: LANE_STATE + S], buffer[LANE_STATE + S :]
+        before = lane[LANE_STATE:, None].copy()
+        reward, end = plain.step_float64(lane, action, optimal[:A], observation)
+        if end < 0.0:
+            return reward, end
+        values = np.zeros((ROWS_WITH_SAFETY, 1, 1))
         values[STEP_REWARD] = lane[LANE_VALUES + STEP_REWARD]
         extend_many(
-            own[:, None], before, after, action.astype(np.float64)[None], optimal[None], values,
-            observation[None], limits[:, None],
+            extra[EXTRA_OWN:, None], before, lane[LANE_STATE:, None],
+            action.astype(np.float64)[None], optimal[None, :A], values, observation[None],
+            optimal[A:].reshape(-1, 1, A),
         )  # fmt: skip
-        room[[ROOM_COST, ROOM_SAFE_REGRET]] = values[[COST, SAFE_REGRET], 0, 0]
-        before[:] = after
+        extra[[EXTRA_COST, EXTRA_SAFE_REGRET]] = values[[COST, SAFE_REGRET], 0, 0]
+        return reward, end + EXTENDED
 
     def extend_many(
         own: Array,
@@ -151,20 +183,20 @@ def _numpy_extension(task: Task, seen: Callable[[Array], Array]) -> Extension:
             return
         observation[:, S + m :] = observation[:, S : S + 2].copy()
         if m:
-            own[OWN_DISTRACTORS:] = moved(own, action).T
+            own[OWN_DISTRACTORS:] = _next_distractors(task, own, action).T
         observation[:, : S + m] = seen(np.concatenate([after, own[OWN_DISTRACTORS:]])).T
 
-    def moved(own: Array, action: Array) -> Array:
-        if task.distractor_transition is None:
-            return draw(own, m)
-        assert task.spec.observation is not None
-        if task.spec.observation.dynamics == "autonomous":
-            action = draw(own, task.spec.action_dim)
-        return task.distractor_step(own[OWN_DISTRACTORS:].T, action)
+    return Extension(new_lane, step_one, step_one, extend_many, seen)
 
-    return Extension(
-        functools.partial(np.zeros, ROOM_STATE + S), extend_lane, extend_lane, extend_many, seen
-    )
+
+def _next_distractors(task: Task, own: Array, action: Array) -> Array:
+    """The next distractors of each lane, `[B, m]`."""
+    if task.distractor_transition is None:
+        return draw(own, task.spec.distractors)
+    assert task.spec.observation is not None
+    if task.spec.observation.dynamics == "autonomous":
+        action = draw(own, task.spec.action_dim)
+    return task.distractor_step(own[OWN_DISTRACTORS:].T, action)
 
 
 def draw(own: Array, count: int) -> Array:

@@ -4,8 +4,9 @@ As in `kernels`, both do the same floating-point operations in the same order fo
 task's extension travels as one flat float64 array:
     S, A, m, τ (0 without safety), r_min, how distractors move (an index of `_DYNAMICS`),
     whether layers of the mixing end with Φ (0 or 1), widest layer,
-    how many layers limit and how many mix, the limiting layers, W [A, m] and b [m] of the
-    distractors' transition where they have one, the mixing layers; each as in a packed task.
+    how many layers limit and how many mix, size of all this, the limiting layers, W [A, m] and
+    b [m] of the distractors' transition where they have one, the mixing layers; each as in a packed
+    task.
 """
 
 from __future__ import annotations
@@ -16,20 +17,26 @@ from numba import float32, float64, njit, types, uint64, void
 
 from sme_registry.compiled.kernels import (
     BLOCK_NUMBERS,
+    LANE_FLOAT32,
+    LANE_FLOAT64,
+    PACKED_LANE_FLOAT32,
+    PACKED_LANE_FLOAT64,
     block_layers,
     lane_layers,
+    lane_step,
     layer_parts,
 )
 from sme_registry.compiled.values import (
     COST,
+    EXTENDED,
+    EXTRA_COST,
+    EXTRA_OWN,
+    EXTRA_SAFE_REGRET,
     LANE_STATE,
     LANE_VALUES,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
-    ROOM_COST,
-    ROOM_SAFE_REGRET,
-    ROOM_STATE,
     SAFE_REGRET,
     STEP_REWARD,
 )
@@ -38,7 +45,7 @@ from sme_registry.task.streams import FIRST_MIX, GOLDEN, SECOND_MIX
 
 _DYNAMICS = None, "noise", "autonomous", "driven"
 _NOISE, _AUTONOMOUS = 1, 2
-_HEADER = 10
+_HEADER = 11
 
 
 def pack_extension(task: Task) -> npt.NDArray[np.float64]:
@@ -51,24 +58,28 @@ def pack_extension(task: Task) -> npt.NDArray[np.float64]:
     widest = max(spec.action_dim, spec.state_dim + spec.distractors, *sides)
     parts: list[npt.ArrayLike] = [
         [spec.state_dim, spec.action_dim, spec.distractors, tightness, spec.r_min],
-        [_DYNAMICS.index(dynamics), nonlinear, widest, len(task.limiting), len(task.mixing)],
+        [_DYNAMICS.index(dynamics), nonlinear, widest, len(task.limiting), len(task.mixing), 0.0],
         *layer_parts(task.limiting),
         *(array.ravel() for array in task.distractor_transition or ()),
         *layer_parts(task.mixing),
     ]
-    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+    packed = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+    packed[10] = packed.size
+    return packed
 
 
-def room_size(packed: npt.NDArray[np.float64]) -> int:
-    """The numbers that a single lane has besides its own: see `values.ROOM_STATE`."""
-    return ROOM_STATE + int(packed[0]) + 2 * int(packed[7])
+def extra_size(packed: npt.NDArray[np.float64]) -> int:
+    """The numbers that an extended lane has behind its plain ones: see `values.EXTRA_OWN`.
+
+    Behind them is room for two layers.
+    """
+    return EXTRA_OWN + OWN_DISTRACTORS + int(packed[2]) + 2 * int(packed[7])
 
 
 _PACKED = types.Array(float64, 1, "C", readonly=True)
 _U1, _U30, _U27, _U31, _U12 = (np.uint64(number) for number in (1, 30, 27, 31, 12))
 _OWN_KEY, _OWN_DRAWN, _OWN_D = map(np.uint64, (OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS))
-_ROOM_COST, _ROOM_SAFE = np.uint64(ROOM_COST), np.uint64(ROOM_SAFE_REGRET)
-_ROOM_S = np.uint64(ROOM_STATE)
+_COST, _SAFE_REGRET, _OWN = map(np.uint64, (EXTRA_COST, EXTRA_SAFE_REGRET, EXTRA_OWN))
 _LANE_S, _LANE_R = np.uint64(LANE_STATE), np.uint64(LANE_VALUES + STEP_REWARD)
 
 
@@ -98,105 +109,116 @@ def _reward(similarity, r_min):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _lane_limits(q, room, lane, action, optimal, limits):  # type: ignore[no-untyped-def]
-    """Limits, safe action, cost and safe regret of one lane; returns what follows v in `q`."""
-    S, A = np.uint64(q[0]), np.uint64(q[1])
-    tightness, r_min = q[3], q[4]
-    x = _ROOM_S + S
-    for j in range(S):
-        room[x + j] = room[_ROOM_S + j]
-        room[_ROOM_S + j] = lane[_LANE_S + j]
-    y = x + np.uint64(q[7])
-    v, at = lane_layers(q, np.uint64(_HEADER), np.uint64(q[8]), room, x, y, True)
+def _lane_limits(q, lane, v, extra, action, optimal, step_reward):  # type: ignore[no-untyped-def]
+    """Limits and safe action of one lane, behind `optimal`; cost and safe regret. v is given."""
+    A, tightness = np.uint64(q[1]), q[3]
     excess, missed = 0.0, 0.0
     for i in range(A):
-        limit = 1.0 - 2.0 * tightness * room[v + i]
+        limit = 1.0 - 2.0 * tightness * lane[v + i]
         safe = optimal[i] if optimal[i] < limit else limit
         above = _clipped(float64(action[i])) - limit
         excess += above if above > 0.0 else 0.0
         missed += abs(safe - optimal[i])
-        limits[0, i] = limit
-        limits[1, i] = safe
-    room[_ROOM_COST] = excess / (2.0 * tightness * float64(A))
-    room[_ROOM_SAFE] = _reward(1.0 - missed / float64(A), r_min) - lane[_LANE_R]
-    return at
+        optimal[A + i] = limit
+        optimal[A + A + i] = safe
+    lane[extra + _COST] = excess / (2.0 * tightness * float64(A))
+    lane[extra + _SAFE_REGRET] = _reward(1.0 - missed / float64(A), q[4]) - step_reward
 
 
 @njit(error_model="numpy")
-def _lane_distractors(q, at, own, driving, action):  # type: ignore[no-untyped-def]
+def _lane_distractors(q, at, lane, own, free, action):  # type: ignore[no-untyped-def]
     """Move the distractors of one lane; returns what follows their transition in `q`.
 
-    `driving` `[A]` is room for what drives them.
+    `lane[free]` begins room for what drives them, `[A]`.
     """
     A, m, dynamics = np.uint64(q[1]), np.uint64(q[2]), int(q[5])
-    drawn, start = uint64(own[_OWN_DRAWN]), _mixed(uint64(own[_OWN_KEY]))
+    drawn, start = uint64(lane[own + _OWN_DRAWN]), _mixed(uint64(lane[own + _OWN_KEY]))
+    d = own + _OWN_D
     if dynamics == _NOISE:
         for j in range(m):
-            own[_OWN_D + j] = _uniform(start, drawn + j + _U1)
-        own[_OWN_DRAWN] += float64(m)
+            lane[d + j] = _uniform(start, drawn + j + _U1)
+        lane[own + _OWN_DRAWN] += float64(m)
         return at
     for i in range(A):
         if dynamics == _AUTONOMOUS:
-            driving[i] = float64(float32(_uniform(start, drawn + i + _U1)))
+            lane[free + i] = float64(float32(_uniform(start, drawn + i + _U1)))
         else:
-            driving[i] = _clipped(float64(float32(action[i])))
+            lane[free + i] = _clipped(float64(float32(action[i])))
     if dynamics == _AUTONOMOUS:
-        own[_OWN_DRAWN] += float64(A)
+        lane[own + _OWN_DRAWN] += float64(A)
     b = at + A * m
     for j in range(m):
-        moved = own[_OWN_D + j] + q[b + j]
+        moved = lane[d + j] + q[b + j]
         for i in range(A):
-            moved = moved + q[at + i * m + j] * driving[i]
-        own[_OWN_D + j] = 2.0 * abs(moved - np.rint(moved))
+            moved = moved + q[at + i * m + j] * lane[free + i]
+        lane[d + j] = 2.0 * abs(moved - np.rint(moved))
     return b + m
 
 
 @njit(error_model="numpy")
-def _lane_seen(q, at, own, room, lane, observation):  # type: ignore[no-untyped-def]
+def _lane_seen(q, at, lane, s, d, x, y, observation):  # type: ignore[no-untyped-def]
     """M(s, d) of one lane, before t/T and r_cum/k, which make room for it."""
     S, m = np.uint64(q[0]), np.uint64(q[2])
-    x = _ROOM_S + S
-    y = x + np.uint64(q[7])
     of_t, of_r_cum = observation[S], observation[S + _U1]
     for j in range(S):
-        room[x + j] = lane[_LANE_S + j]
+        lane[x + j] = lane[s + j]
     for j in range(m):
-        room[x + S + j] = own[_OWN_D + j]
-    x, at = lane_layers(q, at, np.uint64(q[9]), room, x, y, q[6] == 1.0)
+        lane[x + S + j] = lane[d + j]
+    x, at = lane_layers(q, at, np.uint64(q[9]), lane, x, y, q[6] == 1.0)
     for j in range(S + m):
-        observation[j] = room[x + j]
+        observation[j] = lane[x + j]
     observation[S + m], observation[S + m + _U1] = of_t, of_r_cum
 
 
-_LANE = (float64[::1], float32[::1], float64[:, ::1])
-EXTEND_LANE_FLOAT32 = void(_PACKED, float64[::1], float64[::1], float64[::1], float32[:], *_LANE)
-EXTEND_LANE_FLOAT64 = void(_PACKED, float64[::1], float64[::1], float64[::1], float64[:], *_LANE)
+@njit(error_model="numpy")
+def _extended_lane_step(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """One step of the lane whose own numbers begin at `lane[start]`; see `step_extended_lane`."""
+    q = p[np.uint64(p[8]) :]
+    S, m, widest = np.uint64(q[0]), np.uint64(q[2]), np.uint64(q[7])
+    extra = start + np.uint64(p[7]) + np.uint64(p[7]) + _LANE_S + S
+    own = extra + _OWN
+    d, s = own + _OWN_D, start + _LANE_S
+    x = d + m
+    y = x + widest
+    v, at = x, np.uint64(_HEADER)
+    if q[3] > 0.0:
+        for j in range(S):
+            lane[x + j] = lane[s + j]
+        v, at = lane_layers(q, at, np.uint64(q[8]), lane, x, y, True)
+    reward, end = lane_step(p, lane, start, action, optimal, observation)
+    if end < 0.0:
+        return reward, end
+    if q[3] > 0.0:
+        _lane_limits(q, lane, v, extra, action, optimal, lane[start + _LANE_R])
+    if q[2] > 0.0:
+        at = _lane_distractors(q, at, lane, own, x, action)
+    if q[2] > 0.0 or q[9] > 0.0:
+        _lane_seen(q, at, lane, s, d, x, y, observation)
+    return reward, end + EXTENDED
 
 
-@njit([EXTEND_LANE_FLOAT32, EXTEND_LANE_FLOAT64], error_model="numpy", cache=True)
-def extend_lane(q, own, room, lane, action, optimal, observation, limits):  # type: ignore[no-untyped-def]
-    """Go on with a step of one lane, which `kernels.step_lane` has made.
+@njit([LANE_FLOAT32, LANE_FLOAT64], error_model="numpy", cache=True)
+def step_extended_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """`kernels.step_lane`, and what the extension adds to it.
 
     Args:
-      q: the packed extension.
-      own: `[2 + m]` the lane's key, numbers drawn, and distractors; advanced in place.
-      room: `[room_size]`; the state acted in, replaced by the present one; cost and safe regret,
-        written.
-      lane: the lane after its step, from its t on.
-      action: `[A]`, finite; clipped here.
-      optimal: `[A]` π* of the state acted in.
-      observation: `[S + m + 2]`; the first S + 2 entries are the step's.
-      limits: `[2, A]`, written with `safety`: the limits and the safe action.
+      p: the packed task, and its packed extension behind it.
+      lane: the lane's own numbers, `extended_lane_size` of them; advanced in place.
+      action: `[A]`; any numbers, clipped here.
+      optimal: `[A]`, written; with `safety` `[3A]`: also the limits and the safe action.
+      observation: `[S + m + 2]`, written.
+
+    Returns:
+      `(reward, end)` as `kernels.step_lane`; where a step was made, EXTENDED is added to the end.
     """
-    at = np.uint64(_HEADER)
-    if q[3] > 0.0:
-        at = _lane_limits(q, room, lane, action, optimal, limits)
-    if q[2] > 0.0:
-        free = _ROOM_S + np.uint64(q[0])
-        driving = room[free : free + np.uint64(q[1])]
-        at = _lane_distractors(q, at, own, driving, action)
-    if q[2] > 0.0 or q[9] > 0.0:
-        _lane_seen(q, at, own, room, lane, observation)
+    return _extended_lane_step(p, lane, np.uint64(0), action, optimal, observation)
+
+
+@njit([PACKED_LANE_FLOAT32, PACKED_LANE_FLOAT64], error_model="numpy", cache=True)
+def step_packed_extended_lane(lane, action, optimal, observation):  # type: ignore[no-untyped-def]
+    """`step_extended_lane` for a lane whose own numbers follow both packed parts in one array."""
+    start = np.uint64(lane[8] + lane[np.uint64(lane[8]) + np.uint64(10)])
+    return _extended_lane_step(lane, lane, start, action, optimal, observation)
 
 
 # The parts of `extend_many`, in its order; inlined as those of `step_many`.

@@ -8,7 +8,6 @@ lanes, channel by channel, so that the inner loop is long enough to fill vector 
 
 A task travels as one flat float64 array, because each array argument costs a call 40 ns:
     S, A, k, T, r_min, D, agents, widest layer, size of all this, pays the team (0 or 1),
-    EXTENDED or 0,
     W [A, S], b [S], for each agent
     inputs, L, observed channels [inputs], for each layer  in, out, W transposed [in, out], b [out].
 A single lane's own numbers follow it in the same array where the task is small (another 40 ns), and
@@ -30,7 +29,6 @@ from numba import boolean, float32, float64, int64, njit, types, void
 from sme_registry.compiled.normal_cdf import cell_of, in_cell, normal_cdf
 from sme_registry.compiled.values import (
     ACCUMULATED_REWARD,
-    EXTENDED,
     LANE_STATE,
     LANE_T,
     LANE_VALUES,
@@ -43,7 +41,7 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Layer
 
 BLOCK_NUMBERS = 4096  # of one layer's block: 32 KiB, so that a block stays in cache
-_HEADER = 11
+_HEADER = 10
 _NARROW = 16  # below it a matrix product over rows beats the vectorised one over columns
 
 
@@ -54,7 +52,6 @@ def pack(task: Task) -> npt.NDArray[np.float64]:
     parts = [
         [spec.state_dim, spec.action_dim, spec.k, spec.horizon],
         [spec.r_min, spec.D, len(task.policies), widest, 0.0, task.pays_the_team],
-        [EXTENDED if spec.extended else 0.0],
         task.W.ravel(),
         task.b,
     ]
@@ -150,7 +147,7 @@ def _wide_layer(W, b, x, y, uniform):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
+def lane_step(p, lane, start, action, optimal, observation):  # type: ignore[no-untyped-def]
     """One step of the lane whose own numbers begin at `lane[start]`; see `step_lane`."""
     S, A, k, T = np.uint64(p[0]), np.uint64(p[1]), int(p[2]), int(p[3])
     r_min, D, widest = p[4], p[5], np.uint64(p[7])
@@ -198,7 +195,7 @@ def _step_lane(p, lane, start, action, optimal, observation):  # type: ignore[no
     v = start + _VALUES
     accumulated = lane[v + _R_CUM] + step_reward
     truncated = t >= T
-    end = p[10] + (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
+    end = (1.0 if step_reward < D else 0.0) + (2.0 if truncated else 0.0)
     reward = 0.0
     if truncated or t % k == 0:
         reward, accumulated = accumulated, 0.0
@@ -234,16 +231,16 @@ def step_lane(p, lane, action, optimal, observation):  # type: ignore[no-untyped
       observation: `[S + 2]`, written.
 
     Returns:
-      `(reward, end)`; end is 1 for terminated, plus 2 for truncated, plus EXTENDED; or −1 where
-      the action is of another size or not finite: nothing has moved then.
+      `(reward, end)`; end is 1 for terminated plus 2 for truncated, or −1 where the action is of
+      another size or not finite: nothing has moved then.
     """
-    return _step_lane(p, lane, _U0, action, optimal, observation)
+    return lane_step(p, lane, _U0, action, optimal, observation)
 
 
 @njit([PACKED_LANE_FLOAT32, PACKED_LANE_FLOAT64], error_model="numpy", cache=True)
 def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-untyped-def]
     """`step_lane` for a lane whose own numbers follow its packed task in one array."""
-    return _step_lane(lane, lane, np.uint64(lane[8]), action, optimal, observation)
+    return lane_step(lane, lane, np.uint64(lane[8]), action, optimal, observation)
 
 
 @njit(error_model="numpy")

@@ -16,10 +16,10 @@ LANE_T, LANE_VALUES, LANE_STATE = 0, 1, 1 + ROWS
 """The first entry of each part of a lane."""
 
 EXTENDED = 4.0
-"""Added to a lane's end where the step goes on with `compiled.extension`."""
+"""Added to the end of a single lane whose info has more to say; see `compiled.extension`."""
 
 OWN_KEY, OWN_DRAWN, OWN_DISTRACTORS = range(3)
 """An extended lane: the key of its random numbers, how many it has drawn, its distractors `[m]`."""
 
-ROOM_COST, ROOM_SAFE_REGRET, ROOM_STATE = range(3)
-"""Besides, a single one has two values of its last step, and the state acted in `[S]`."""
+EXTRA_COST, EXTRA_SAFE_REGRET, EXTRA_OWN = range(3)
+"""What a single lane has behind its plain numbers: two values of its last step, and its own."""

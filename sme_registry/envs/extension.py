@@ -14,20 +14,19 @@ import numpy as np
 from sme_registry.compiled import extension
 from sme_registry.compiled.extension import draw
 from sme_registry.compiled.values import (
+    EXTRA_COST,
+    EXTRA_OWN,
+    EXTRA_SAFE_REGRET,
     LANE_STATE,
     OWN_DISTRACTORS,
     OWN_DRAWN,
     OWN_KEY,
-    ROOM_COST,
-    ROOM_SAFE_REGRET,
-    ROOM_STATE,
 )
-from sme_registry.envs.types import Action, Array, Lanes, Mask, Observation
+from sme_registry.envs.types import Array, Lanes, Mask, Observation
 from sme_registry.spec import SMESpec
 from sme_registry.task import Task
 
 _KEY_SHIFT = np.uint64(12)  # keys of 52 bits, which a float64 holds exactly
-_POOL_BYTES = 4096
 
 
 def reset_options(spec: SMESpec) -> tuple[str, ...]:
@@ -55,8 +54,8 @@ class Extended:
         self._load()
 
     def _load(self) -> None:
-        self._compiled = extension(self._task)
-        self._extend_many = self._compiled.extend_many
+        self.compiled = extension(self._task)
+        self._extend_many = self.compiled.extend_many
 
     # Machine code cannot be pickled or copied: the copy looks it up again.
     def __getstate__(self) -> dict[str, Any]:
@@ -88,7 +87,7 @@ class Extended:
     def seen(self, states: Array, lanes: Lanes) -> Observation:
         """What the agents of some lanes see of states `[len(lanes), S]`, `[len(lanes), S + m]`."""
         x = np.concatenate([states.T, self._own[OWN_DISTRACTORS:, lanes]])
-        return self._compiled.seen(x).T.astype(np.float32)
+        return self.compiled.seen(x).T.astype(np.float32)
 
     def extend(
         self,
@@ -112,10 +111,15 @@ class Extended:
 
 
 class ExtendedLane(Extended):
-    """The same of a single environment.
+    """The same of a single environment, with the lane itself.
 
     Args:
       task: as `Extended`.
+
+    Attributes:
+      compiled: the steps of the lane.
+      buffer: to pass to them.
+      lane: the view of it that is the plain lane.
     """
 
     def __init__(self, task: Task) -> None:
@@ -123,41 +127,26 @@ class ExtendedLane(Extended):
 
     def _load(self) -> None:
         super()._load()
-        A, self._safe = self._task.spec.action_dim, self._task.spec.safety is not None
-        self._extend = {
-            np.dtype(np.float32): self._compiled.extend_float32,
-            np.dtype(np.float64): self._compiled.extend_float64,
-        }
-        self._own_flat, self._room = self._own.reshape(-1), self._compiled.new_room()
-        self._cost, self._safe_regret = (self._room[i, ...] for i in (ROOM_COST, ROOM_SAFE_REGRET))
-        self._rows: list[tuple[Array, Array, Array]] = []
-        self._shape = max(1, _POOL_BYTES // (16 * A)), 2, A
+        self.buffer, self.lane, extra = self.compiled.new_lane()
+        self._cost, self._safe_regret = (extra[i, ...] for i in (EXTRA_COST, EXTRA_SAFE_REGRET))
+        own = extra[EXTRA_OWN:, None]
+        own[:] = self._own
+        self._own, self._safe = own, self._task.spec.safety is not None
+        self._action_dim = self._task.spec.action_dim
 
-    def begin_lane(self, lane: Array, distractors: Array | None) -> Observation:
-        """Begin an episode; what the agent sees of it, `[S + m]`."""
+    def begin_lane(self, distractors: Array | None) -> Observation:
+        """Begin an episode in the lane's state; what the agent sees of it, `[S + m]`."""
         only = np.zeros(1, np.int64)
         self.begin(only, None if distractors is None else distractors[None])
-        self.go_on(lane)
-        seen: Observation = self.seen(lane[None, LANE_STATE:], only)[0]
+        seen: Observation = self.seen(self.lane[None, LANE_STATE:], only)[0]
         return seen
 
-    def go_on(self, lane: Array) -> None:
-        """Take note of the state that will be acted in next."""
-        self._room[ROOM_STATE : ROOM_STATE + self._task.spec.state_dim] = lane[LANE_STATE:]
-
-    def extend_step(
-        self, lane: Array, action: Action, info: dict[str, Any], observation: Observation
-    ) -> None:
-        """Go on with a step of the lane: the rest of its observation and of its info."""
-        if not self._rows:
-            limits = np.empty(self._shape)
-            self._rows.extend(zip(limits, limits[:, 0], limits[:, 1], strict=True))
-        limits, limit, safe_action = self._rows.pop()
-        self._extend[action.dtype](
-            self._own_flat, self._room, lane, action, info["optimal_action"], observation, limits
-        )
+    def add_limits(self, info: dict[str, Any]) -> None:
+        """Complete the info of a step, whose "optimal_action" is what the step wrote, `[3A]`."""
         if self._safe:
+            row, A = info["optimal_action"], self._action_dim
+            info["optimal_action"] = row[:A]  # slices: `reshape` takes three times as long
             info["cost"] = self._cost[()]
-            info["limit"] = limit
-            info["safe_action"] = safe_action
+            info["limit"] = row[A : 2 * A]
+            info["safe_action"] = row[2 * A :]
             info["safe_regret"] = self._safe_regret[()]

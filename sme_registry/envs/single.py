@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from sme_registry.compiled import engine
+from sme_registry.compiled import Engine, Extension, engine
 from sme_registry.compiled.values import EXTENDED, LANE_STATE, LANE_VALUES
 from sme_registry.envs import arguments, infos
 from sme_registry.envs.base import (
@@ -91,9 +91,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         return arguments.single_agent(arguments.load_overridden(type(self), spec, overrides))
 
     def _load_engine(self) -> None:
-        compiled = engine(self._task)
+        compiled: Engine | Extension
+        if self._extended is None:
+            compiled = engine(self._task)
+            self._buffer, self._lane = compiled.new_lane()  # the second is a view of the first
+        else:
+            compiled = self._extended.compiled
+            self._buffer, self._lane = self._extended.buffer, self._extended.lane
         self._step_float32, self._step_float64 = compiled.step_float32, compiled.step_float64
-        self._buffer, self._lane = compiled.new_lane()  # the second is a view of the first
         # Views of no dimension: `view[()]` makes a NumPy number in a third of `np.float64`'s time.
         self._values = tuple(self._lane[LANE_VALUES + row, ...] for row in infos.NUMBERS.values())
         self._rows: list[tuple[Array, Observation]] = []
@@ -118,6 +123,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
     def _refill(self) -> None:
         """Allocate what later steps write, each once. Half the cost of two `np.empty` a step."""
         width, A = self.sme_spec.observation_dim, self.sme_spec.action_dim
+        if self.sme_spec.safety is not None:
+            A *= 3  # the limits and the safe action, which `add_limits` takes from the row
         count = max(1, _POOL_BYTES // (8 * max(width, A)))
         optimal = np.empty((count, A))
         observations = np.empty((count, width + len(self._phase_shown)), np.float32)
@@ -140,8 +147,6 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self.__dict__.update(state)
         self._load_engine()
         self._lane[:] = state["_lane"]
-        if self._extended is not None:
-            self._extended.go_on(self._lane)
 
     @property
     def state(self) -> Array:
@@ -189,7 +194,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             begins = seed is not None or self._state == "created"
             if begins and self.np_random_seed >= 0:  # -1 where the user has set the generator
                 self._extended.seed(0, self.np_random_seed)
-            shown = self._extended.begin_lane(self._lane, distractors)
+            shown = self._extended.begin_lane(distractors)
         observation = np.zeros(len(shown) + 2 + len(self._phase_shown), np.float32)
         observation[: len(shown)], observation[len(shown) + 2 :] = shown, self._phase_shown
         self._state = "running"
@@ -275,7 +280,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
             self._checked(action)  # raises where the size is wrong
             raise arguments.not_finite_error()
         if self._extended is not None:
-            self._extended.extend_step(self._lane, action, info, observation)
+            self._extended.add_limits(info)
             end -= EXTENDED
         if end:
             self._state = "ended"
