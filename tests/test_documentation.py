@@ -143,7 +143,7 @@ def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> No
     from sme_registry.cli import app as sme
 
     page = (ROOT / "docs" / "safety_and_observation.md").read_text()
-    block = page.split("## One task from spec to certificate")[1]
+    block = page.split("## One task from spec to agent")[1]
     command = block.split("```")[1].replace("\\\n", "").splitlines()[1]
     arguments = shlex.split(command)[1:]
     arguments[1] = str(tmp_path / arguments[1])

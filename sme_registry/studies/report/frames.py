@@ -48,6 +48,15 @@ for each agent, NaN for tasks without it:
     results: normalised_regret/<agent>                                    of the region
              wd_regret/<agent>, ood_regret/<agent>, online_regret/<agent> of the run
     curves:  regret/<agent>                                               of the evaluation
+
+Where the plan has tasks with safety or with observation, `results` has these columns of them, NaN
+or NA for the other tasks:
+
+    tightness                                             of the task's limits, τ
+    cost, violating_share, safe_regret, price_of_safety   of the region
+    distractors, dynamics, mixing, mixing_depth           fields of the task's observation
+    distractor_regret                                     of the run: mean over the shells of d
+    invariance                                            of the region
 """
 
 from __future__ import annotations
@@ -76,6 +85,14 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     hidden_width:int64 policy_init:str rotation spec_seed:str spec_digest:str seed:int64 nu
     transitions:Int64 dataset_digest:string behaviour_similarity behaviour_similarity_sd
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
+# Columns of a run, and of its regions, where the plan has tasks with these fields.
+_EXTENSIONS = {
+    "safety": ("tightness", "cost violating_share safe_regret price_of_safety"),
+    "observation": (
+        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 distractor_regret",
+        "invariance",
+    ),
+}
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
 AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
@@ -150,15 +167,23 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
     agents = list(dict.fromkeys(name for *_, report in finished for name in report.agents))
     by_agent = " ".join(f" {column}/{name}" for column in AGENT_COLUMNS for name in agents)
     regrets = " ".join(f" regret/{name}" for name in agents)
+    extensions = "".join(
+        f" {of_run} {of_region}"
+        for field, (of_run, of_region) in _EXTENSIONS.items()
+        if any(getattr(each.setting, field) is not None for each in plan.classes)
+    )
     return StudyFrames(
-        frame(rows, RUN_COLUMNS + _REGION + _RUN + by_agent), frame(evaluations, CURVES + regrets)
+        frame(rows, RUN_COLUMNS + _REGION + _RUN + extensions + by_agent),
+        frame(evaluations, CURVES + regrets),
     )
 
 
 def runs(results: pd.DataFrame) -> pd.DataFrame:
     """One row per run: `results` without the columns of its regions."""
     by_agent = [name for name in results.columns if name.startswith(_RUN_OF_AGENT)]
-    columns = [*RUN, *_dtypes(_RUN), *by_agent]
+    extensions = _dtypes(" ".join(of_run for of_run, _ in _EXTENSIONS.values()))
+    present = [name for name in extensions if name in results.columns]
+    columns = [*RUN, *_dtypes(_RUN), *present, *by_agent]
     return results.drop_duplicates(RUN)[columns].reset_index(drop=True)
 
 
@@ -201,10 +226,20 @@ def _result_rows(
             **run,
             **agents,
             **region.model_dump(exclude={"name", "channels"}),
+            **_extensions_of_region(report, index),
             **regrets,
             "region": region.name,
             "constant_similarity": references["constant_half"][index].similarity,
         }
+
+
+def _extensions_of_region(report: EvaluationReport, index: int) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    if report.safety is not None:
+        columns |= report.safety.regions[index].model_dump(exclude={"name", "step_reward"})
+    if report.observation is not None and report.observation.invariance:
+        columns["invariance"] = report.observation.invariance[index].invariance
+    return columns
 
 
 def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
@@ -232,7 +267,7 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
         **{
             name: value
             for name, value in cell.spec.every_field().items()
-            if name not in ("schema_version", "seed", "team")
+            if name not in ("schema_version", "seed", "team", *_EXTENSIONS)
         },
         **{name: getattr(report, name) for name in ("wd_regret", "ood_regret", "ood_decay")},
         **{name: getattr(cell, name) for name in ("uses", "action_range", "steps", "seed")},
@@ -244,6 +279,11 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
         "steps_per_second": result.timing.steps_per_second,
         "key": result.key,
     }
+    for field in ("safety", "observation"):
+        block = getattr(cell.spec, field)
+        columns |= {} if block is None else block.to_dict()
+    if report.observation is not None:
+        columns["distractor_regret"] = report.distractor_regret
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {

@@ -13,8 +13,11 @@ import pytest
 
 from sme_registry import studies
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport
+from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report import frames
+from tests.studies.cells import small_file
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +83,57 @@ def test_a_study_without_results_has_the_same_columns(
     for empty, full in zip(studies.load(tmp_path), loaded, strict=True):
         assert len(empty) == 0
         pd.testing.assert_series_equal(empty.dtypes, full.dtypes)
+
+
+EXTENDED = {
+    "plain": {},
+    "safe": {"safety": {"tightness": 0.4}},
+    "driven": {"observation": {"distractors": 3, "dynamics": "driven"}},
+    "mixed": {"observation": {"mixing": "nonlinear"}},
+}
+
+
+def frames_of(*names: str) -> tuple[studies.StudyFrames, dict[str, EvaluationReport]]:
+    """The frames of these classes under one reference, and the report of each class."""
+    small = {"state_dim": 2, "action_dim": 2}
+    classes = [{"name": n, "setting": small | EXTENDED[n], "seeds": [1]} for n in names]
+    plan = small_file(seeds=1, algorithms=["linear_least_squares"], classes=classes).plan
+    results = {cell.cell.digest: run_cell(cell.cell) for cell in plan.cells}
+    reports = {cell.class_name: results[cell.cell.digest].report for cell in plan.cells}
+    assert all(reports.values())
+    return frames.study_frames(plan, results), reports  # type: ignore[return-value]
+
+
+def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
+    (results, _), reports = frames_of(*EXTENDED)
+    of_class = {name: rows.reset_index() for name, rows in results.groupby("class_name")}
+    safety = reports["safe"].safety
+    assert safety is not None
+    for name in ("cost", "violating_share", "safe_regret", "price_of_safety"):
+        assert list(of_class["safe"][name]) == [getattr(each, name) for each in safety.regions]
+    assert of_class["safe"].cost.iloc[0] > 0
+    observation = reports["driven"].observation
+    assert observation is not None
+    assert list(of_class["driven"].invariance) == [e.invariance for e in observation.invariance]
+    assert of_class["driven"].distractor_regret[0] == reports["driven"].distractor_regret
+    run = frames.runs(results).set_index("class_name")
+    assert run.tightness.dropna().to_dict() == {"safe": 0.4}
+    assert run.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
+    assert run.dynamics.dropna().to_dict() == {"driven": "driven"}
+    assert run.mixing.dropna().to_dict() == {"driven": "none", "mixed": "nonlinear"}
+    assert run.mixing_depth.dropna().to_dict() == {"mixed": 1}
+    assert run.distractor_regret.dropna().index.to_list() == ["driven"]
+    documented = set(re.findall(r"\w+", str(frames.__doc__)))
+    assert not set(results) - documented
+
+
+def test_plans_without_limits_and_observations_have_no_such_columns() -> None:
+    plain, safe, driven = (set(frames_of(name)[0].results) for name in ("plain", "safe", "driven"))
+    limits = {"tightness", "cost", "violating_share", "safe_regret", "price_of_safety"}
+    assert safe - plain == limits
+    fields = {"distractors", "dynamics", "mixing", "mixing_depth"}
+    assert driven - plain == fields | {"distractor_regret", "invariance"}
+    assert plain <= safe & driven
 
 
 def test_the_documentation_names_every_column(loaded: studies.StudyFrames) -> None:
