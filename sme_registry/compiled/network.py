@@ -43,7 +43,8 @@ def network(
 
     def compiled(x: Array) -> Array:
         out = np.empty((len(layers[-1].b), x.shape[1]))
-        run(packed, np.ascontiguousarray(x), uniform, out)  # another layout would be misread
+        if out.size:  # the compiled loop goes by blocks of lanes, of which there must be one
+            run(packed, np.ascontiguousarray(x), uniform, out)  # another layout would be misread
         return out
 
     return compiled

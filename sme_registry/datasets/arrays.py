@@ -2,7 +2,8 @@
 
 Row i is (s, a, R, s'): observation, action, reward and next observation, with the exact values that
 only an SME provides: π*(s), r̃, r and the regret 1 − r. `N` transitions, `S` state_dim, `A`
-action_dim, `n` agents (1 without a team), `O` = S + 1 + n entries of an observation.
+action_dim, `n` agents (1 without a team), `m` distractors (0 without `observation`), `O` = S + m +
+1 + n entries of an observation.
 
 Rows of one trajectory are contiguous and in order. All arrays have the same number of rows, so
 observations and actions cannot be misaligned.
@@ -31,6 +32,7 @@ class Transitions:
 
     Attributes:
       observations: `[N, O]` float32 in [0, 1]: s, t/T, and each agent's r_cum/k, before the step.
+        With `observation` what the agent saw, M(s, d) `[S + m]`, in place of s.
       actions: `[N, A]` float32 in [0, 1], as the environment executed them.
       rewards: `[N]` float64 in [0, k], R; of a team the mean over its agents.
       next_observations: `[N, O]` float32, after the step; also at the end of a trajectory.
@@ -46,6 +48,13 @@ class Transitions:
       episodes: `[N]` int64, index of the row's trajectory, from 0; non-decreasing.
       components: `[N]` int64, index of the recipe's behaviour policy that acted.
       agent_rewards: `[N, n]` float64, R of each agent of a team; None for a single agent.
+      costs: `[N]` float64 in [0, 1], the cost of the action; this and the next three are None
+        without `safety`.
+      limits: `[N, A]` float64 in [0, 1], ℓ(s).
+      safe_actions: `[N, A]` float64 in [0, 1], min(π*(s), ℓ(s)).
+      safe_regrets: `[N]` float64 in [−1, 1], the step reward of the safe action minus r.
+      distractors: `[N, m]` float64 in [0, 1], before the step; both are None without distractors.
+      next_distractors: `[N, m]` float64.
     """
 
     observations: Observation
@@ -63,13 +72,19 @@ class Transitions:
     episodes: Indices
     components: Indices
     agent_rewards: Array | None = None
+    costs: Array | None = None
+    limits: Array | None = None
+    safe_actions: Array | None = None
+    safe_regrets: Array | None = None
+    distractors: Array | None = None
+    next_distractors: Array | None = None
 
     def __len__(self) -> int:
         """N, the number of transitions."""
         return len(self.rewards)
 
     def columns(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays by name, in the order of this class; without `agent_rewards` if it is None."""
+        """The arrays by name, in the order of this class, without those that are None."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: array for name, array in named.items() if array is not None}
 

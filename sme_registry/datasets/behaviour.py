@@ -45,7 +45,8 @@ class OptimalPolicy:
     """π* as a function from states `[B, S]` to `[B, A]`, with the same bits in any batch."""
 
     def __init__(self, task: Task, lanes: int) -> None:
-        self._batch = Batch(task, lanes, reuse=True)
+        plain = replace(task, spec=task.spec.derive(safety=None, observation=None))
+        self._batch = Batch(plain, lanes, reuse=True)  # neither changes π*, and both take time
         self._lanes = np.arange(lanes)
         self._observation = self._batch.observe()
         self._no_action = np.zeros((lanes, task.spec.action_dim))
@@ -96,7 +97,7 @@ class BehaviourPolicy:
     """A policy that acts in all lanes.
 
     Attributes:
-      act: actions `[B, A]` for states `[B, S]` and joint observations `[B, S + 1 + n]`.
+      act: actions `[B, A]` for states `[B, S]` and joint observations `[B, O]`.
       stream: the random numbers that it uses; None if it is deterministic.
     """
 

@@ -3,7 +3,7 @@
 Episode e of a behaviour does not depend on what runs next to it: its start, each α and its actions
 come from its own part of named streams, and lanes are bit-equal to single environments. So the
 number of lanes changes the time and not the numbers. A data set is the first N rows of episodes
-0, 1, 2, …. `B` lanes, `S` state_dim, `A` action_dim, `n` agents, T horizon.
+0, 1, 2, …. `B` lanes, `S` state_dim, `A` action_dim, `n` agents, `m` distractors, T horizon.
 """
 
 from __future__ import annotations
@@ -16,6 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.values import (
+    COST,
+    REGRET,
+    REWARD,
+    SAFE_REGRET,
+    SIMILARITY,
+    STEP_REWARD,
+)
 from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.behaviour import BehaviourPolicy, EpisodeStream, behaviour_policy
 from sme_registry.datasets.recipe import DatasetRecipe
@@ -23,6 +31,7 @@ from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.regions import expansion
+from sme_registry.spec import SMESpec
 from sme_registry.task import Task
 from sme_registry.task.memory import refuse_above_limit
 
@@ -39,11 +48,14 @@ class Rows(NamedTuple):
     t: npt.NDArray[np.int64]  # `[M]` steps of the episode before this one
     state: Array  # `[M, S]`
     next_state: Array
-    observation: Observation  # `[M, S + 1 + n]`
+    observation: Observation  # `[M, S + m + 1 + n]`
     next_observation: Observation
     action: npt.NDArray[np.float32]  # `[M, A]`
     optimal: Array  # `[M, A]`
-    values: Array  # `[M, 4, n]` similarity, step reward, regret, reward
+    values: Array  # `[M, 5, n]` the rows of `compiled.values`; with `safety` 7
+    limits: Array  # `[M, 2, A]` the limits and the safe action; without `safety` `[M, 2, 0]`
+    distractors: Array  # `[M, m]`
+    next_distractors: Array
     terminated: Mask  # `[M]` as the task ends episodes
     truncated: Mask
 
@@ -74,10 +86,15 @@ def collect(
       PolicyError, MissingDependencyError: a policy cannot be used.
     """
     spec = recipe.spec
-    S, A, n = spec.state_dim, spec.action_dim, len(task.policies)
+    S, A, n, m = spec.state_dim, spec.action_dim, len(task.policies), spec.distractors
+    row = 24 * (S + m) + 12 * A + 48 * n + 64
+    if spec.safety is not None:
+        row += 16 * A + 16
+    with_distractors = f", {m} distractors" if m else ""
     refuse_above_limit(
-        3 * recipe.transitions * (24 * S + 12 * A + 48 * n + 64),
-        f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}",
+        3 * recipe.transitions * row,
+        f"transitions={recipe.transitions}: a data set of state_dim={S}, action_dim={A}"
+        f"{with_distractors}",
         "Collect fewer, or several data sets with different seeds.",
     )
     kept_share = max(1e-300, (1.0 + (recipe.coverage or 0.0)) ** S)  # of uniform states
@@ -98,13 +115,14 @@ def collect(
         steps = play(task, policy, starts, num_lanes)
         parts.append(_first_rows(steps, recipe, share, max(10**6, 20 * expected), report))
         done += share
-    return _concatenate(parts, spec.team is not None)
+    return _concatenate(parts, spec)
 
 
 def play(task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int) -> Iterator[Rows]:
     """Play episodes 0, 1, 2, … without end, each in the first lane that is free.
 
-    The first numbers of an episode in `starts` are its initial state.
+    The first numbers of an episode in `starts` are its initial state, which determines its
+    distractors, too.
 
     Yields:
       A step of all lanes; the arrays are valid until the next one.
@@ -122,14 +140,17 @@ def play(task: Task, policy: BehaviourPolicy, starts: EpisodeStream, lanes: int)
             starts.begin(lane, number)
             policy.begin(lane, number)
         t[ended] = 0
-        batch.begin(ended, observation, starts.next(ended))
-        s = batch.state
+        initial = starts.next(ended)
+        batch.seed_by_states(ended, initial)
+        batch.begin(ended, observation, initial)
+        s, distractors = batch.state, batch.distractors
         # The environment executes exactly what the data set stores: float32 in the unit range.
         action = np.clip(policy.act(s, observation), 0.0, 1.0).astype(np.float32)
         step = batch.advance(action.astype(np.float64))
         yield Rows(
             episode, t, s, batch.state, observation, step.observation, action, step.optimal,
-            step.values[:4].transpose(2, 0, 1), step.terminated, step.truncated,
+            step.values.transpose(2, 0, 1), step.limits.transpose(1, 0, 2), distractors,
+            batch.distractors, step.terminated, step.truncated,
         )  # fmt: skip
         t += 1
         observation = step.observation
@@ -202,7 +223,7 @@ class _Collected:
         )
 
 
-def _concatenate(parts: list[Rows], team: bool) -> Transitions:
+def _concatenate(parts: list[Rows], spec: SMESpec) -> Transitions:
     """The rows of all behaviours as one data set, its trajectories numbered from 0."""
     rows = Rows._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
     component = np.repeat(np.arange(len(parts)), [len(part.t) for part in parts])
@@ -213,11 +234,21 @@ def _concatenate(parts: list[Rows], team: bool) -> Transitions:
         | (rows.episode[1:] != rows.episode[:-1])
         | (rows.t[1:] != rows.t[:-1] + 1)
     )
-    similarity, step_reward, regret, reward = np.moveaxis(rows.values, 1, 0)
+    team = spec.team is not None
 
-    def by_agent(values: Array) -> Array:
+    def of_row(row: int) -> Array:
+        values = rows.values[:, row]
         return values.copy() if team else values[:, 0].copy()
 
+    reward = rows.values[:, REWARD]
+    extension: dict[str, Array] = {}
+    if spec.safety is not None:
+        limits, safe_actions = np.moveaxis(rows.limits, 1, 0)
+        extension |= {"costs": of_row(COST), "safe_regrets": of_row(SAFE_REGRET)}
+        extension |= {"limits": limits.copy(), "safe_actions": safe_actions.copy()}
+    if spec.distractors:
+        extension["distractors"] = rows.distractors
+        extension["next_distractors"] = rows.next_distractors
     return Transitions(
         observations=rows.observation,
         actions=rows.action,
@@ -226,12 +257,13 @@ def _concatenate(parts: list[Rows], team: bool) -> Transitions:
         terminations=rows.terminated,
         timeouts=ends & ~rows.terminated,
         optimal_actions=rows.optimal,
-        regrets=by_agent(regret),
-        similarities=by_agent(similarity),
-        step_rewards=by_agent(step_reward),
+        regrets=of_row(REGRET),
+        similarities=of_row(SIMILARITY),
+        step_rewards=of_row(STEP_REWARD),
         states=rows.state,
         next_states=rows.next_state,
         episodes=np.concatenate([[0], np.cumsum(ends)[:-1]]).astype(np.int64),
         components=component.astype(np.int64),
         agent_rewards=reward.copy() if team else None,
+        **extension,
     )

@@ -1,8 +1,9 @@
 """Minari's HDF5 layout of a data set: its arrays as a file, and the file's metadata.
 
-An episode of T steps holds `observations` `[T + 1, O]` and `infos/state` `[T + 1, S]`, whose last
-rows follow the last step. Minari requires length T + 1 for every info: the last row of the others
-repeats the row before it and has no meaning.
+An episode of T steps holds `observations` `[T + 1, O]`, `infos/state` `[T + 1, S]` and, where the
+task has distractors, `infos/distractors` `[T + 1, m]`, whose last rows follow the last step. Minari
+requires length T + 1 for every info: the last row of the others repeats the row before it and has
+no meaning.
 
 Minari writes resizable HDF5 datasets, which take several times the space if episodes are short.
 These are of fixed size, so Minari cannot append steps to an existing episode.
@@ -21,6 +22,7 @@ from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.record import KEY, DatasetRecord
 from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
+from sme_registry.spec import SMESpec
 from sme_registry.task.draw import agents
 
 DATA, METADATA, NAMESPACE_METADATA = "main_data.hdf5", "metadata.json", "namespace_metadata.json"
@@ -29,8 +31,26 @@ _INFOS = {
     "similarity": "similarities",
     "step_reward": "step_rewards",
     "regret": "regrets",
-    "agent_reward": "agent_rewards",
 }
+_TEAM_INFOS = {"agent_reward": "agent_rewards"}
+_SAFETY_INFOS = {
+    "cost": "costs",
+    "limit": "limits",
+    "safe_action": "safe_actions",
+    "safe_regret": "safe_regrets",
+}
+
+
+def _infos(spec: SMESpec) -> dict[str, str]:
+    """The infos of a task's data sets that are about a step, and the columns that they hold."""
+    team = {} if spec.team is None else _TEAM_INFOS
+    return _INFOS | team | ({} if spec.safety is None else _SAFETY_INFOS)
+
+
+def _position_infos(spec: SMESpec) -> dict[str, tuple[str, str]]:
+    """Those that are about where a step begins and ends, and their two columns."""
+    distractors = {"distractors": ("distractors", "next_distractors")} if spec.distractors else {}
+    return {"state": ("states", "next_states"), **distractors}
 
 
 def require_minari() -> None:
@@ -52,7 +72,7 @@ def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> 
     from minari.serialization import serialize_space
 
     recipe, scores = record.recipe, record.scores
-    observation_dim = recipe.spec.state_dim + 1 + len(agents(recipe.spec))
+    observation_dim = recipe.spec.observation_dim - 1 + len(agents(recipe.spec))
     observation_space, action_space = (
         gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         for width in (observation_dim, recipe.spec.action_dim)
@@ -111,11 +131,11 @@ def to_hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:
         )
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(array))
 
-    columns = transitions.columns()
-    infos = {info: columns[name] for info, name in _INFOS.items() if name in columns}
+    columns, spec = transitions.columns(), record.recipe.spec
+    infos = {info: columns[name] for info, name in _infos(spec).items()}
     observations, next_observations = transitions.observations, transitions.next_observations
     # The task also truncates at its horizon when the same step terminates the episode.
-    at_horizon = next_observations[:, record.recipe.spec.state_dim] == 1.0
+    at_horizon = next_observations[:, spec.observation_dim - 2] == 1.0
     truncations = transitions.timeouts | at_horizon
     with h5py.File("memory", "w", driver="core", backing_store=False, block_size=2**22) as file:
         first = 0
@@ -132,8 +152,8 @@ def to_hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:
             put(episode.id, "terminations", transitions.terminations[rows])
             put(episode.id, "truncations", truncations[rows])
             group = episode.create_group("infos").id
-            states = np.concatenate([transitions.states[rows], transitions.next_states[last]])
-            put(group, "state", states)
+            for info, (before, after) in _position_infos(spec).items():
+                put(group, info, np.concatenate([columns[before][rows], columns[after][last]]))
             for info, column in infos.items():
                 put(group, info, np.concatenate([column[rows], column[last]]))
             first = end
@@ -149,7 +169,7 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
     """
     import h5py
 
-    team = record.recipe.spec.team is not None
+    spec = record.recipe.spec
     parts: dict[str, list[npt.NDArray[Any]]] = {}
 
     def get(group: Any, name: str) -> npt.NDArray[Any]:
@@ -178,9 +198,9 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
                 components=np.full(len(terminations), episode.attrs["behaviour"], np.int64),
             )
             infos = h5py.h5g.open(episode.id, b"infos")
-            states = get(infos, "state")
-            add(states=states[:-1], next_states=states[1:])
-            for info, name in _INFOS.items():
-                if team or info != "agent_reward":
-                    add(**{name: get(infos, info)[:-1]})
+            for info, (before, after) in _position_infos(spec).items():
+                positions = get(infos, info)
+                add(**{before: positions[:-1], after: positions[1:]})
+            for info, name in _infos(spec).items():
+                add(**{name: get(infos, info)[:-1]})
     return Transitions(**{name: np.concatenate(arrays) for name, arrays in parts.items()})

@@ -1,7 +1,9 @@
 """`replay`: check every transition of a data set against its task, from the definition.
 
-The next state must agree to the bit; π*, r̃, r and the reward to 1e-12; and the rows of a trajectory
-must follow one another.
+The next state must agree to the bit; π*, r̃, r, the reward, limits and costs to 1e-12; what an agent
+sees through a mixing to 1e-6, as float32; and the rows of a trajectory must follow one another.
+Driven distractors must agree to the bit. Others must lie in the cube: the random numbers that move
+them are not in the data set.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
 TOLERANCE = 1e-12
-_ROUNDED = 1e-6  # of r_cum/k of a trajectory that begins within an episode: stored as float32
+# Of r_cum/k of a trajectory that begins within an episode, and of what a mixing shows: both are
+# stored as float32.
+_ROUNDED = 1e-6
 _BLOCK = 4096
 
 
@@ -49,20 +53,28 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
     terminated = np.asarray((step_reward < spec.D).any(axis=1))
     _same("terminations", transitions.terminations, terminated)
 
-    t = np.rint(transitions.observations[:, S].astype(np.float64) * T).astype(np.int64)
-    for name, seen, s, step in (
-        ("observations", transitions.observations, transitions.states, t),
-        ("next_observations", transitions.next_observations, transitions.next_states, t + 1),
-    ):
-        inputs = np.column_stack([s, step / T]).astype(np.float32)
-        _same(name, seen[:, : S + 1], inputs)
+    if spec.safety is not None:
+        _replay_safety(transitions, task, a, optimal, step_reward[:, 0])
+    if spec.distractors:
+        _replay_distractors(transitions, task, a)
+
+    width, rounded = S + spec.distractors, _ROUNDED if task.mixing else 0.0
+    t = np.rint(transitions.observations[:, width].astype(np.float64) * T).astype(np.int64)
+    columns = transitions.columns()
+    for which, step in (("", t), ("next_", t + 1)):
+        name = f"{which}observations"
+        shown = task.seen(columns[f"{which}states"], columns.get(f"{which}distractors"))
+        _same(name, columns[name][:, :width], shown.astype(np.float32), rounded)
+        _same(name, columns[name][:, width], (step / T).astype(np.float32))
 
     ends = transitions.terminations | transitions.timeouts
     inner = np.flatnonzero(~ends)
     if not ends[-1]:
         raise _mismatch("timeouts", N - 1, "the last row must end its trajectory")
-    for before, after in (("next_states", "states"), ("next_observations", "observations")):
-        _same(before, getattr(transitions, before)[inner], getattr(transitions, after)[inner + 1])
+    for after in ("states", "observations", "distractors"):
+        if after in columns:
+            before = f"next_{after}"
+            _same(before, columns[before][inner], columns[after][inner + 1])
     _same("timeouts", ends | (t + 1 < T), np.ones(N, bool))
     _same("episodes", transitions.episodes, np.cumsum(ends) - ends)
     if recipe.coverage is not None:
@@ -76,14 +88,39 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
     _same("rewards", rewards, expected, tolerance)
 
 
+def _replay_safety(
+    transitions: Transitions, task: Task, a: Array, optimal: Array, step_reward: Array
+) -> None:
+    """Check the limits, safe actions, costs and safe regrets of a task with `safety`."""
+    columns = transitions.columns()
+    limit = task.limit(transitions.states)
+    safe = np.minimum(optimal, limit)
+    safe_regret = task.reward_of(task.similarity_of(safe, optimal)) - step_reward
+    _same("limits", columns["limits"], limit, TOLERANCE)
+    _same("safe_actions", columns["safe_actions"], safe, TOLERANCE)
+    _same("costs", columns["costs"], task.cost_of(a, limit), TOLERANCE)
+    _same("safe_regrets", columns["safe_regrets"], safe_regret, TOLERANCE)
+
+
+def _replay_distractors(transitions: Transitions, task: Task, a: Array) -> None:
+    """Check the distractors of a task with some."""
+    columns, spec = transitions.columns(), task.spec
+    for name in ("distractors", "next_distractors"):
+        d = columns[name]
+        _same(name, (d >= 0.0) & (d <= 1.0), np.ones(d.shape, bool))
+    if spec.observation is not None and spec.observation.dynamics == "driven":
+        moved = task.distractor_step(columns["distractors"], a)
+        _same("next_distractors", columns["next_distractors"], moved)
+
+
 def _rewards(
     transitions: Transitions, step_reward: Array, t: npt.NDArray[np.int64], k: int, horizon: int
 ) -> tuple[Array, Array]:
     """R of each row and agent `[N, n]`, and its tolerance `[N, 1]`."""
     starts = np.concatenate([[0], transitions.ends[:-1]])
     lengths = np.diff([*starts, len(t)])
-    S = transitions.states.shape[1]
-    accumulated = transitions.observations[starts, S + 1 :].astype(np.float64) * k
+    n = step_reward.shape[1]
+    accumulated = transitions.observations[starts, -n:].astype(np.float64) * k
     tolerance = k * np.where(np.repeat(t[starts], lengths) == 0, TOLERANCE, _ROUNDED)
     reward = np.empty_like(step_reward)
     for step in range(int(lengths.max())):  # all trajectories at once

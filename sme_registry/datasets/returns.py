@@ -102,7 +102,7 @@ def exact_return(
     """Run a policy from states of a task to the end of the episode.
 
     Args:
-      policy: anything that `evaluate` accepts: a callable `[B, S + 2] → [B, A]`, a model, or the
+      policy: anything that `evaluate` accepts: a callable `[B, O] → [B, A]`, a model, or the
         path of one.
       spec: a single-agent task: a spec, its fields, an id, a digest or a path.
       states: `[M, S]` in [0, 1]; `Transitions.states` are exact, its observations are rounded.
@@ -112,7 +112,8 @@ def exact_return(
         is then Q(s, a) instead of V(s).
       gamma: γ in [0, 1] of the discounted return.
       rollouts: episodes from each state: 1 for a deterministic policy, whose return is exact; more
-        for a stochastic one, whose mean gets a 95 % interval (Student's t).
+        for a stochastic one, whose mean gets a 95 % interval (Student's t). On a task with
+        distractors also more than 1: each episode draws them anew, at its start too.
       action_range: of the policy's actions; None takes its own, and "unit" for a callable.
 
     Returns:
@@ -121,8 +122,8 @@ def exact_return(
     Raises:
       UnknownNameError, SpecError: no such task, or it is a team's.
       StateError: states, t or r_cum have the wrong shape or impossible values.
-      OptionError: another argument is out of range, or the policy is stochastic and `rollouts` is
-        1.
+      OptionError: another argument is out of range, or `rollouts` is 1 and the policy is
+        stochastic or the task has distractors.
       PolicyError: the policy cannot be used.
     """
     task = load_task(spec)
@@ -139,8 +140,10 @@ def exact_return(
     if rollouts == 1:
         _check_deterministic(checked_policy, task, states, t, r_cum)
     results = [
-        run_rollouts(checked_policy, task, states, t=t, r_cum=r_cum, actions=actions, gamma=gamma)
-        for _ in range(rollouts)
+        run_rollouts(
+            checked_policy, task, states, t=t, r_cum=r_cum, actions=actions, gamma=gamma, seed=seed
+        )
+        for seed in range(rollouts)
     ]
     lengths = np.stack([each.length for each in results])
     return ExactReturn(
@@ -171,9 +174,8 @@ def positions(
     """
     chosen = slice(None) if rows is None else np.asarray(rows)
     seen = transitions.observations[chosen].astype(np.float64)
-    S = spec.state_dim
-    t = np.rint(seen[:, S] * spec.horizon).astype(np.int64)
-    r_cum = np.minimum(seen[:, S + 1] * spec.k, t % spec.k)
+    t = np.rint(seen[:, -2] * spec.horizon).astype(np.int64)
+    r_cum = np.minimum(seen[:, -1] * spec.k, t % spec.k)
     return {"states": transitions.states[chosen], "t": t, "r_cum": r_cum}
 
 
@@ -227,7 +229,13 @@ def _column(name: str, value: npt.ArrayLike, rows: int) -> Array:
 def _check_deterministic(
     policy: Callable[[Observation], npt.ArrayLike], task: Task, s: Array, t: Steps, r_cum: Array
 ) -> None:
-    """Raise if two calls of a policy with the same observations give different actions."""
+    """Raise if the return of one episode from a state is not the only one that it can have."""
+    if task.spec.distractors:
+        raise OptionError(
+            f"rollouts=1: the task has {task.spec.distractors} distractors, which are drawn at "
+            "random, so the return of one episode is not exact. Give rollouts=30 or more for a "
+            "mean with its interval."
+        )
     batch = Batch(task, min(len(s), LANES))
     batch.place(s[:LANES], t[:LANES], r_cum[:LANES, None])
     if not np.array_equal(policy(batch.observe()), policy(batch.observe())):

@@ -252,6 +252,15 @@ class Batch:
         if self._extended is not None:
             self._extended.seed(lane, seed)
 
+    def seed_by_states(self, lanes: Lanes, states: Array, seed: int = 0) -> None:
+        """Restart the distractors of lanes from initial states `[len(lanes), S]` and a seed.
+
+        Equal states and seeds give equal distractors, in any lane: so episodes whose states come
+        from a named stream need no other random numbers to be reproducible.
+        """
+        if self._extended is not None:
+            self._extended.seed_by_states(lanes, states, seed)
+
     def live(self, lane: int, lifetime: int) -> None:
         """Let a lane's life, if it lives through a stream, go on after so many steps."""
 

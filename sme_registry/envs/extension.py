@@ -76,6 +76,11 @@ class Extended:
         self._own[OWN_KEY, lane] = word >> _KEY_SHIFT
         self._own[OWN_DRAWN, lane] = 0.0
 
+    def seed_by_states(self, lanes: Lanes, states: Array, seed: int) -> None:
+        """Restart the streams of lanes from their initial states; see `Batch.seed_by_states`."""
+        for lane, s in zip(lanes.tolist(), states, strict=True):
+            self.seed(lane, seed + int.from_bytes(s.astype("<f8").tobytes(), "little"))
+
     def begin(self, lanes: Lanes, distractors: Array | None = None) -> None:
         """Put distractors `[len(lanes), m]` into lanes that begin an episode; None draws them."""
         if distractors is None:

@@ -83,11 +83,12 @@ def rollouts(
     r_cum: Array | None = None,
     actions: Array | None = None,
     gamma: float = 1.0,
+    seed: int = 0,
 ) -> Rollouts:
     """Run an episode from each of the states to its end.
 
     Args:
-      policy: from observations `[B, S + 2]` to actions `[B, A]` of the unit range, which are
+      policy: from observations `[B, S + m + 2]` to actions `[B, A]` of the unit range, which are
         clipped to it; B is at most `LANES`. It is also called for episodes that have ended, until
         all of their batch have. The state of a recurrent `Policy` is initial at the first call.
         For a team, a `TeamPolicy`.
@@ -97,6 +98,8 @@ def rollouts(
       r_cum: `[n]` accumulated reward since the last payout; None for 0.
       actions: `[n, A]` actions of the first step; None for the policy's.
       gamma: γ of the discounted return, in [0, 1].
+      seed: of the task's distractors, at least 0. With one seed, episodes from equal states have
+        equal ones.
 
     Raises:
       SpecError: the task is a team's, and the policy is not.
@@ -115,6 +118,7 @@ def rollouts(
     for begin in range(0, n, LANES):
         lanes = order[begin : begin + LANES]
         batch = Batch(task, len(lanes), reuse=True)
+        batch.seed_by_states(np.arange(len(lanes)), states[lanes], seed)
         batch.place(states[lanes], t[lanes], np.repeat(r_cum[lanes, None], agents, axis=1))
         observation = batch.observe()
         act = _acting(policy)

@@ -86,15 +86,16 @@ def _single_agent(spec: SMESpec) -> Task:
 
 def _check_task(transitions: Transitions, task: Task) -> None:
     """Raise OptionError unless arrays are finite and of this task."""
-    S, A = task.spec.state_dim, task.spec.action_dim
+    S, A, m = task.spec.state_dim, task.spec.action_dim, task.spec.distractors
+    seen, with_distractors = task.spec.observation_dim, f", {m} distractors" if m else ""
     if len(transitions) == 0:
         raise OptionError("transitions=0: must be at least 1. Give a data set with rows.")
-    for name, width in (("observations", S + 2), ("actions", A), ("next_observations", S + 2)):
+    for name, width in (("observations", seen), ("actions", A), ("next_observations", seen)):
         shape = getattr(transitions, name).shape
         if shape != (len(transitions), width):
             raise OptionError(
                 f"{name} of shape {shape}: must be ({len(transitions)}, {width}) for state_dim={S},"
-                f" action_dim={A}. Give the spec of the data set."
+                f" action_dim={A}{with_distractors}. Give the spec of the data set."
             )
     for name in ("observations", "actions", "next_observations", "rewards", "states"):
         if not np.isfinite(getattr(transitions, name)).all():

@@ -7,6 +7,7 @@ import dataclasses
 import gymnasium
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 import sme_registry
 from sme_registry.datasets import DatasetRecipe, replay
@@ -33,7 +34,23 @@ TASKS = {
     "one step": {"horizon": 1},
     "a team": {"team": TEAM, "k": 4, "horizon": 9},
     "a fragile team": {"team": {**TEAM, "reward": "team"}, "D": 0.3},
-}
+    "limited": {"safety": {"tightness": 0.2}, "k": 4},
+    "noisy": {"observation": {"distractors": 3}, "D": 0.3},
+    "mixed": {"observation": {"mixing": "orthogonal"}},
+    "limited and distracted": {
+        "safety": {"tightness": 0.1},
+        "observation": {
+            "distractors": 5, "dynamics": "autonomous", "mixing": "nonlinear", "mixing_depth": 2,
+        },
+        "horizon": 31,
+    },
+}  # fmt: skip
+DRIVEN = {
+    "safety": {"tightness": 0.2},
+    "observation": {
+        "distractors": 3, "dynamics": "driven", "mixing": "nonlinear", "mixing_depth": 1,
+    },
+}  # fmt: skip
 HALVES = [(0.6, 0.5), ("random", 0.5)]
 
 
@@ -80,6 +97,41 @@ def test_a_data_set_equals_the_steps_of_a_single_environment():
             assert info["similarity"] == data.similarities[row]
             np.testing.assert_array_equal(info["optimal_action"], data.optimal_actions[row])
         start = end
+
+
+def test_limits_costs_and_distractors_are_those_of_a_single_environment():
+    of = recipe({**DRIVEN, "k": 3}, [(1.0, 1.0)], transitions=250)
+    data = collected(of)
+    env = sme_registry.make(of.spec)
+    start = 0
+    for end in data.ends:
+        begun = {"state": data.states[start], "distractors": data.distractors[start]}
+        observation, _ = env.reset(options=begun)
+        for row in range(start, end):
+            np.testing.assert_array_equal(env.unwrapped.distractors, data.distractors[row])
+            np.testing.assert_array_equal(observation, data.observations[row])
+            observation, _, _, _, info = env.step(data.actions[row])
+            np.testing.assert_array_equal(observation, data.next_observations[row])
+            np.testing.assert_array_equal(info["limit"], data.limits[row])
+            np.testing.assert_array_equal(info["safe_action"], data.safe_actions[row])
+            assert info["cost"] == data.costs[row]
+            assert info["safe_regret"] == data.safe_regrets[row]
+        start = end
+    assert (data.costs > 0).any()
+
+
+def test_what_agents_see_changes_neither_the_states_nor_the_behaviour():
+    plain = collected(recipe({}, HALVES))
+    for observation in (task["observation"] for task in TASKS.values() if "observation" in task):
+        seen = collected(recipe({"observation": observation}, HALVES))
+        for array in ("states", "actions", "rewards", "optimal_actions", "next_states"):
+            np.testing.assert_array_equal(getattr(seen, array), getattr(plain, array))
+
+
+def test_distractors_are_uniform_and_differ_between_episodes():
+    data = collected(recipe({"observation": {"distractors": 4}}, transitions=5000))
+    assert len(np.unique(data.distractors)) == data.distractors.size
+    assert kstest(data.distractors.ravel(), "uniform").pvalue > 0.01
 
 
 @pytest.mark.parametrize("count", [1, 99, 100, 101, 250])
@@ -271,12 +323,13 @@ def test_a_policy_that_fails_is_named():
     [
         "observations", "actions", "rewards", "next_observations", "terminations", "timeouts",
         "optimal_actions", "regrets", "similarities", "step_rewards", "states", "next_states",
-        "episodes",
+        "episodes", "costs", "limits", "safe_actions", "safe_regrets", "distractors",
+        "next_distractors",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("row", [0, 150, 299])
 def test_replay_detects_a_change_in_any_array_and_row(array, row):
-    of = recipe(transitions=300)
+    of = recipe(DRIVEN, transitions=300)
     data = collected(of)
     changed = getattr(data, array).copy()
     one = changed[row : row + 1]

@@ -105,6 +105,19 @@ def test_rollouts_from_rows_of_a_data_set_repeat_its_rewards() -> None:
     )
 
 
+def test_positions_are_found_behind_what_the_agent_sees() -> None:
+    observed = {"distractors": 3, "mixing": "orthogonal"}
+    spec = SPEC.derive(k=7, observation=observed)
+    recipe = DatasetRecipe(spec=spec, behaviours=(parse_behaviour(0.4),), transitions=90)
+    plain = recipe.model_copy(update={"spec": SPEC.derive(k=7)})
+    found, expected = (
+        positions(collect(each, materialize(each.spec)), each.spec) for each in (recipe, plain)
+    )
+    for name in ("states", "t", "r_cum"):
+        np.testing.assert_array_equal(found[name], expected[name])
+    assert found["r_cum"].max() > 1.0
+
+
 def test_the_optimum_earns_one_in_every_remaining_step() -> None:
     spec = SPEC.derive(k=5, D=0.9)
     task = materialize(spec)
@@ -153,6 +166,25 @@ def test_a_stochastic_policy_has_no_exact_return() -> None:
     random = np.random.default_rng(0)
     with pytest.raises(OptionError, match="rollouts=1: the policy is stochastic"):
         exact_return(lambda o: random.random((len(o), 2)), SPEC, states=STATES)
+
+
+def test_distractors_are_drawn_anew_in_each_rollout_and_make_no_single_one_exact() -> None:
+    # The distractor is the action: one step of it is a uniform action, known by quadrature.
+    one = SPEC.derive(state_dim=1, action_dim=1, horizon=1)
+    spec = one.derive(observation={"distractors": 1})
+    states = np.random.default_rng(2).random((400, 1))
+    optimal = materialize(spec).optimal_action(states)
+    grid = (np.arange(20_000) + 0.5) / 20_000
+    truth = np.maximum(0.0, 1.0 - 4.0 * np.abs(grid - optimal)).mean(axis=1)
+    found, again = (
+        exact_return(lambda o: o[:, 1:2], spec, states=states, rollouts=60).undiscounted
+        for _ in range(2)
+    )
+    held = ((found.low <= truth) & (truth <= found.high)).mean()
+    assert 0.91 < held < 0.985
+    np.testing.assert_array_equal(found.mean, again.mean)
+    with pytest.raises(OptionError, match="rollouts=1: the task has 1 distractors"):
+        exact_return(lambda o: o[:, :1], spec, states=states)
 
 
 @pytest.mark.parametrize(

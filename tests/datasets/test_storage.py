@@ -96,6 +96,33 @@ class TestReading:
         assert read.digest == dataset.record.arrays_digest
         replay(read, dataset.recipe, task)
 
+    def test_costs_and_distractors_are_read_bit_for_bit_and_minari_has_them(self, tmp_path):
+        from sme_registry.datasets.collect import collect
+
+        spec = {
+            "safety": {"tightness": 0.2},
+            "observation": {"distractors": 3, "mixing": "nonlinear", "mixing_depth": 1},
+        }
+        dataset = make_dataset(spec, 0.5, transitions=150, folder=tmp_path)
+        task = materialize(dataset.recipe.spec)
+        read, generated = dataset.transitions(), collect(dataset.recipe, task)
+        assert {"costs", "limits", "distractors"} <= set(generated.columns())
+        for name, array in generated.columns().items():
+            np.testing.assert_array_equal(getattr(read, name), array, strict=True)
+        replay(read, dataset.recipe, task)
+
+        loaded = dataset.minari()
+        assert loaded.observation_space.shape == (13,)
+        episode = loaded[0]
+        np.testing.assert_array_equal(episode.infos["cost"][:-1], read.costs[:100])
+        np.testing.assert_array_equal(episode.infos["limit"][:-1], read.limits[:100])
+        np.testing.assert_array_equal(episode.infos["distractors"][1:], read.next_distractors[:100])
+        np.testing.assert_array_equal(episode.truncations, read.timeouts[:100])
+        env = loaded.recover_environment()
+        env.reset(options={name: episode.infos[name][0] for name in ("state", "distractors")})
+        _, _, _, _, info = env.step(episode.actions[0])
+        assert info["cost"] == read.costs[0]
+
     def test_the_record_has_provenance_and_digests(self, root):
         record = open_dataset(NAME, root).record
         assert record.recipe.transitions == 250

@@ -203,6 +203,23 @@ def test_a_policy_may_keep_what_it_observed() -> None:
     np.testing.assert_allclose(times, np.arange(100) / 100, atol=1e-6)
 
 
+def test_distractors_depend_on_the_state_of_the_start_and_the_seed() -> None:
+    spec = PLAIN.derive(observation={"distractors": 2, "dynamics": "autonomous"}, horizon=20)
+    states, task = start_states(0, 0, 5, 3), materialize(spec)
+
+    def seen(rows: Any, seed: int = 0) -> Any:
+        kept: list[Any] = []
+        rollouts(lambda o: kept.append(o) or np.full((len(o), 2), 0.5), task, rows, seed=seed)  # type: ignore[func-returns-value]
+        return np.array(kept)
+
+    all_at_once = seen(states)
+    np.testing.assert_array_equal(all_at_once[:, 3:], seen(states[3:]))
+    np.testing.assert_array_equal(all_at_once, seen(states))
+    distractors = all_at_once[:, :, 3:5]
+    assert len(np.unique(distractors)) == distractors.size
+    assert not (distractors == seen(states, seed=1)[:, :, 3:5]).any()
+
+
 def test_a_team_is_rolled_out_as_its_environment_steps_it() -> None:
     spec = PLAIN.derive(
         k=3, horizon=7, team={"agents": [{"action_dim": 1, "observes": [0]}, {"action_dim": 1}]}
