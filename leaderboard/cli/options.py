@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from leaderboard.documents.board import FILE, BoardDocument, Folder
+from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
 from sme_registry.errors import OptionError
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
@@ -161,14 +161,14 @@ def find_suite(name: str) -> SuiteFile:
     """A suite by its name in the catalogue, its file's path, or a board that has it.
 
     Raises:
-      UnknownNameError, SpecError: there is none, it is invalid, or it has streams.
+      UnknownNameError, SpecError: there is none, it is invalid, or boards do not score it.
       BoardError: the served board cannot be reached.
     """
     if is_url(name) or os.path.isfile(os.path.join(name, FILE)):
         return board_document(name).suite_file
     is_path = name.endswith(".json") or (os.sep in name and os.path.isfile(name))
     file = SuiteFile.read(name) if is_path else catalogue.find(SuiteFile, name)
-    file.suite.refuse_streams("a leaderboard")
+    refuse_unscored(file.suite)
     return file
 
 

@@ -73,6 +73,20 @@ class Limits(StrictModel):
     total_bytes: Annotated[Integer, Field(ge=1)] = 2**36
 
 
+def refuse_unscored(suite: Suite) -> None:
+    """Raise SpecError if a suite has what boards do not score: streams, safety or observation.
+
+    A rank by distance from the optimum alone would favour agents that break limits.
+    """
+    suite.refuse_streams("a leaderboard")
+    extended = ", ".join(member.name for member in suite.classes if member.setting.extended)
+    if extended:
+        raise SpecError(
+            f"suite: has classes with safety or observation ({extended}), and a leaderboard scores "
+            "neither. Choose a suite without them; studies train on them: `sme study new --suite`."
+        )
+
+
 class BoardDocument(Document):
     """`board.json`. Fields younger than version 1 are left out of the JSON at their defaults.
 
@@ -106,9 +120,9 @@ class BoardDocument(Document):
 
     @field_validator("suite")
     @classmethod
-    def _of_single_tasks(cls, suite: Suite) -> Suite:
+    def _can_be_scored(cls, suite: Suite) -> Suite:
         try:
-            suite.refuse_streams("a leaderboard")
+            refuse_unscored(suite)
         except SpecError as error:
             raise ValueError(str(error)) from None
         return suite
