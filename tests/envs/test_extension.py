@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import sme_registry
 from sme_registry import SMESpec, StreamSpec, testing
@@ -18,6 +20,7 @@ from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import OptionError, SpecError, StateError
 from sme_registry.task.streams import counted
 from sme_registry.wrappers import RecordRegret
+from tests.strategies import specs
 
 SPECS = {
     "safe": SMESpec(horizon=20, safety={"tightness": 0.2}),
@@ -91,6 +94,43 @@ def test_a_batch_of_any_size_is_its_singles(name: str, lanes: int, backend: str)
             np.testing.assert_array_equal(batch.distractors[lane], env.distractors)
             for key, value in info.items():
                 np.testing.assert_array_equal(infos[key][lane], value, err_msg=key)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(spec=specs(team=False), seed=st.integers(0, 99))
+def test_a_step_of_any_spec_is_the_definitions_single_and_in_a_batch(
+    spec: SMESpec, seed: int, backend: str
+) -> None:
+    env, batch = SMEEnv(spec), SMEVectorEnv(spec, 3)
+    task, rng = env.task, np.random.default_rng(seed)
+    env.reset(seed=seed)
+    batch.reset(seed=seed)
+    for _ in range(3):
+        s, d = env.state, env.distractors
+        action = actions_of(batch, rng)
+        observation, _, terminated, truncated, info = env.step(action[0])
+        together = batch.step(action)
+        np.testing.assert_array_equal(env.state, task.transition(s, action[0]))
+        np.testing.assert_allclose(
+            observation[:-2], task.seen(env.state, env.distractors), rtol=0, atol=2e-7
+        )
+        if spec.observation is not None and spec.observation.dynamics == "driven":
+            np.testing.assert_array_equal(env.distractors, task.distractor_step(d, action[0]))
+        if spec.safety is not None:
+            a, safe = action[0].astype(np.float64), task.safe_action(s)
+            np.testing.assert_allclose(info["limit"], task.limit(s), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(info["safe_action"], safe, rtol=0, atol=1e-12)
+            # A tiny tightness magnifies the rounding of the limits; so does a threshold of r.
+            scale = 2.0 * spec.safety.tightness
+            assert scale * info["cost"] == pytest.approx(scale * task.cost(s, a), abs=1e-12)
+            safe_regret = task.step_reward(s, safe) - task.step_reward(s, a)
+            if spec.r_min == 0.0:
+                assert info["safe_regret"] == pytest.approx(safe_regret, abs=1e-11)
+        np.testing.assert_array_equal(together[0][0], observation)
+        for key, value in info.items():
+            np.testing.assert_array_equal(together[4][key][0], value, err_msg=key)
+        if terminated or truncated:
+            break
 
 
 @pytest.mark.parametrize("name", SPECS)
