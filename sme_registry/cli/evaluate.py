@@ -78,9 +78,9 @@ def evaluate(
 
     With --out, it also writes evaluation.json (of a stream stream.json) and figures.
 
-    A function takes observations `[B, S + 2]` and returns actions `[B, A]`, in [0, 1] unless
-    --action-range is symmetric; so does an .onnx network. A .zip of Stable-Baselines3 can run code
-    when it is loaded: use only files whose author you trust.
+    A function takes observations `[B, S + 2]`, with m distractors `[B, S + m + 2]`, and returns
+    actions `[B, A]`, in [0, 1] unless --action-range is symmetric; so does an .onnx network. A .zip
+    of Stable-Baselines3 can run code when it is loaded: use only files whose author you trust.
 
     For a team, give a folder with the policy of each agent, such as agent_0.zip, from the agent's
     own observations; or the one policy that all agents share. That one is called for each agent

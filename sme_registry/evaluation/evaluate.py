@@ -57,7 +57,8 @@ def evaluate(
     Models act deterministically. Actions are clipped as the environment clips them.
 
     Args:
-      policy: a callable from observations `[B, S + 2]` float32 to actions `[B, A]`; a
+      policy: a callable from observations `[B, S + 2]` float32 (of a task with m distractors
+        `[B, S + m + 2]`, what its agent sees of both first) to actions `[B, A]`; a
         Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);
         the path of an .onnx file or of an offline policy's .npz; `module:function`; or the name
         of a reference policy, such as "linear". For a team, one of these that all agents share,

@@ -162,12 +162,17 @@ class EvaluationReport(ReportFile):
             for policy, regions in {"": scope.regions, **scope.references}.items():
                 who = {"policy": policy or self.policy, "reference": bool(policy), "agent": agent}
                 for index, region in enumerate(regions):
-                    yield who | _columns(region) | self._extensions(policy, index)
+                    yield who | _columns(region) | self.extensions(index, policy)
         for region in () if self.observation is None else self.observation.distractor_regions:
             yield {"policy": self.policy, "reference": False, "agent": ""} | _columns(region)
 
-    def _extensions(self, reference: str, index: int) -> dict[str, float]:
-        """The columns of safety and distractors of a reference, or of the policy, in a region."""
+    def extensions(self, index: int, reference: str = "") -> dict[str, float]:
+        """The numbers of safety and distractors in a region, by name; none of a plain task.
+
+        Args:
+          index: of the region.
+          reference: the name of a reference; empty for the policy.
+        """
         columns: dict[str, float] = {}
         if self.safety is not None:
             scores = self.safety.references.get(reference, self.safety.regions)

@@ -45,8 +45,8 @@ def as_policy(
 
     Args:
       policy: one of
-        a callable from observations `[B, S + 2]` float32 to actions `[B, A]`, NumPy arrays or
-        PyTorch tensors;
+        a callable from observations `[B, S + 2]` float32, with m distractors `[B, S + m + 2]`, to
+        actions `[B, A]`, NumPy arrays or PyTorch tensors;
         a `torch.nn.Module`, which is called on a tensor, in evaluation mode and without gradients;
         a model of Stable-Baselines3, or any other with `predict(observations, deterministic=True)`;
         the path of such a model's .zip (loading it can run code of its author);

@@ -226,20 +226,11 @@ def _result_rows(
             **run,
             **agents,
             **region.model_dump(exclude={"name", "channels"}),
-            **_extensions_of_region(report, index),
+            **report.extensions(index),
             **regrets,
             "region": region.name,
             "constant_similarity": references["constant_half"][index].similarity,
         }
-
-
-def _extensions_of_region(report: EvaluationReport, index: int) -> dict[str, Any]:
-    columns: dict[str, Any] = {}
-    if report.safety is not None:
-        columns |= report.safety.regions[index].model_dump(exclude={"name", "step_reward"})
-    if report.observation is not None and report.observation.invariance:
-        columns["invariance"] = report.observation.invariance[index].invariance
-    return columns
 
 
 def curve_rows(cell: PlannedCell, result: CellResult) -> Iterator[dict[str, Any]]:
