@@ -35,7 +35,7 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
 PROBE_STATES = 2**14  # of which half are held out
-_MOST_NUMBERS = 2**24  # of a layer's outputs in all states, 128 MiB as float64
+_MOST_NUMBERS = 2**24  # of all their observations, 128 MiB as float64
 
 HiddenLayers = Callable[[Observation], Iterable[Array]]
 """From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order."""
