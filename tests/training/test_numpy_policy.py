@@ -9,7 +9,7 @@ import pytest
 
 from sme_registry import SMESpec, StreamSpec
 from sme_registry.errors import SpecError
-from sme_registry.evaluation import Perceptron
+from sme_registry.evaluation import Perceptron, Policy, as_policy
 from sme_registry.training.numpy_policy import numpy_policy
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -64,6 +64,25 @@ def test_the_copied_network_acts_as_predict_does(algorithm: str, action_range: R
     assert expected.std() > 0.1
     if algorithm in ("PPO", "A2C", "TRPO"):  # an unbounded mean, which SB3 clips
         assert np.mean((expected == 0.0) | (expected == 1.0)) > 0.05
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "TD3", "SAC"])
+def test_the_copied_network_has_the_hidden_layers_of_the_model_as_it_was(algorithm: str) -> None:
+    model = new_model(algorithm_class(algorithm))
+    own, copied = as_policy(model, SPEC), numpy_policy(model, SPEC)
+    assert isinstance(own, Policy)
+    assert own.hidden is not None
+    assert copied.hidden is not None
+    expected = list(own.hidden(OBSERVATIONS))
+    with torch.no_grad():
+        for parameter in model.policy.parameters():
+            parameter += 1.0
+    assert len(expected) == 2
+    for one, other, later in zip(
+        copied.hidden(OBSERVATIONS), expected, own.hidden(OBSERVATIONS), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-4)
+        assert np.abs(later - other).max() > 0.1
 
 
 @pytest.mark.parametrize("observes_phase", [False, True])
