@@ -36,7 +36,7 @@ from sme_registry.task.uniformity import (
 LANES = 4_096
 STEPS = 1_000
 _ROUNDING = 1e-9
-_MEASURED_CHANNELS = 1_024  # above it the fit and the Jacobians take longer than everything else
+_MEASURED_CHANNELS = 512  # above it the fit and the Jacobians take longer than everything else
 _LARGEST_CONDITION = 5_000.0
 _SINGULAR = 1.0 / float(np.finfo(np.float64).eps)  # of a matrix that float64 cannot invert
 
@@ -57,7 +57,7 @@ def _distractors(task: Task, seed: int) -> tuple[Check, ...]:
     """Autonomous distractors always move under random actions; driven ones under any agent's."""
     assert task.distractor_transition is not None
     m, A = task.spec.distractors, task.spec.action_dim
-    lanes = max(256, min(LANES, 2**22 // (m * A)))
+    lanes = max(256, min(LANES, 2**20 // (m * A)))
     d = numbers(task, seed, "distractors", lanes, m)
     for t in range(STEPS):
         d = task.distractor_step(d, numbers(task, seed, f"distractors/actions/{t}", lanes, A))
