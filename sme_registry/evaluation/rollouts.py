@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sme_registry.compiled.values import REGRET, REWARD, SIMILARITY
 from sme_registry.envs.arguments import initial_states, single_agent
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Array, Observation
@@ -127,8 +128,8 @@ def rollouts(
         while running.any():
             a = act(observation.copy()) if first is None else first
             done = batch.advance(np.asarray(a, np.float64))
-            similarity, _, regret, reward, _ = _team_means(done.values)
-            own = done.values[2]
+            similarity, regret, reward = _team_means(done.values[[SIMILARITY, REGRET, REWARD]])
+            own = done.values[REGRET]
             step = (reward, weight * reward, 1.0, regret, similarity, similarity**2, *own)
             for total, value in zip(sums, step, strict=True):
                 total += running * value
@@ -149,5 +150,5 @@ def _acting(policy: Callable[[Observation], Any]) -> Callable[[Observation], Any
 
 
 def _team_means(values: Array) -> Array:
-    """Means over agents, `[5, n, B]` to `[5, B]`; without a sum for a single agent."""
+    """Means over agents, `[rows, n, B]` to `[rows, B]`; without a sum for a single agent."""
     return values[:, 0] if values.shape[1] == 1 else np.asarray(values.mean(axis=1))

@@ -203,6 +203,14 @@ def test_a_policy_may_keep_what_it_observed() -> None:
     np.testing.assert_allclose(times, np.arange(100) / 100, atol=1e-6)
 
 
+def test_limits_change_no_return() -> None:
+    limited = HARD.derive(D=0.0, safety={"tightness": 0.2})
+    act, states = nearly_optimal(limited), start_states(0, 0, 5, 3)
+    plain = rollouts(act, materialize(limited.derive(safety=None)), states)
+    for one, other in zip(rollouts(act, materialize(limited), states), plain, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_distractors_depend_on_the_state_of_the_start_and_the_seed() -> None:
     spec = PLAIN.derive(observation={"distractors": 2, "dynamics": "autonomous"}, horizon=20)
     states, task = start_states(0, 0, 5, 3), materialize(spec)
