@@ -23,7 +23,7 @@ from sme_registry.diagnosis.document import (
 )
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy, references
-from sme_registry.evaluation.regions import expansion, region_name, states
+from sme_registry.evaluation.regions import States, expansion, region_name, states
 from sme_registry.spec import EvaluationProtocol
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
@@ -57,7 +57,8 @@ _TINY = 1e-12
 class Sample(NamedTuple):
     """States, the actions in them, and the optimal actions."""
 
-    observation: Observation  # `[N, S + 2]`
+    drawn: States  # with the distractors and times that the observations show
+    observation: Observation  # `[N, O]`
     s: Array  # `[N, S]` states
     a: Array  # `[N, A]` actions of the policy, in [0, 1]
     optimal: Array  # `[N, A]` optimal actions
@@ -101,7 +102,7 @@ def sample(
     optimal = engine(task).optimal_action(s)
     random = streams.uniform(protocol.seed, f"diagnosis/{region}/random", optimal.size)
     actions = fitted.actions(s, optimal, random.reshape(optimal.shape))
-    return Sample(observation, s, clipped_actions(policy, observation), optimal, actions)
+    return Sample(drawn, observation, s, clipped_actions(policy, observation), optimal, actions)
 
 
 def fixed_states(
@@ -287,12 +288,13 @@ def _slope(part: Array, optimal: Array) -> float:
 def _sensitivity(policy: Policy, task: Task, states: Sample, seed: int) -> float:
     """RMS change of a over RMS change of a*, for small steps of the state."""
     few = affordable(task, 2048)
-    observation, s = states.observation[:few].copy(), states.s[:few]
+    s = states.s[:few]
     directions = streams.gaussian(seed, "diagnosis/directions", s.size).reshape(s.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    observation[:, : s.shape[1]] = s + _STEP * directions
-    moved = observation[:, : s.shape[1]].astype(np.float64)
-    optimal_change = engine(task).optimal_action(moved) - states.optimal[:few]
+    moved = (s + _STEP * directions).astype(np.float32)
+    optimal_change = engine(task).optimal_action(moved.astype(np.float64)) - states.optimal[:few]
+    drawn = States(moved, states.drawn.d[:few], states.drawn.time[:few])
+    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
     change = clipped_actions(policy, observation) - states.a[:few]
     return float(np.sqrt((change**2).mean() / max(float((optimal_change**2).mean()), _TINY)))
 

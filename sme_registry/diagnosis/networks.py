@@ -22,6 +22,7 @@ from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy
 from sme_registry.evaluation.policies import Perceptron
+from sme_registry.evaluation.regions import States
 from sme_registry.io import require_packages
 from sme_registry.task import Task, streams
 from sme_registry.task.draw import Array
@@ -137,12 +138,12 @@ def _fit(
 
 def _pairs(task: Task, count: int, seed: int, stream: str) -> tuple[Observation, Observation]:
     """Observations of uniform states at random times, and the optimal actions, float32."""
-    S, T = task.spec.state_dim, task.spec.horizon
+    S, m = task.spec.state_dim, task.spec.distractors
     u = streams.uniform(seed, stream, count * (S + 1)).reshape(count, S + 1)
-    observation = np.zeros((count, S + 2), np.float32)
-    observation[:, :S] = u[:, :S]
-    observation[:, S] = np.floor(u[:, S] * T) / T
-    optimal = engine(task).optimal_action(observation[:, :S].astype(np.float64))
+    d = streams.uniform(seed, f"{stream}/distractors", count * m).reshape(count, m)
+    drawn = States(u[:, :S].astype(np.float32), d, u[:, S])
+    observation = drawn.observation(drawn.seen(task), task.spec.horizon)
+    optimal = engine(task).optimal_action(drawn.s.astype(np.float64))
     return observation, optimal.astype(np.float32)
 
 

@@ -71,21 +71,32 @@ class Trajectories(NamedTuple):
 
 
 def rollout(
-    act: Callable[[Observation], Array], task: Task, initial_states: Array
+    act: Callable[[Observation], Array],
+    task: Task,
+    initial_states: Array,
+    seed: int,
+    *,
+    sees_state: bool = False,
 ) -> tuple[Trajectories, ...]:
     """Whole episodes of a policy in the unit range, from initial states `[n, S]`, by agent.
 
-    `act` maps joint observations `[n, S + 1 + m]` of m agents (one where there is no team) to the
-    actions `[n, A]` of all.
+    `act` maps joint observations `[n, O]` of all agents (one where there is no team), or float32
+    states `[n, S]` if it `sees_state`, to the actions `[n, A]` of all. `seed` is of the
+    distractors.
     """
     n, agents = len(initial_states), len(task.owned)
     batch = Batch(task, n)
+    if task.spec.distractors:
+        for lane, word in enumerate(streams.bit_generator(seed, "diagnosis/lanes").random_raw(n)):
+            batch.seed(lane, int(word))
     observation = batch.observe()
     batch.begin(np.arange(n), observation, initial_states)
     alive, terminated = np.ones(n, bool), np.zeros((agents, n), bool)
     rows: list[tuple[npt.NDArray[Any], ...]] = []
     while alive.any():
-        s, a = batch.state, np.clip(act(observation.copy()), 0.0, 1.0)
+        s = batch.state
+        shown = s.astype(np.float32) if sees_state else observation.copy()
+        a = np.clip(act(shown), 0.0, 1.0)
         step = batch.advance(np.ascontiguousarray(a, np.float64))
         due = ((len(rows) + 1) % task.spec.k == 0) | step.truncated
         mae, constant_mae = (_mae(task, x - step.optimal) for x in (a, 0.5))
@@ -125,9 +136,9 @@ def episodes_of(
     S, T = task.spec.state_dim, task.spec.horizon
     n = max(8, min(episodes, MAX_NUMBERS // (T * (S + 8))))
     starts = streams.uniform(seed, "diagnosis/starts", n * S).reshape(n, S)
-    runs = {POLICY: rollout(act, task, starts)}
+    runs = {POLICY: rollout(act, task, starts, seed)}
     for name, reference in _reference_actions(task, fitted, n, seed).items():
-        runs[name] = rollout(reference, task, starts)
+        runs[name] = rollout(reference, task, starts, seed, sees_state=True)
     return tuple(dict(zip(runs, each, strict=True)) for each in zip(*runs.values(), strict=True))
 
 
@@ -159,16 +170,14 @@ def on_policy(task: Task, runs: dict[str, Trajectories]) -> OnPolicy:
 def _reference_actions(
     task: Task, fitted: references.References, n: int, seed: int
 ) -> dict[str, Callable[[Observation], Array]]:
-    """The references as functions of joint observations `[n, S + 1 + m]`."""
-    S, A = task.spec.state_dim, task.spec.action_dim
+    """The references as functions of states `[n, S]`."""
+    A = task.spec.action_dim
     bits = streams.bit_generator(seed, "diagnosis/random_action")
     return {
-        "linear_least_squares": lambda observation: (
-            (observation[:, :S] - 0.5) @ fitted.slope + fitted.intercept
-        ),
-        "best_constant": lambda observation: np.tile(fitted.constant, (n, 1)),
-        "constant_half": lambda observation: np.full((n, A), 0.5),
-        "uniform_random": lambda observation: streams.to_uniform(bits.random_raw(n * A)).reshape(
+        "linear_least_squares": fitted.linear,
+        "best_constant": lambda s: np.tile(fitted.constant, (n, 1)),
+        "constant_half": lambda s: np.full((n, A), 0.5),
+        "uniform_random": lambda s: streams.to_uniform(bits.random_raw(n * A)).reshape(
             n, A
         ),
     }
