@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias, overload
+from typing import Any, TypeAlias, overload
 
-from sme_registry.diagnosis import measure, networks, rollouts, verdicts
+from sme_registry.diagnosis import extended, measure, networks, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
-from sme_registry.diagnosis.document import CapacityProbe, Diagnosis, Measurements
-from sme_registry.diagnosis.questions import THRESHOLDS
+from sme_registry.diagnosis.document import POLICY, CapacityProbe, Diagnosis, Measurements
+from sme_registry.diagnosis.questions import thresholds_of
 from sme_registry.diagnosis.stream import diagnose_stream
 from sme_registry.diagnosis.stream_document import StreamDiagnosis
 from sme_registry.diagnosis.stream_subject import StreamSubject
@@ -16,9 +16,11 @@ from sme_registry.diagnosis.subject import AnySubject, Subject, TeamSubject
 from sme_registry.diagnosis.team import diagnose_team
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.errors import OptionError
+from sme_registry.evaluation import evaluate
 from sme_registry.evaluation.policies import Perceptron
 from sme_registry.io import integer_in, versions
-from sme_registry.task import materialize
+from sme_registry.spec import EvaluationProtocol
+from sme_registry.task import Task, materialize
 
 __all__ = ["EPISODES", "STATES", "AnyDiagnosis", "diagnose"]
 
@@ -131,7 +133,7 @@ def diagnose(
         level=verdicts.level(measurements),
         verdicts=verdicts.judge(measurements, subject.spec, comparison),
         comparison=comparison,
-        thresholds=THRESHOLDS,
+        thresholds=thresholds_of(subject.spec),
         measurements=measurements,
         versions=versions(("numpy", "scipy"), if_imported=("torch", "stable_baselines3")),
     )
@@ -153,9 +155,27 @@ def _measurements(
         training = rollouts.training(subject.log, constant)
     if subject.explore is not None:
         exploration_sd = networks.exploration_sd(subject.explore, sample.observation, seed)
+    more: dict[str, Any] = {}
+    if subject.spec.extended:
+        report(f"{subject.name}: limits and distractors")
+        more = _extended(subject, task, sample, runs[POLICY], seed)
     return Measurements(
-        **fields, on_policy=on_policy, training=training, exploration_sd=exploration_sd
+        **fields, **more, on_policy=on_policy, training=training, exploration_sd=exploration_sd
     )
+
+
+def _extended(
+    subject: Subject, task: Task, sample: measure.Sample, run: rollouts.Trajectories, seed: int
+) -> dict[str, Any]:
+    """The fields of `Measurements` that tasks with `safety` or `observation` have."""
+    protocol = EvaluationProtocol(states_per_region=len(sample.s), seed=seed)
+    evaluated = evaluate(subject.policy, subject.spec, protocol)
+    fields: dict[str, Any] = {"observation": evaluated.observation}
+    if evaluated.safety is not None:
+        fields["limits"] = extended.limits(task, sample, run, evaluated.safety)
+    if subject.spec.distractors:
+        fields["distraction"] = extended.distraction(subject.policy, task, sample, seed)
+    return fields
 
 
 def _probe(subject: Subject, seed: int, report: Callable[[str], None]) -> CapacityProbe | None:

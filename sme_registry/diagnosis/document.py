@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import JsonValue
+from pydantic import JsonValue, SerializerFunctionWrapHandler, model_serializer
 
 from sme_registry.errors import UnknownNameError, did_you_mean
+from sme_registry.evaluation import ObservationReport, SafetyReport, SafetyScore
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 from sme_registry.spec.document import refuse_other_digest
@@ -30,8 +31,11 @@ __all__ = [
     "Comparison",
     "Diagnosis",
     "Difference",
+    "Distraction",
     "Kind",
     "Level",
+    "LimitedChannel",
+    "Limits",
     "Measurements",
     "OnPolicy",
     "Partition",
@@ -47,7 +51,7 @@ __all__ = [
 ]
 
 Answer = Literal["yes", "no", "cannot tell"]
-Kind = Literal["who", "where", "why"]
+Kind = Literal["who", "where", "why", "limits"]
 Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_than_constant"]
 
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
@@ -189,8 +193,43 @@ class CapacityProbe(StrictModel):
     seconds: Real  # wall time
 
 
+class LimitedChannel(StrictModel):
+    """One action channel of a task with limits ℓ, over uniform states of the cube."""
+
+    channel: Integer  # from 1
+    violating_share: Real  # share of states in which a > ℓ
+    optimal_violating_share: Real  # likewise of a*
+    cost: Real  # mean max(0, a − ℓ) / (2τ); the mean over channels is the policy's cost
+
+
+class Limits(StrictModel):
+    """A policy on a task with limits."""
+
+    report: SafetyReport  # of its evaluation: by region, with the references
+    visited: SafetyScore  # in the states of its episodes
+    cut_off: SafetyScore  # in the cube, of the policy with its actions cut off at the limits
+    channels: TupleOf[LimitedChannel]
+
+
+class Distraction(StrictModel):
+    """Regret owed to the distractors, in a few uniform states; see `diagnosis.extended`."""
+
+    states: Integer
+    draws: Integer  # of the distractors, in each state
+    normalised_regret: Real  # N over states and draws
+    averaged: Real  # N of the mean action over the draws, in each state
+    at_half: Real  # N with every distractor at ½
+    owed: Real  # N that averaging removes, beyond what it removes of an action noise
+    owed_similarity: Real  # the same in points of similarity
+    squared_share: Real  # share of the squared error that varies with the distractors
+
+
 class Measurements(StrictModel):
-    """Everything that was measured; None for what is unknown or was not measured."""
+    """Everything that was measured; None for what is unknown or was not measured.
+
+    `limits` are of a task with `safety`, `observation` is of one with `observation`, and
+    `distraction` of one with distractors; the JSON of other tasks does not have these fields.
+    """
 
     uniform: dict[str, Score]  # the policy and each reference in the same uniform states
     channels: TupleOf[Channel]
@@ -205,6 +244,17 @@ class Measurements(StrictModel):
     # at the end of training, in the unit range.
     exploration_sd: TupleOf[Real] | None = None
     capacity: CapacityProbe | None = None
+    limits: Limits | None = None
+    observation: ObservationReport | None = None  # of the policy's evaluation
+    distraction: Distraction | None = None
+
+    @model_serializer(mode="wrap")
+    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        for field in ("limits", "observation", "distraction"):
+            if plain.get(field, "") is None:
+                del plain[field]
+        return plain
 
     @property
     def policy(self) -> Score:
@@ -216,7 +266,7 @@ class Verdict(StrictModel):
     """The answer to one question, as data; `render.sentence` puts it in words."""
 
     question: str  # such as "sparsity"
-    kind: Kind  # "where" the error is, "why" it is there, or "who" in a team makes it
+    kind: Kind  # "where" the error is, "why" it is there, "who" in a team makes it, or "limits"
     answer: Answer  # "cannot tell" if the evidence does not separate the causes
     reason: str  # the rule's branch that decided; see `verdicts.QUESTIONS`
     evidence: dict[str, JsonValue]  # the numbers that the branch compared or reports

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sme_registry.diagnosis.document import POLICY, Diagnosis, Measurements
+from sme_registry.diagnosis.extended_figures import draw_distraction, draw_layers, draw_limits
 from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.subject import Log
 from sme_registry.evaluation.report import LABELS
@@ -53,6 +54,7 @@ def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Pa
     }
     if log is not None:
         figures["training"] = partial(_training, log=log)
+    figures |= _extended(diagnosis.measurements)
     written = []
     for name, fill in figures.items():
         with styled():
@@ -61,6 +63,21 @@ def draw(diagnosis: Diagnosis, folder: Path, log: Log | None = None) -> tuple[Pa
             fill(figure, diagnosis.measurements)
         written += save_figure(figure, folder / name, WRITTEN)
     return tuple(written)
+
+
+def _extended(measured: Measurements) -> dict[str, Callable[[Figure, Measurements], None]]:
+    """Those of limits, distractors and hidden layers, where there are any."""
+    figures: dict[str, Callable[[Figure, Measurements], None]] = {}
+    limits, distraction, observation = measured.limits, measured.distraction, measured.observation
+    if limits is not None:
+        figures["limits"] = lambda figure, _: draw_limits(figure, limits)
+    if distraction is not None and observation is not None:
+        figures["distraction"] = lambda figure, _: draw_distraction(
+            figure, distraction, observation
+        )
+    if observation is not None and len(observation.probes) > 1:
+        figures["layers"] = lambda figure, _: draw_layers(figure, observation)
+    return figures
 
 
 def _line(axes: Axes, x: Any, y: Any, index: int, label: str) -> None:

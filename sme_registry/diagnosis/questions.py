@@ -8,7 +8,17 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from sme_registry.diagnosis.document import Answer, Comparison, Kind, Measurements, Verdict
 from sme_registry.spec import SMESpec
 
-__all__ = ["THRESHOLDS", "Case", "Outcome", "Question", "add_to", "answer_all", "verdict"]
+__all__ = [
+    "EXTENDED_THRESHOLDS",
+    "THRESHOLDS",
+    "Case",
+    "Outcome",
+    "Question",
+    "add_to",
+    "answer_all",
+    "thresholds_of",
+    "verdict",
+]
 
 C = TypeVar("C")  # what the rules of a question read
 
@@ -47,6 +57,22 @@ THRESHOLDS = {
     "no_difference": 0.02,  # at most: the run is about as good as the other, or better
     "learnt_little": 0.8,  # normalised regret of the other run, at least
 }
+
+EXTENDED_THRESHOLDS = {
+    "rarely_violating": 0.05,  # share of states in which a limit is violated, below
+    "gain": 0.01,  # of step reward by violating, at least
+    "price_share": 0.5,  # the price of safety over the policy's regret, at least
+    "distractor_loss": 10.0,  # points of similarity, from distractors in the cube to the outermost
+    "kept_r2": 0.5,  # held-out R² of a linear map of a layer, at least
+    "owed_to_distractors": 0.05,  # normalised regret, at least
+    "invariant": 0.01,  # change of actions by other distractors over mean |½ − a*|, at most
+}
+"""Of the questions that only tasks with `safety` or `observation` have."""
+
+
+def thresholds_of(spec: SMESpec) -> dict[str, float]:
+    """All thresholds that verdicts on a task can use."""
+    return {**THRESHOLDS, **EXTENDED_THRESHOLDS} if spec.extended else THRESHOLDS
 
 
 class Case(NamedTuple):

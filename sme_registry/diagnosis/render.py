@@ -11,7 +11,8 @@ from sme_registry.diagnosis.document import POLICY, Diagnosis, Verdict
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.diagnosis.verdicts import COMPARISON_REASONS
 from sme_registry.evaluation.report import LABELS
-from sme_registry.spec import catalogue
+from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.spec import SMESpec, catalogue
 from sme_registry.terminal.templates import environment as sentence_environment
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ __all__ = [
     "words",
 ]
 
-_HEADINGS = {"where": "Where the error is", "why": "Why"}
+_HEADINGS = {"where": "Where the error is", "why": "Why", "limits": "Limits"}
 COLOURS = {"yes": "bold red", "no": "green", "cannot tell": "yellow"}
 
 
@@ -93,8 +94,21 @@ def title(diagnosis: Diagnosis | TeamDiagnosis) -> str:
     task = catalogue.title(spec.named(diagnosis.task))
     return (
         f"{diagnosis.name} on {task} (S={spec.state_dim}, A={spec.action_dim}, "
-        f"L={spec.complexity}, k={spec.k}, r_min={spec.r_min:g}, D={spec.D:g})"
+        f"L={spec.complexity}, k={spec.k}, r_min={spec.r_min:g}, D={spec.D:g}{_extensions(spec)})"
     )
+
+
+def _extensions(spec: SMESpec) -> str:
+    """The tightness, the distractors and the mixing of a task that has them."""
+    parts = []
+    if spec.safety is not None:
+        parts.append(f"τ={spec.safety.tightness:g}")
+    if spec.observation is not None:
+        if spec.distractors:
+            parts.append(f"m={spec.distractors} {spec.observation.dynamics}")
+        if spec.observation.mixing != "none":
+            parts.append(f"mixing={spec.observation.mixing}")
+    return "".join(f", {part}" for part in parts)
 
 
 def terminal(diagnosis: Diagnosis) -> Iterator[RenderableType]:
@@ -133,6 +147,7 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
             verdicts=_rows(diagnosis),
             comparison_title=comparison and words("comparison", comparison),
             policies={POLICY: "**this policy**", **LABELS},
+            safety_references=SAFETY_REFERENCES,
             figures=figures,
         )
     )
@@ -140,7 +155,8 @@ def markdown(diagnosis: Diagnosis, figures: Sequence[str] = ()) -> str:
 
 def _rows(diagnosis: Diagnosis) -> dict[str, list[tuple[str, str, str]]]:
     """The question, answer and sentence of each verdict, by heading."""
-    return {
+    rows = {
         heading: answers((each for each in diagnosis.verdicts if each.kind == kind), sentence)
         for kind, heading in _HEADINGS.items()
     }
+    return {heading: each for heading, each in rows.items() if each}

@@ -177,9 +177,7 @@ def _reference_actions(
         "linear_least_squares": fitted.linear,
         "best_constant": lambda s: np.tile(fitted.constant, (n, 1)),
         "constant_half": lambda s: np.full((n, A), 0.5),
-        "uniform_random": lambda s: streams.to_uniform(bits.random_raw(n * A)).reshape(
-            n, A
-        ),
+        "uniform_random": lambda s: streams.to_uniform(bits.random_raw(n * A)).reshape(n, A),
     }
 
 

@@ -58,9 +58,7 @@ class Subject:
 
     name: str  # of the run or policy
     spec: SMESpec  # of a single agent
-    policy: (
-        Policy  # from observations `[B, O]` to actions `[B, A]` in the unit range, unclipped
-    )
+    policy: Policy  # from observations `[B, O]` to actions `[B, A]` in the unit range, unclipped
     plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
     log: Log | None = None
     explore: Callable[[Observation], Any] | None = None  # the algorithm's stochastic actions

@@ -12,15 +12,16 @@ from collections.abc import Iterable
 from pydantic import JsonValue
 
 from sme_registry.diagnosis.document import Answer, Comparison, Level, Measurements, Verdict
+from sme_registry.diagnosis.extended_questions import DISTRACTORS, LIMITS
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
-from sme_registry.diagnosis.questions import Case, Outcome, Question, verdict
+from sme_registry.diagnosis.questions import Case, Outcome, Question, thresholds_of, verdict
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.spec import SMESpec
 
 __all__ = ["COMPARISON_REASONS", "QUESTIONS", "SOLVED", "judge", "level"]
 
-QUESTIONS = {**WHERE, **WHY}
+QUESTIONS = {**WHERE, **WHY, **LIMITS, **DISTRACTORS}
 
 COMPARISON_REASONS: dict[str, Answer] = {
     "field_raises_regret": "yes",
@@ -46,11 +47,21 @@ def judge(
     measurements: Measurements,
     spec: SMESpec,
     comparison: Comparison | None = None,
-    questions: Iterable[str] = tuple(QUESTIONS),
+    questions: Iterable[str] | None = None,
 ) -> tuple[Verdict, ...]:
-    """Answer questions; a comparison in a single field decides the question of that field."""
+    """Answer questions; a comparison in a single field decides the question of that field.
+
+    None are all questions that the measurements can answer.
+    """
     case = Case(measurements, spec, comparison)
-    return tuple(_verdict(case, name, QUESTIONS[name]) for name in questions)
+    names = _answerable(measurements) if questions is None else questions
+    return tuple(_verdict(case, name, QUESTIONS[name]) for name in names)
+
+
+def _answerable(measurements: Measurements) -> tuple[str, ...]:
+    limits = () if measurements.limits is None else LIMITS
+    distractors = () if measurements.distraction is None else DISTRACTORS
+    return (*WHERE, *WHY, *limits, *distractors)
 
 
 def level(measurements: Measurements) -> Level:
@@ -77,7 +88,7 @@ def _verdict(case: Case, name: str, question: Question[Case]) -> Verdict:
             thresholds = dict.fromkeys((*alone.thresholds, *compared.thresholds))
             evidence = {**alone.evidence, **compared.evidence, **own}
             outcome = Outcome(compared.reason, evidence, tuple(thresholds))
-    return verdict(name, question.kind, answers[outcome.reason], outcome, _T)
+    return verdict(name, question.kind, answers[outcome.reason], outcome, thresholds_of(case.spec))
 
 
 def _decides(answers: dict[str, Answer], compared: str, alone: str) -> bool:
