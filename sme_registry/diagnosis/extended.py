@@ -97,7 +97,8 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
     """
     m, numbers = task.spec.distractors, task.spec.observation_dim + task.spec.action_dim
     few = min(_STATES, len(states.s), max(8, MAX_NUMBERS // (_DRAWS * numbers)))
-    drawn, optimal = States(*(x[:few] for x in states.drawn)), states.optimal[:few]
+    s, d, time = states.drawn
+    drawn, optimal = States(s[:few], d[:few], time[:few]), states.optimal[:few]
     half = max(float(np.abs(0.5 - optimal).mean()), _TINY)
 
     def act(d: Array) -> Array:

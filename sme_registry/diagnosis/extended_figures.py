@@ -10,7 +10,7 @@ from sme_registry.diagnosis.document import Distraction, Limits
 from sme_registry.evaluation import ObservationReport, SafetyScore
 from sme_registry.evaluation.report import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
-from sme_registry.plots.style import COLOURS, GREY, draw_reference, legend_above, look
+from sme_registry.plots.style import COLOURS, GREY, legend_above, look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,6 +20,7 @@ __all__ = ["draw_distraction", "draw_layers", "draw_limits"]
 
 _MARKERS = ("*", "P", "X", "d")
 _MAX_CHANNELS = 32
+_HALF = LABELS["constant_half"]
 
 
 def draw_limits(figure: Figure, limits: Limits) -> None:
@@ -30,7 +31,7 @@ def draw_limits(figure: Figure, limits: Limits) -> None:
     own = {
         "this policy": limits.report.regions[0],
         "cut off at the limits": limits.cut_off,
-        "where it goes": limits.visited,
+        "in visited states": limits.visited,
     }
     for index, (label, score) in enumerate(own.items()):
         _point(left, score, label, str(look(index)["marker"]), COLOURS[index])
@@ -69,31 +70,28 @@ def draw_distraction(
     left, right = figure.subplots(1, 2)
     bars = {
         "uniform": distraction.normalised_regret,
-        "averaged\nout": distraction.averaged,
+        "averaged out": distraction.averaged,
         "all at ½": distraction.at_half,
-        **{
-            region.name.replace(" ", "\n"): region.normalised_regret
-            for region in observation.distractor_regions
-        },
+        **{region.name: region.normalised_regret for region in observation.distractor_regions},
     }
     colours = [COLOURS[0]] * 3 + [COLOURS[1]] * len(observation.distractor_regions)
-    drawn = left.bar(range(len(bars)), list(bars.values()), 0.7, color=colours)
-    left.bar_label(drawn, [f"{value:.2f}" for value in bars.values()], padding=2, fontsize=7.5)
-    left.set_xticks(range(len(bars)), list(bars), fontsize=7.5)
-    draw_reference(left, "constant_half", None, 1.0, LABELS["constant_half"])
-    left.set_ylim(0.0, max(1.15, 1.1 * max(bars.values())))
-    left.set_xlabel("distractors")
-    left.set_ylabel("normalised regret  (0 = optimal)")
+    drawn = left.barh(list(bars), list(bars.values()), 0.7, color=colours)
+    left.bar_label(drawn, [f"{value:.2f}" for value in bars.values()], padding=3, fontsize=8)
+    left.invert_yaxis()
+    left.axvline(1.0, color=GREY, linewidth=1.1, linestyle=(0, (4, 4)), label=_HALF)
+    left.set_xlim(0.0, max(1.15, 1.1 * max(bars.values())))
+    left.set_xlabel("normalised regret  (0 = optimal)")
+    left.set_ylabel("distractors")
     names = [each.name for each in observation.invariance]
     changes = [each.invariance for each in observation.invariance]
     drawn = right.bar(names, changes, 0.7, color=COLOURS[2])
-    right.bar_label(drawn, [f"{value:.2f}" for value in changes], padding=2, fontsize=7.5)
+    right.bar_label(drawn, [f"{value:.2f}" for value in changes], padding=2, fontsize=8)
     right.set_ylim(0.0, max(0.1, 1.15 * max(changes)))
     right.set_xlabel("region of the state")
     right.set_ylabel("change of a by other distractors\n(unit: mean |½ − a*|)")
     legend_above(left)
-    for axes in (left, right):
-        axes.grid(visible=False, axis="x")
+    left.grid(visible=False, axis="y")
+    right.grid(visible=False, axis="x")
 
 
 def draw_layers(figure: Figure, observation: ObservationReport) -> None:

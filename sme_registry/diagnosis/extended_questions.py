@@ -103,7 +103,7 @@ def _price_of_safety(case: Case) -> Outcome:
 def _distractors_outside(case: Case) -> Outcome:
     _, observation = _distractors(case)
     outside = observation.distractor_regions[-1]
-    loss = outside.similarity_loss
+    loss = 100.0 * (outside.mae - case.measurements.policy.mae)
     lost = loss >= _T["distractor_loss"]
     return Outcome(
         "similarity_lost" if lost else "similarity_kept",

@@ -12,11 +12,19 @@ from rich.console import Console
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy
+from sme_registry.evaluation import Perceptron
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.terminal import out
 
 SPEC = SMESpec(horizon=20)
 DEEP = SMESpec(horizon=20, complexity=10, seed=1)
+DISTRACTORS = 6
+EXTENDED = SMESpec(
+    horizon=20,
+    safety={"tightness": 0.2},
+    observation={"distractors": DISTRACTORS},
+    policy_init="unit_variance",
+)
 
 
 def optimum(spec: SMESpec) -> Any:
@@ -90,3 +98,23 @@ class Noisy:
     def __call__(self, observation: Any) -> Any:
         a = optimum(SPEC)(observation)
         return a + 0.1 * self.generator.standard_normal(a.shape)
+
+
+def distracted(observation: Any) -> Any:
+    """π* that adds a known function of the first four distractors."""
+    return optimum(EXTENDED)(observation) + 0.2 * (observation[:, 8:12] - 0.5)
+
+
+def network(hidden: int = 16, *, keeps: slice = slice(0, 8 + DISTRACTORS)) -> Perceptron:
+    """A random network, whose only hidden layer has a linear image of these channels."""
+    generator = np.random.default_rng(0)
+    inside = np.zeros((EXTENDED.observation_dim, hidden))
+    width = len(range(*keeps.indices(len(inside))))
+    inside[keeps] = generator.normal(size=(width, hidden))
+    outside = generator.normal(size=(hidden, EXTENDED.action_dim)) / (4 * hidden)
+    return Perceptron(
+        [
+            (inside, np.zeros(hidden), "identity"),
+            (outside, np.full(EXTENDED.action_dim, 0.5), "identity"),
+        ]
+    )

@@ -18,7 +18,7 @@ from sme_registry.diagnosis.document import (
     Measurements,
     Training,
 )
-from tests.diagnosis.policies import SPEC, diagnosis_of, printed, shrunk
+from tests.diagnosis.policies import EXTENDED, SPEC, diagnosis_of, network, printed, shrunk
 
 DECLARED = {
     (question, reason)
@@ -65,8 +65,12 @@ def random_verdicts(count: int) -> Iterator[Verdict]:
     """The verdicts on random measurements, on tasks with every axis on or off."""
     generator = random.Random(0)
     plain = diagnosis_of(shrunk, states=64).measurements.to_dict()
+    extended = diagnosis_of(network(), EXTENDED, states=64).measurements.to_dict()
     for _ in range(count):
-        measured = Measurements.from_dict(scrambled(plain, generator), "random")
+        base, specs = generator.choice(
+            ((plain, (SPEC, SPEC.derive(k=5, r_min=0.5, D=0.3))), (extended, (EXTENDED,)))
+        )
+        measured = Measurements.from_dict(scrambled(base, generator), "random")
         channels = measured.channels
         if generator.random() < 0.5:  # one channel learnt and one not
             low, high = ({"normalised_regret": x, "slope": 3.0} for x in (0.1, 1.0))
@@ -79,7 +83,10 @@ def random_verdicts(count: int) -> Iterator[Verdict]:
                 "exploration_sd": generator.choice((None, (0.0, 0.0), (0.1, 0.3))),
             }
         )
-        spec = generator.choice((SPEC, SPEC.derive(k=5, r_min=0.5, D=0.3)))
+        if measured.observation is not None and generator.random() < 0.2:
+            unknown = measured.observation.model_copy(update={"probes": ()})
+            measured = measured.model_copy(update={"observation": unknown})
+        spec = generator.choice(specs)
         comparison = None
         if generator.random() < 0.5:
             field = generator.choice(list(FIELDS))
@@ -97,7 +104,7 @@ def random_verdicts(count: int) -> Iterator[Verdict]:
 
 def test_every_question_and_reason_is_reached_and_has_a_sentence() -> None:
     reached = set()
-    for verdict in random_verdicts(2000):
+    for verdict in random_verdicts(4000):
         reached.add((verdict.question, verdict.reason))
         text = render.sentence(verdict)
         assert text.endswith(".")

@@ -11,6 +11,8 @@ from sme_registry import SMESpec
 from sme_registry.diagnosis import Subject, Verdict, diagnose, load_policy, render, verdicts
 from sme_registry.diagnosis.document import CapacityProbe, Comparison, Difference
 from sme_registry.diagnosis.subject import Log
+from sme_registry.diagnosis.where import WHERE
+from sme_registry.diagnosis.why import WHY
 from sme_registry.errors import SMEError, UnknownNameError
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (
@@ -331,7 +333,7 @@ def test_a_verdict_has_the_name_that_is_shown_and_the_name_in_data() -> None:
     by_data = diagnosis.verdict("credit_assignment")
     assert diagnosis.verdict("credit assignment") is by_data
     assert diagnosis.verdict(" Credit  Assignment ") is by_data
-    for question in verdicts.QUESTIONS:
+    for question in (*WHERE, *WHY):
         assert diagnosis.verdict(render.label(question)).question == question
     with pytest.raises(SMEError, match=r"action channels, .*Did you mean 'sparsity'"):
         diagnosis.verdict("sparcity")
