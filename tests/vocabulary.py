@@ -33,6 +33,13 @@ QUANTITIES = {
     "units": "outputs of a layer",
     "state_r2": "held-out R² of a linear map from a layer to the state",
     "distractor_r2": "the same to the distractors",
+    "optimal_violating_share": "violating_share of the optimum",
+    "averaged_regret": "normalised regret of the mean action over distractors, in each state",
+    "half_regret": "normalised regret with every distractor at ½",
+    "owed_regret": "normalised regret that averaging over the distractors removes",
+    "owed_similarity": "the same in points of similarity",
+    "distractor_share": "share of the squared error that varies with the distractors",
+    "distractor_draws": "draws of the distractors, in each state",
     # Performance in a stream, from the retention matrix of normalised regrets
     "initial_normalised_regret": "normalised regret of the initial policy on each phase",
     "fresh_normalised_regret": "that of an agent trained on that phase alone",

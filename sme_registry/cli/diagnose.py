@@ -80,6 +80,9 @@ def diagnose(
     separate causes; --against or --probe-capacity then often help. With --out, it also writes
     diagnosis.json, diagnosis.md and figures.
 
+    On a task with limits or distractors, it also shows whether the policy violates the limits and
+    earns by it, and how much of its regret is owed to the distractors.
+
     Of a team, it shows who is to blame for the team's regret, and where each agent's own error is.
     Of a life in a stream, it shows which phases were costly, forgotten or never learnt, whether
     plasticity was lost, and the state of the network after each visit.

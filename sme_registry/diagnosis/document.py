@@ -215,13 +215,13 @@ class Distraction(StrictModel):
     """Regret owed to the distractors, in a few uniform states; see `diagnosis.extended`."""
 
     states: Integer
-    draws: Integer  # of the distractors, in each state
+    distractor_draws: Integer  # of the distractors, in each state
     normalised_regret: Real  # N over states and draws
-    averaged: Real  # N of the mean action over the draws, in each state
-    at_half: Real  # N with every distractor at ½
-    owed: Real  # N that averaging removes, beyond what it removes of an action noise
+    averaged_regret: Real  # N of the mean action over the draws, in each state
+    half_regret: Real  # N with every distractor at ½
+    owed_regret: Real  # N that averaging removes, beyond what it removes of an action noise
     owed_similarity: Real  # the same in points of similarity
-    squared_share: Real  # share of the squared error that varies with the distractors
+    distractor_share: Real  # share of the squared error that varies with the distractors
 
 
 class Measurements(StrictModel):

@@ -121,13 +121,13 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
     centre = act(np.full((few, m), 0.5))
     return Distraction(
         states=few,
-        draws=_DRAWS,
+        distractor_draws=_DRAWS,
         normalised_regret=varied.regret,
-        averaged=varied.averaged,
-        at_half=float(np.abs(centre - optimal).mean()) / half,
-        owed=owed,
+        averaged_regret=varied.averaged,
+        half_regret=float(np.abs(centre - optimal).mean()) / half,
+        owed_regret=owed,
         owed_similarity=100.0 * half * owed,
-        squared_share=max(0.0, varied.variance - repeated.variance) / max(error, _TINY),
+        distractor_share=max(0.0, varied.variance - repeated.variance) / max(error, _TINY),
     )
 
 

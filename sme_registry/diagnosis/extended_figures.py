@@ -70,8 +70,8 @@ def draw_distraction(
     left, right = figure.subplots(1, 2)
     bars = {
         "uniform": distraction.normalised_regret,
-        "averaged out": distraction.averaged,
-        "all at ½": distraction.at_half,
+        "averaged out": distraction.averaged_regret,
+        "all at ½": distraction.half_regret,
         **{region.name: region.normalised_regret for region in observation.distractor_regions},
     }
     colours = [COLOURS[0]] * 3 + [COLOURS[1]] * len(observation.distractor_regions)

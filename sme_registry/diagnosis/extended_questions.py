@@ -148,7 +148,7 @@ def _distractors_represented(case: Case) -> Outcome:
 def _distraction(case: Case) -> Outcome:
     effect, observation = _distractors(case)
     invariance = observation.invariance[0].invariance
-    if effect.owed >= _T["owed_to_distractors"]:
+    if effect.owed_regret >= _T["owed_to_distractors"]:
         reason = "distracted"
     else:
         reason = "invariant" if invariance <= _T["invariant"] else "hardly_distracted"
@@ -157,7 +157,7 @@ def _distraction(case: Case) -> Outcome:
         {
             "distractors": case.spec.distractors,
             "invariance": invariance,
-            **effect.model_dump(exclude={"states", "draws"}),
+            **effect.model_dump(exclude={"states", "distractor_draws"}),
         },
         ("owed_to_distractors", "invariant"),
     )

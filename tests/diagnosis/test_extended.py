@@ -23,6 +23,7 @@ from tests.diagnosis.policies import (
     printed,
     shrunk,
 )
+from tests.geometry import assert_readable
 
 MIXED = EXTENDED.derive(
     observation={"distractors": 4, "mixing": "nonlinear", "dynamics": "autonomous"}
@@ -76,7 +77,7 @@ def test_a_constant_is_neither_distracted_nor_unsafe() -> None:
     assert set(answers(diagnosis).values()) == {"no"}
     assert diagnosis.verdict("constraint_violation").reason == "within_limits"
     assert diagnosis.verdict("distraction").reason == "invariant"
-    assert evidence(diagnosis, "distraction")["owed"] == pytest.approx(0.0, abs=1e-12)
+    assert evidence(diagnosis, "distraction")["owed_regret"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_an_oracle_that_adds_a_function_of_the_distractors_owes_them_its_regret() -> None:
@@ -86,10 +87,12 @@ def test_an_oracle_that_adds_a_function_of_the_distractors_owes_them_its_regret(
     found: Any = verdict.evidence
     # |a − a*| = 0.2 |d − ½|, of which the mean is 0.05: five points, but where it is clipped.
     assert found["owed_similarity"] == pytest.approx(5.0, abs=0.4)
-    assert found["owed"] == pytest.approx(diagnosis.measurements.policy.normalised_regret, abs=0.02)
-    assert found["averaged"] < 0.02
-    assert found["at_half"] < 1e-6
-    assert found["squared_share"] == pytest.approx(1.0, abs=0.05)
+    assert found["owed_regret"] == pytest.approx(
+        diagnosis.measurements.policy.normalised_regret, abs=0.02
+    )
+    assert found["averaged_regret"] < 0.02
+    assert found["half_regret"] < 1e-6
+    assert found["distractor_share"] == pytest.approx(1.0, abs=0.05)
     assert "Why: distraction." in render.headline(diagnosis)
 
 
@@ -100,7 +103,7 @@ def test_distractors_that_only_hide_another_fault_owe_little() -> None:
 
     verdict = diagnosis_of(offset, EXTENDED).verdict("distraction")
     assert (verdict.answer, verdict.reason) == ("no", "hardly_distracted")
-    assert 0.0 <= verdict.evidence["owed"] < 0.01
+    assert 0.0 <= verdict.evidence["owed_regret"] < 0.01
 
 
 def test_a_random_policy_is_noisy_and_not_distracted() -> None:
@@ -113,7 +116,7 @@ def test_a_random_policy_is_noisy_and_not_distracted() -> None:
     diagnosis = diagnosis_of(noisy, EXTENDED)
     assert diagnosis.verdict("action_noise").answer == "yes"
     assert diagnosis.verdict("distraction").answer == "no"
-    assert evidence(diagnosis, "distraction")["owed"] < 0.02
+    assert evidence(diagnosis, "distraction")["owed_regret"] < 0.02
 
 
 def test_a_policy_that_fails_only_outside_the_distractors_cube_is_found() -> None:
@@ -242,12 +245,14 @@ def test_a_mixing_alone_asks_nothing_of_distractors() -> None:
 
 
 def test_the_page_the_terminal_and_the_data_have_limits_distractors_and_layers(
-    tmp_path: Any,
+    tmp_path: Any, figures: list[Any]
 ) -> None:
     diagnosis = diagnosis_of(network(), EXTENDED, states=256)
-    figures = [path.name for path in draw(diagnosis, tmp_path) if path.suffix == ".png"]
-    assert {"limits.png", "distraction.png", "layers.png"} <= set(figures)
-    page = render.markdown(diagnosis, figures)
+    names = [path.name for path in draw(diagnosis, tmp_path) if path.suffix == ".png"]
+    assert {"limits.png", "distraction.png", "layers.png"} <= set(names)
+    for figure in figures:
+        assert_readable(figure)
+    page = render.markdown(diagnosis, names)
     for heading in ("## Limits", "## Distractors", "## Layers"):
         assert heading in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
