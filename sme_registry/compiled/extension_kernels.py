@@ -245,16 +245,16 @@ def _block_limits(q, first, count, action, optimal, x, excess, missed, values, l
 
 
 @njit(inline="always", error_model="numpy")
-def _block_numbers(own, first, count, numbers, start):  # type: ignore[no-untyped-def]
-    """The next random numbers of a block of lanes, into `numbers` `[n, lanes]`."""
+def _block_numbers(own, first, count, n, start, out, row, column):  # type: ignore[no-untyped-def]
+    """The next n random numbers of a block of lanes, into `out` from its row and column on."""
     for lane in range(count):
         start[lane] = _mixed(uint64(own[OWN_KEY, first + lane]))
         start[lane] += GOLDEN * uint64(own[OWN_DRAWN, first + lane])
-        own[OWN_DRAWN, first + lane] += float64(numbers.shape[0])
-    for j in range(numbers.shape[0]):
+        own[OWN_DRAWN, first + lane] += float64(n)
+    for j in range(n):
         place = uint64(j + 1)
         for lane in range(count):
-            numbers[j, lane] = _uniform(start[lane], place)
+            out[row + j, column + lane] = _uniform(start[lane], place)
 
 
 @njit(inline="always", error_model="numpy")
@@ -288,17 +288,14 @@ def _block_inputs(after, own, first, count, x):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", error_model="numpy")
-def _block_distractors(q, at, own, first, count, action, driving, noise, start, column):  # type: ignore[no-untyped-def]
+def _block_distractors(q, at, own, first, count, action, driving, start, column):  # type: ignore[no-untyped-def]
     """Move the distractors of a block of lanes; returns what follows their transition in `q`."""
     A, m, dynamics = int(q[1]), int(q[2]), int(q[5])
     if dynamics == _NOISE:
-        _block_numbers(own, first, count, noise[:m], start)
-        for j in range(m):
-            for lane in range(count):
-                own[OWN_DISTRACTORS + j, first + lane] = noise[j, lane]
+        _block_numbers(own, first, count, m, start, own, OWN_DISTRACTORS, first)
         return at
     if dynamics == _AUTONOMOUS:
-        _block_numbers(own, first, count, driving, start)
+        _block_numbers(own, first, count, A, start, driving, 0, 0)
     for i in range(A):
         for lane in range(count):
             if dynamics != _AUTONOMOUS:
@@ -351,13 +348,13 @@ def extend_many(q, own, before, after, action, optimal, values, observation, lim
             x, y, at = block_layers(q, at, int(q[8]), x, y, cells, count, True)
             _block_limits(q, first, count, action, optimal, x, column, second, values, limits)
         if m > 0:
-            at = _block_distractors(q, at, own, first, count, action, driving, x, start, column)
+            at = _block_distractors(q, at, own, first, count, action, driving, start, column)
         if m > 0 or mixing > 0:
             for lane in range(first, first + count):
                 of_t, of_r_cum = observation[lane, S], observation[lane, S + 1]
                 observation[lane, S + m], observation[lane, S + m + 1] = of_t, of_r_cum
             _block_inputs(after, own, first, count, x)
             x, y, at = block_layers(q, at, mixing, x, y, cells, count, q[6] == 1.0)
-            for j in range(S + m):
-                for lane in range(count):
+            for lane in range(count):
+                for j in range(S + m):
                     observation[first + lane, j] = x[j, lane]

@@ -243,42 +243,81 @@ def step_packed_lane(lane, action, optimal, observation):  # type: ignore[no-unt
     return lane_step(lane, lane, np.uint64(lane[8]), action, optimal, observation)
 
 
+@njit(inline="always", error_model="numpy")
+def _four_sums(W, b, x, y, o, count):  # type: ignore[no-untyped-def]
+    """W x + b of the outputs o … o + 3 for `count` lanes: each input is read once for all four."""
+    # Two indices everywhere: a row taken as an array of its own costs two atomic operations.
+    inputs = W.shape[0]
+    o0, o1, o2, o3 = np.uint64(o), np.uint64(o + 1), np.uint64(o + 2), np.uint64(o + 3)
+    b0, b1, b2, b3 = b[o0], b[o1], b[o2], b[o3]
+    for lane in range(count):
+        y[o0, lane], y[o1, lane], y[o2, lane], y[o3, lane] = b0, b1, b2, b3
+    i = 0
+    while i + 4 <= inputs:
+        i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
+        a0, a1, a2, a3 = W[i0, o0], W[i1, o0], W[i2, o0], W[i3, o0]
+        c0, c1, c2, c3 = W[i0, o1], W[i1, o1], W[i2, o1], W[i3, o1]
+        d0, d1, d2, d3 = W[i0, o2], W[i1, o2], W[i2, o2], W[i3, o2]
+        e0, e1, e2, e3 = W[i0, o3], W[i1, o3], W[i2, o3], W[i3, o3]
+        for lane in range(count):
+            x0, x1, x2, x3 = x[i0, lane], x[i1, lane], x[i2, lane], x[i3, lane]
+            y[o0, lane] = (((y[o0, lane] + a0 * x0) + a1 * x1) + a2 * x2) + a3 * x3
+            y[o1, lane] = (((y[o1, lane] + c0 * x0) + c1 * x1) + c2 * x2) + c3 * x3
+            y[o2, lane] = (((y[o2, lane] + d0 * x0) + d1 * x1) + d2 * x2) + d3 * x3
+            y[o3, lane] = (((y[o3, lane] + e0 * x0) + e1 * x1) + e2 * x2) + e3 * x3
+        i += 4
+    while i < inputs:
+        i0 = np.uint64(i)
+        a0, c0, d0, e0 = W[i0, o0], W[i0, o1], W[i0, o2], W[i0, o3]
+        for lane in range(count):
+            x0 = x[i0, lane]
+            y[o0, lane] = y[o0, lane] + a0 * x0
+            y[o1, lane] = y[o1, lane] + c0 * x0
+            y[o2, lane] = y[o2, lane] + d0 * x0
+            y[o3, lane] = y[o3, lane] + e0 * x0
+        i += 1
+
+
+@njit(inline="always", error_model="numpy")
+def _one_sum(W, b, x, y, o, count):  # type: ignore[no-untyped-def]
+    """W x + b of the output o for `count` lanes, four inputs at a time."""
+    inputs, bias = W.shape[0], b[o]
+    for lane in range(count):
+        y[o, lane] = bias
+    i = 0
+    while i + 4 <= inputs:
+        i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
+        w0, w1, w2, w3 = W[i0, o], W[i1, o], W[i2, o], W[i3, o]
+        for lane in range(count):
+            total = y[o, lane] + w0 * x[i0, lane]
+            total = total + w1 * x[i1, lane]
+            total = total + w2 * x[i2, lane]
+            y[o, lane] = total + w3 * x[i3, lane]
+        i += 4
+    while i < inputs:
+        i0 = np.uint64(i)
+        w = W[i0, o]
+        for lane in range(count):
+            y[o, lane] = y[o, lane] + w * x[i0, lane]
+        i += 1
+
+
 @njit(error_model="numpy")
 def _block_layer(W, b, x, y, cells, count, uniform=True):  # type: ignore[no-untyped-def]
     """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed.
 
-    `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b.
+    `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b. Each sum runs over
+    its inputs in ascending order.
     """
-    # Two indices everywhere: a row taken as an array of its own costs two atomic operations.
-    inputs, outputs = W.shape
+    outputs = W.shape[1]
+    in_fours = outputs - outputs % 4
+    for o in range(0, in_fours, 4):
+        _four_sums(W, b, x, y, o, count)
+    for o in range(in_fours, outputs):
+        _one_sum(W, b, x, y, o, count)
+    if not uniform:
+        return
     for o in range(outputs):
-        bias = b[o]
-        for lane in range(count):
-            y[o, lane] = bias
-        i = 0
-        while i + 8 <= inputs:
-            i0, i1, i2, i3 = np.uint64(i), np.uint64(i + 1), np.uint64(i + 2), np.uint64(i + 3)
-            i4, i5, i6, i7 = np.uint64(i + 4), np.uint64(i + 5), np.uint64(i + 6), np.uint64(i + 7)
-            w0, w1, w2, w3 = W[i0, o], W[i1, o], W[i2, o], W[i3, o]
-            w4, w5, w6, w7 = W[i4, o], W[i5, o], W[i6, o], W[i7, o]
-            for lane in range(count):
-                z = y[o, lane] + w0 * x[i0, lane]
-                z = z + w1 * x[i1, lane]
-                z = z + w2 * x[i2, lane]
-                z = z + w3 * x[i3, lane]
-                z = z + w4 * x[i4, lane]
-                z = z + w5 * x[i5, lane]
-                z = z + w6 * x[i6, lane]
-                y[o, lane] = z + w7 * x[i7, lane]
-            i += 8
-        while i < inputs:
-            i0 = np.uint64(i)
-            w = W[i0, o]
-            for lane in range(count):
-                y[o, lane] = y[o, lane] + w * x[i0, lane]
-            i += 1
-        if not uniform:
-            continue
         for lane in range(count):
             cells[lane], y[o, lane] = cell_of(y[o, lane])
         for lane in range(count):
