@@ -1,6 +1,6 @@
 """`export_onnx`: the deterministic policy of a network as an ONNX file.
 
-    input `observations` [B, S + 2] float32  →  output `actions` [B, A] float32 in [0, 1]
+    input `observations` [B, O] float32  →  output `actions` [B, A] float32 in [0, 1]
 
 The graph contains every step from an observation to an action of the unit range, clipping
 included. Its actions are compared with the policy's, and a file that differs is never written.
@@ -48,7 +48,7 @@ def export_onnx(
     """Write a policy as an ONNX file, and check the file against the policy.
 
     Args:
-      policy: a network from observations `[B, S + 2]` to actions `[B, A]`, one of
+      policy: a network from the task's observations `[B, O]` to actions `[B, A]`, one of
         a `torch.nn.Module`, or a function of PyTorch tensors such as `lambda o: actor(o).mean`;
         a `Perceptron` of arrays: a JAX network's parameters, or a linear map;
         a Stable-Baselines3 model, or the path of its .zip (loading it can run code of its author);

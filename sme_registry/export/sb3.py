@@ -62,7 +62,7 @@ def _network(model: Any) -> Any:
 
 
 def _widths(network: Any) -> tuple[int, int]:
-    """S + 2 and A, entries of the model's observations and actions."""
+    """O and A, entries of the model's observations and actions."""
     widths = []
     for what in ("observation", "action"):
         shape = getattr(getattr(network, f"{what}_space"), "shape", None)

@@ -55,7 +55,7 @@ ReportProgress = Callable[[int, int, str], None]
 class OfflineResult:
     """A finished offline training."""
 
-    policy: OfflinePolicy  # from observations `[B, S + 2]` to actions `[B, A]`, for `evaluate`
+    policy: OfflinePolicy  # from observations `[B, O]` to actions `[B, A]`, for `evaluate`
     record: OfflineRecord  # the content of `offline.json`
     report: EvaluationReport  # of the policy
     folder: Path | None  # None if nothing was written

@@ -63,6 +63,23 @@ def test_the_same_seed_gives_the_same_policy_and_scores(
     assert not np.array_equal(parts(one)[0], parts(other)[0])
 
 
+@pytest.mark.parametrize("algorithm", ["bc", "iql"])
+def test_learners_see_what_the_agent_saw_and_the_report_has_its_cost(algorithm: str) -> None:
+    observed = {"distractors": 3, "mixing": "orthogonal"}
+    spec = TINY.derive(safety={"tightness": 0.2}, observation=observed)
+    data = transitions_of(spec)
+    one, two = (short(data, spec=spec, algorithm=algorithm) for _ in range(2))
+    assert one.record.evaluations == two.record.evaluations
+    assert one.report.to_dict() == two.report.to_dict()
+    assert one.policy.observation_dim == 7
+    assert one.report.safety is not None
+    assert one.report.observation is not None
+    with pytest.raises(OptionError, match=r"\(600, 4\) for state_dim=2, action_dim=2\."):
+        short(data, spec=TINY)
+    with pytest.raises(OptionError, match=r"\(600, 7\) for .*, action_dim=2, 3 distractors\."):
+        short(transitions_of(), spec=spec)
+
+
 def test_training_leaves_torch_as_it_was(transitions: Transitions) -> None:
     torch.set_num_threads(2)
     torch.manual_seed(5)

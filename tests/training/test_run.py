@@ -91,6 +91,19 @@ def test_the_same_seed_trains_the_same_model_and_another_one_does_not(
     assert [e.regret for e in other.episodes] != [e.regret for e in run.episodes]
 
 
+def test_a_run_with_limits_and_distractors_is_repeated_and_reports_both(tmp_path: Path) -> None:
+    observed = {"distractors": 3, "dynamics": "autonomous", "mixing": "orthogonal"}
+    spec = TINY.derive(safety={"tightness": 0.2}, observation=observed)
+    one, two = (
+        train(spec, folder=tmp_path / name, algorithm="TD3", steps=150, protocol=PROTOCOL)
+        for name in ("one", "two")
+    )
+    assert [e.regret for e in one.episodes] == [e.regret for e in two.episodes]
+    assert one.report.to_dict() == two.report.to_dict()
+    assert one.report.safety is not None
+    assert one.report.observation is not None
+
+
 def test_training_lowers_regret(tmp_path: Path) -> None:
     # One second of TD3 on a task of one channel; the first 100 steps act at random.
     spec = SMESpec(state_dim=1, action_dim=1, horizon=25, seed=1)
