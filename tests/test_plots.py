@@ -37,14 +37,17 @@ def report():
     return evaluate(half, PLANE, PROTOCOL, name=r"a $\frac$ name")
 
 
-EPISODES = [{"step": 100 * (i + 1), "regret": 1.0 - i / 50} for i in range(50)]
+EPISODES = [
+    {"step": 100 * (i + 1), "regret": 1.0 - i / 50, "cost": 0.1 - i / 500} for i in range(50)
+]
 
 
 @pytest.mark.parametrize("ending", FORMATS)
-@pytest.mark.parametrize("kind", ["decay_curve", "similarity_map", "training_curve"])
+@pytest.mark.parametrize("kind", ["cost_curve", "decay_curve", "similarity_map", "training_curve"])
 def test_every_figure_is_written_in_every_format(tmp_path, report, ending, kind):
     path = tmp_path / "new" / f"figure.{ending}"
     figure = {
+        "cost_curve": lambda: plots.cost_curve(EPISODES, path),
         "decay_curve": lambda: plots.decay_curve(report, path),
         "similarity_map": lambda: plots.similarity_map(half, PLANE, path, resolution=20),
         "training_curve": lambda: plots.training_curve(EPISODES, path),

@@ -39,8 +39,8 @@ def train(
         typer.Option(
             "--algorithm",
             "-a",
-            help="TD3, SAC, DDPG, PPO, A2C, or module:Class, such as sb3_contrib:TQC. Default TD3, "
-            "for teams PPO.",
+            help="TD3, SAC, DDPG, PPO, A2C, or module:Class, such as sb3_contrib:TQC; for tasks "
+            "with safety also PPOLagrangian, PPOProjection. Default TD3, for teams PPO.",
         ),
     ] = None,
     agents: Annotated[
@@ -137,6 +137,13 @@ def train(
     Stable-Baselines3 with the trained weights. Tasks of a new shape, or other hyperparameters, are
     compiled first, which takes some seconds.
 
+    PPOLagrangian and PPOProjection are for tasks with safety. PPOLagrangian is PPO that keeps the
+    mean cost of a step, exploration included, near cost_limit (0.01): a multiplier weighs costs
+    against rewards, and rises while the cost is above the limit, by multiplier_learning_rate times
+    the difference. PPOProjection is PPO whose actions are cut at the limits: it is given the task's
+    own limits, which no other agent knows, so it costs nothing. On such tasks, episodes.csv also
+    has the cost of each episode.
+
     On a stream, such as Switch5, the agent lives through all phases, in one environment and for as
     many steps as the stream has. The folder contains stream.json instead of evaluation.json (what
     the agent retains of each phase, and its dynamic regret beside that of reference agents), and in
@@ -169,6 +176,8 @@ def train(
       sme train Team4 --independent --steps 40000
 
       sme train Switch5 -a PPO --agents jax
+
+      sme train safe.json -a PPOLagrangian -n 100000 --set cost_limit=0.02
 
       sme train --suite mine.json -a PPO --out runs/mine
     """

@@ -228,3 +228,12 @@ def single_agent(task: Task) -> Task:
             "for one. Use sme_registry.make_parallel or sme_registry.make_aec."
         )
     return task
+
+
+def refuse_without_limits(who: str, spec: SMESpec) -> None:
+    """Raise OptionError if a task has no `safety`, which an algorithm or a wrapper needs."""
+    if spec.safety is None:
+        raise OptionError(
+            f"{who}: needs a task with limits, and this one has none. Give a task with safety; "
+            "`sme new task.json --safety '{\"tightness\": 0.2}'` writes one."
+        )

@@ -58,6 +58,12 @@ def _network(model: Any) -> Any:
         raise PolicyError(
             f"model={model!r:.80}: must be a Stable-Baselines3 model or the path of its .zip."
         )
+    if hasattr(network, "projection"):
+        raise PolicyError(
+            f"model: its policy is a {type(network).__name__}, which projects actions onto the "
+            "task's limits, and a projection cannot be exported. Export a model of another "
+            "algorithm, such as PPOLagrangian."
+        )
     return network
 
 

@@ -1,7 +1,7 @@
 """Files, folders, locks, strict JSON, arrays, spare memory, packages, argument checks."""
 
 from sme_registry.io.arrays import Arrays, read_arrays, write_arrays
-from sme_registry.io.checks import choice, integer_in
+from sme_registry.io.checks import choice, integer_in, number_in
 from sme_registry.io.files import (
     TEMPORARY,
     atomic_file,
@@ -42,6 +42,7 @@ __all__ = [
     "is_installed",
     "is_locked",
     "missing_dependency",
+    "number_in",
     "parse_json",
     "read_arrays",
     "read_json",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Collection
 from typing import Any
+
+import numpy as np
 
 from sme_registry.errors import OptionError, SMEError, did_you_mean
 
@@ -40,6 +43,23 @@ def integer_in(
         allowed = f"of at least {low:,}" if high is None else f"in [{low:,}, {high:,}]"
         raise error(f"{name}={value!r:.60}: must be an integer {allowed}.{advice and f' {advice}'}")
     return number
+
+
+def number_in(
+    name: str, value: Any, low: float, high: float = math.inf, *, advice: str = ""
+) -> float:
+    """Check a finite number, as `integer_in` checks an integer; booleans do not count.
+
+    Raises:
+      OptionError: not a finite number, or outside [low, high].
+    """
+    is_number = isinstance(value, int | float | np.number) and type(value).__name__ != "bool"
+    if not is_number or not (math.isfinite(value) and low <= value <= high):
+        allowed = f"of at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+        raise OptionError(
+            f"{name}={value!r:.60}: must be a finite number {allowed}.{advice and f' {advice}'}"
+        )
+    return float(value)
 
 
 def choice(

@@ -5,7 +5,7 @@ SVG by its ending, and draws in the caller's axes where it gets `ax`. `save_figu
 figure.
 """
 
-from sme_registry.plots.curves import learning_curve, training_curve
+from sme_registry.plots.curves import cost_curve, learning_curve, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
 from sme_registry.plots.observation import layer_probes, sensitivity_bars
@@ -19,6 +19,7 @@ from sme_registry.plots.streams import (
 from sme_registry.plots.style import save_figure
 
 __all__ = [
+    "cost_curve",
     "decay_curve",
     "dynamic_regret_curve",
     "layer_probes",

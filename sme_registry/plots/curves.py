@@ -1,4 +1,4 @@
-"""Regret during training: `training_curve` of one run, `learning_curve` of several methods.
+"""Training: `training_curve` and `cost_curve` of one run, `learning_curve` of several methods.
 
 x is the total of environment steps over all environments, sorted: parallel lanes end their episodes
 in any order, and many at one step. The line is the median of the last `window` episodes, or
@@ -80,6 +80,39 @@ def training_curve(
         axes.axhline(0.0, color=GREY, linewidth=1.1, label="optimal")
         if visits:
             shade_visits(axes, visits)
+        if title and ax is None:
+            entitle(figure_of(axes), title)
+    return figure_of(axes)
+
+
+def cost_curve(
+    episodes: Run,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    title: str = "",
+    window: int | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw the mean cost of each training episode over environment steps, for a task with safety.
+
+    Args:
+      episodes: as in `training_curve`, with the column `cost` instead of `regret`.
+      path: a file to write, .png, .pdf or .svg; None writes none.
+      title: above a new figure.
+      window: as in `training_curve`.
+      ax: the axes to draw in, without legend; None for a new figure.
+
+    Returns:
+      The figure.
+
+    Raises:
+      OptionError, MissingDependencyError: see `training_curve`.
+    """
+    step, cost = _points(episodes, "cost")
+    with canvas(ax, (6.2, 4.0), path) as (axes,):
+        draw_training(axes, step, cost, window)
+        axes.set_ylim(0.0, max(1.1 * float(cost.max()), 0.01))
+        axes.set_ylabel("mean cost per step")
         if title and ax is None:
             entitle(figure_of(axes), title)
     return figure_of(axes)
@@ -213,8 +246,8 @@ def _table(table: Mapping[str, Any]) -> dict[str, list[Any]]:
     return methods
 
 
-def _points(run: Run) -> tuple[Array, Array]:
-    """`[N]` environment steps at which episodes ended, and their mean regrets."""
+def _points(run: Run, column: str = "regret") -> tuple[Array, Array]:
+    """`[N]` environment steps at which episodes ended, and their mean regrets or costs."""
     source = "episodes"
     if isinstance(run, str | os.PathLike):
         path = Path(run) / EPISODES if Path(run).is_dir() else Path(run)
@@ -222,16 +255,17 @@ def _points(run: Run) -> tuple[Array, Array]:
     try:
         if hasattr(run, "keys"):
             table: Any = run
-            points = [np.asarray(table[name], dtype=np.float64) for name in ("step", "regret")]
+            points = [np.asarray(table[name], dtype=np.float64) for name in ("step", column)]
         else:
             rows = list(run)
-            points = [np.array([_field(r, name) for r in rows]) for name in ("step", "regret")]
+            points = [np.array([_field(r, name) for r in rows]) for name in ("step", column)]
         if points[0].ndim != 1 or points[0].shape != points[1].shape:
             raise ValueError
     except (KeyError, AttributeError, TypeError, ValueError):
         raise OptionError(
-            f"{source}: every row must have numbers for step and regret. "
-            "Give the episodes.csv of a training run."
+            f"{source}: every row must have numbers for step and {column}. "
+            "Give the episodes.csv of a training run"
+            f"{' on a task with safety' if column == 'cost' else ''}."
         ) from None
     if not len(points[0]):
         raise OptionError(f"{source}: contains no finished episode. Train for longer.")
@@ -239,7 +273,9 @@ def _points(run: Run) -> tuple[Array, Array]:
 
 
 def _field(row: Any, name: str) -> float:
-    return float(row[name] if hasattr(row, "keys") else getattr(row, name))
+    if hasattr(row, "keys"):
+        return float(row[name])
+    return float(getattr(row if hasattr(row, name) else row.safety, name))
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

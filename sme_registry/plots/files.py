@@ -8,7 +8,7 @@ from typing import Any
 
 from sme_registry.evaluation import EvaluationReport, StreamReport
 from sme_registry.evaluation.continual import Visit
-from sme_registry.plots.curves import Run, training_curve
+from sme_registry.plots.curves import Run, cost_curve, training_curve
 from sme_registry.plots.decay import decay_curve
 from sme_registry.plots.maps import similarity_map
 from sme_registry.plots.observation import layer_probes, sensitivity_bars
@@ -21,7 +21,7 @@ from sme_registry.plots.streams import (
 )
 from sme_registry.plots.style import WRITTEN, save_figure
 
-_TRAINING, _DECAY, _MAP = "training_curve", "decay_curve", "similarity_map"
+_TRAINING, _COST, _DECAY, _MAP = "training_curve", "cost_curve", "decay_curve", "similarity_map"
 _OF_STREAMS: dict[str, Callable[[StreamReport], Any]] = {
     "retention_map": retention_map,
     "performance_curve": performance_curve,
@@ -35,17 +35,20 @@ _OF_EXTENSIONS: dict[str, Callable[[EvaluationReport], Any]] = {
 }
 FILES = tuple(
     f"{name}.{ending}"
-    for name in (_TRAINING, _DECAY, _MAP, *_OF_EXTENSIONS, *_OF_STREAMS)
+    for name in (_TRAINING, _COST, _DECAY, _MAP, *_OF_EXTENSIONS, *_OF_STREAMS)
     for ending in WRITTEN
 )
 
 
 def write_training(
-    episodes: Run, folder: Path, title: str, visits: Sequence[Visit] = ()
+    episodes: Run, folder: Path, title: str, visits: Sequence[Visit] = (), costs: bool = False
 ) -> list[Path]:
-    """Write the training curve; see `training_curve` for arguments and errors."""
+    """Write the training curve and, with `costs`, the curve of costs; see `training_curve`."""
     figure = training_curve(episodes, title=title, visits=visits)
-    return save_figure(figure, folder / _TRAINING, WRITTEN)
+    files = save_figure(figure, folder / _TRAINING, WRITTEN)
+    if costs:
+        files += save_figure(cost_curve(episodes, title=title), folder / _COST, WRITTEN)
+    return files
 
 
 def write_stream(report: StreamReport, folder: Path) -> list[Path]:

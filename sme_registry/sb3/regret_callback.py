@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
 
 
@@ -30,6 +31,7 @@ class EpisodeRegret(NamedTuple):
       length: number of steps.
       terminated: whether it ended by D; False if it reached the horizon.
       agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
+      safety: what it cost; None for a task without `safety`.
     """
 
     step: int
@@ -39,6 +41,7 @@ class EpisodeRegret(NamedTuple):
     length: int
     terminated: bool
     agents_regret: tuple[float, ...] = ()
+    safety: EpisodeSafety | None = None
 
 
 class EpisodeSums:
@@ -52,6 +55,7 @@ class EpisodeSums:
     def __init__(self, lanes: int, agents: int = 1) -> None:
         self._agents = agents
         self._sums = np.zeros((4, lanes))  # return, length, regret, similarity
+        self._safety: npt.NDArray[np.float64] | None = None  # those of `EpisodeSafety`, if any
 
     def add(
         self,
@@ -79,6 +83,9 @@ class EpisodeSums:
                 f"RegretCallback: the environment's infos have no {error}. Use it with an "
                 "environment of sme_registry, whose wrappers keep the infos."
             ) from None
+        safety = safety_of_step(infos)
+        if safety is not None:
+            self._safety = safety if self._safety is None else self._safety + safety
         self._sums[0] += rewards
         self._sums[1] += 1.0
         first_lanes = np.flatnonzero(dones[:: self._agents]) * self._agents
@@ -88,6 +95,10 @@ class EpisodeSums:
         lanes = slice(lane, lane + self._agents)
         returned, length, regret, similarity = self._sums[:, lanes].mean(axis=1).tolist()
         by_agent = self._sums[2, lanes] / length if self._agents > 1 else ()
+        safety = None
+        if self._safety is not None:  # of a single agent
+            safety = EpisodeSafety(*(self._safety[:, lane] / length).tolist())
+            self._safety[:, lane] = 0.0
         episode = EpisodeRegret(
             step=step,
             regret=regret / length,
@@ -96,6 +107,7 @@ class EpisodeSums:
             length=int(length),
             terminated=not info.get("TimeLimit.truncated", False),
             agents_regret=tuple(map(float, by_agent)),
+            safety=safety,
         )
         self._sums[:, lanes] = 0.0
         return episode
@@ -107,7 +119,8 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
     Works with every `VecEnv` of our environments: `SMEVecEnv`, `SMETeamVecEnv`, and SB3's
     `DummyVecEnv` and `SubprocVecEnv` with or without `Monitor`. SB3's logger shows the mean over
     the episodes that ended since its last output, as `rollout/regret` and `rollout/similarity`;
-    for a team also `rollout/regret/<agent>`.
+    for a team also `rollout/regret/<agent>`, and for a task with `safety` also `rollout/cost`,
+    `rollout/violating_share` and `rollout/safe_regret`.
 
     Attributes:
       episodes: the finished episodes, oldest first. `plots.training_curve` draws them.
@@ -141,4 +154,6 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
             self.logger.record_mean("rollout/similarity", episode.similarity)
             for agent, regret in zip(self._agents, episode.agents_regret, strict=True):
                 self.logger.record_mean(f"rollout/regret/{agent}", regret)
+            for name, value in episode.safety._asdict().items() if episode.safety else ():
+                self.logger.record_mean(f"rollout/{name}", value)
         return True

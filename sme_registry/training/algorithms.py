@@ -1,6 +1,7 @@
 """`uses`: the name of what `sme train` and the cells of a study train. Imported only when needed.
 
     PPO, TD3, …        an algorithm of Stable-Baselines3, in any case
+    PPOLagrangian, …   one of ours for tasks with `safety` (`WITH_LIMITS`), in any case
     jax:PPO, …         the same in JAX, with its environment in one program (`sme_registry.jax`)
     an entry point     of the group `sme_registry.algorithms`, in an installed package
     module:name        imported, from this folder or installed
@@ -21,19 +22,23 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
+from sme_registry.envs.arguments import refuse_without_limits
 from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, import_object, require_packages
 from sme_registry.spec import SMESpec, StreamSpec
-from sme_registry.spec.study import JAX, in_jax
+from sme_registry.spec.study import INDEPENDENT, JAX, in_jax
 
-# Names of classes in `stable_baselines3`, with their descriptions in `sme train --help`.
+# Names of classes in `stable_baselines3` and, for tasks with `safety`, in `sme_registry.sb3`.
 ALGORITHMS = {
     "TD3": "off-policy, deterministic; the fastest learner on the default task",
     "SAC": "off-policy, entropy-regularised",
     "DDPG": "off-policy, deterministic; the predecessor of TD3",
     "PPO": "on-policy; steps ten times faster, but learns from many more",
     "A2C": "on-policy",
+    "PPOLagrangian": "PPO with a limit on the mean cost of a step, for tasks with safety",
+    "PPOProjection": "PPO whose actions are cut at the limits, which it knows, for the same tasks",
 }
+WITH_LIMITS = ("PPOLagrangian", "PPOProjection")
 ENTRY_POINTS = "sme_registry.algorithms"
 _TEAMS = 8
 _MAX_REPLAY = 1_000_000  # SB3's default
@@ -55,6 +60,17 @@ def is_on_policy(algorithm: Any) -> bool:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
     return isinstance(algorithm, type) and issubclass(algorithm, OnPolicyAlgorithm)
+
+
+def check_limits(uses: str, document: SMESpec | StreamSpec) -> None:
+    """Raise OptionError if an algorithm of `WITH_LIMITS` is to train on a task without `safety`.
+
+    Imports neither Stable-Baselines3 nor PyTorch.
+    """
+    spec = document if isinstance(document, SMESpec) else document.phases[0].spec
+    for name in WITH_LIMITS:
+        if uses.removeprefix(INDEPENDENT).casefold() == name.casefold():
+            refuse_without_limits(name, spec)
 
 
 AGENTS = ("sb3", "jax")
@@ -124,7 +140,9 @@ def load_algorithm(name: str) -> Any:
     """The class of an algorithm of `ALGORITHMS`; see `require_sb3`."""
     # It imports the deprecated `gym` if that is installed, which prints a long notice.
     with contextlib.redirect_stderr(io.StringIO()), quiet():
-        return getattr(importlib.import_module("stable_baselines3"), known_algorithm(name))
+        name = known_algorithm(name)
+        module = "sme_registry.sb3" if name in WITH_LIMITS else "stable_baselines3"
+        return getattr(importlib.import_module(module), name)
 
 
 def find_algorithm(uses: str, field: str = "uses", others: Iterable[str] = ()) -> Any:

@@ -1,6 +1,7 @@
 """`episodes.csv`: one row for each finished episode, written as soon as it ends.
 
-That of a team has one more column for each agent, `regret/<agent>`.
+That of a team has one more column for each agent, `regret/<agent>`; that of a task with `safety`
+has `cost`, `violating_share` and `safe_regret`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from sme_registry.envs.episode_safety import EpisodeSafety
 from sme_registry.errors import OptionError
 from sme_registry.io import write_atomically
 
@@ -33,6 +35,7 @@ class Episode(NamedTuple):
       terminated: 1 if it ended by D, 0 if it reached the horizon.
       wall_seconds: of training over all sessions when it ended.
       agents_regret: mean regret of each agent, in the team's order; empty for a single agent.
+      safety: what it cost; None for a task without `safety`.
     """
 
     episode: int
@@ -44,9 +47,11 @@ class Episode(NamedTuple):
     terminated: int
     wall_seconds: float
     agents_regret: tuple[float, ...] = ()
+    safety: EpisodeSafety | None = None
 
 
-COLUMNS = Episode._fields[:-1]
+COLUMNS = Episode._fields[:-2]
+SAFETY = EpisodeSafety._fields
 _TYPES = (int, int, float, int, float, float, int, float)
 
 
@@ -61,21 +66,23 @@ def read_episodes(path: Path) -> list[Episode]:
     except (OSError, UnicodeDecodeError) as error:
         raise OptionError(f"{path}: cannot be read: {error}. Give an episodes.csv.") from None
     head = rows[0] if rows else []
-    columns, agents = tuple(head[: len(COLUMNS)]), head[len(COLUMNS) :]
-    if columns != COLUMNS or not all(column.startswith(_AGENT_PREFIX) for column in agents):
+    columns, others = tuple(head[: len(COLUMNS)]), tuple(head[len(COLUMNS) :])
+    by_agent = all(column.startswith(_AGENT_PREFIX) for column in others)
+    if columns != COLUMNS or not (by_agent or others == SAFETY):
         raise OptionError(
             f"{path}: the columns must be {','.join(COLUMNS)}, and for a team "
-            f"{_AGENT_PREFIX}<agent>."
+            f"{_AGENT_PREFIX}<agent>, or for a task with safety {','.join(SAFETY)}."
         )
     episodes = []
     for row in rows[1:]:
         try:
-            kinds = zip(_TYPES + (float,) * len(agents), row, strict=True)
+            kinds = zip(_TYPES + (float,) * len(others), row, strict=True)
             values = [kind(text) for kind, text in kinds]
         except ValueError:  # a number or a column is missing
             break
-        regrets = tuple(values[len(COLUMNS) :])
-        episodes.append(Episode._make((*values[: len(COLUMNS)], regrets)))
+        own, rest = values[: len(COLUMNS)], tuple(values[len(COLUMNS) :])
+        episode = Episode._make((*own, (), EpisodeSafety(*rest) if others == SAFETY else None))
+        episodes.append(episode._replace(agents_regret=rest) if by_agent else episode)
     return episodes
 
 
@@ -92,16 +99,26 @@ class EpisodeLog:
         self.agents = agents
         kept = read_episodes(path) if up_to_step and path.exists() else []
         self.episodes = [episode for episode in kept if episode.step <= up_to_step]
+        self._path = path
+        self._write()
+
+    def _write(self) -> None:
+        """Write the head and the rows so far, and open the file for more."""
         text = io.StringIO()
-        head = [*COLUMNS, *(f"{_AGENT_PREFIX}{agent}" for agent in agents)]
+        safety = SAFETY if self.episodes and self.episodes[0].safety is not None else ()
+        head = [*COLUMNS, *safety, *(f"{_AGENT_PREFIX}{agent}" for agent in self.agents)]
         csv.writer(text, lineterminator="\n").writerows([head, *map(_row, self.episodes)])
-        write_atomically(path, text.getvalue())
-        self._stream = path.open("a", encoding="utf-8", newline="")
+        write_atomically(self._path, text.getvalue())
+        self._stream = self._path.open("a", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream, lineterminator="\n")
 
     def add(self, episode: Episode) -> None:
         """Append one row."""
         self.episodes.append(episode)
+        if len(self.episodes) == 1 and episode.safety is not None:  # which has columns of its own
+            self.close()
+            self._write()
+            return
         self._writer.writerow(_row(episode))
         self._stream.flush()
 
@@ -111,5 +128,6 @@ class EpisodeLog:
 
 
 def _row(episode: Episode) -> list[int | str]:
-    *values, agents = episode
-    return [format(v, ".9g") if isinstance(v, float) else v for v in (*values, *agents)]
+    *values, agents, safety = episode
+    row = (*values, *(safety or ()), *agents)
+    return [format(v, ".9g") if isinstance(v, float) else v for v in row]

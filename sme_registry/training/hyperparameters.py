@@ -170,7 +170,7 @@ def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[st
     if not isinstance(algorithm, type):
         return {}
     if issubclass(algorithm, OnPolicyAlgorithm) and "n_steps" not in chosen:
-        default = inspect.signature(algorithm).parameters["n_steps"].default
+        default = parameters_of(algorithm)["n_steps"].default
         n_steps = min(default, max(_MIN_ROLLOUT, _ROLLOUT // lanes))
         return {} if n_steps == default else {"n_steps": n_steps}
     if issubclass(algorithm, OffPolicyAlgorithm) and lanes > 1:
@@ -178,9 +178,29 @@ def for_lanes(algorithm: Any, lanes: int, chosen: Iterable[str] = ()) -> dict[st
     return {}
 
 
+def parameters_of(function: Any) -> dict[str, inspect.Parameter]:
+    """The parameters of a function, or of a class's constructor.
+
+    A constructor that takes any keyword passes those that it does not name to the next class, so
+    that class's are its own.
+    """
+    if not isinstance(function, type):
+        return dict(inspect.signature(function).parameters)
+    parameters: dict[str, inspect.Parameter] = {}
+    for owner in function.__mro__:
+        if "__init__" not in vars(owner):
+            continue
+        own = {each.name: each for each in inspect.signature(owner).parameters.values()}
+        parameters = {**own, **parameters}
+        if not any(each.kind is each.VAR_KEYWORD for each in own.values()):
+            passed_on = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
+            return {name: p for name, p in parameters.items() if p.kind not in passed_on}
+    return parameters
+
+
 def _names(function: Any, reserved: Iterable[str]) -> list[str] | None:
     """The names of a function's arguments that a user may set; None if it accepts any."""
-    parameters = inspect.signature(function).parameters
+    parameters = parameters_of(function)
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
         return None
     return [name for name in parameters if name not in reserved and not name.startswith("_")]

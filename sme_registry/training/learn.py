@@ -274,6 +274,7 @@ class RunLog:
                     terminated=int(episode.terminated),
                     wall_seconds=round(self._wall_seconds, 3),
                     agents_regret=by_agent if self._log.agents else (),
+                    safety=episode.safety,
                 )
             )
         if finished:
@@ -318,7 +319,9 @@ class RunLog:
         if recent:
             regret = np.mean([episode.regret for episode in recent])
             whose = "team's mean regret" if self._log.agents else "mean regret"
-            notes.append(f"{whose} {regret:.3f} (last {len(recent)} episodes)")
+            costs = [episode.safety.cost for episode in recent if episode.safety is not None]
+            cost = f", cost {np.mean(costs):.3f}" if costs else ""
+            notes.append(f"{whose} {regret:.3f}{cost} (last {len(recent)} episodes)")
         return ", ".join(notes)
 
 

@@ -117,7 +117,10 @@ def _draw(
     if episodes:
         title = f"{report.policy} on {report.title}"
         visits = report.visits if isinstance(report, StreamReport) else ()
-        figures += plot_files.write_training(folder / episode_files.FILE, folder, title, visits)
+        costs = episodes[0].safety is not None
+        figures += plot_files.write_training(
+            folder / episode_files.FILE, folder, title, visits, costs
+        )
     if isinstance(report, StreamReport):
         return (*figures, *plot_files.write_stream(report, folder))
     return (*figures, *plot_files.write_evaluation(report, folder, model))

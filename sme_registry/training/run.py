@@ -50,6 +50,7 @@ from sme_registry.task import load_document, materialize, materialize_stream
 from sme_registry.training import checkpoint, reports
 from sme_registry.training import episodes as episode_files
 from sme_registry.training.algorithms import (
+    check_limits,
     default_algorithm,
     default_num_envs,
     find_algorithm,
@@ -133,7 +134,8 @@ def train(
 
     Args:
       spec: the task or the stream: a document, its fields, an id, a digest or a path.
-      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; "module:Class", such as
+      algorithm: "TD3", "SAC", "DDPG", "PPO" or "A2C", in any case; for a task with `safety` also
+        "PPOLagrangian" or "PPOProjection"; "module:Class", such as
         "sb3_contrib:TQC", "module:function" or an entry point (`algorithms`); "jax:PPO", "jax:TD3"
         or "jax:SAC" in JAX; None takes TD3, and PPO for a team.
       steps: environment steps over all environments, at least 1; None takes 20,000, and those of
@@ -287,6 +289,7 @@ def _with_algorithm(
             f"device={device!r}: is for agents in JAX; those of Stable-Baselines3 train on the "
             'CPU. Leave it out, or use --agents jax (in Python, agents="jax").'
         )
+    check_limits(uses, plan.document)
     algorithm = find_algorithm(uses, "algorithm")
     refuse_unknown(algorithm, uses, settings)
     if num_envs is None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sme_registry.envs.episode_safety import EpisodeSafety
 from sme_registry.envs.types import Array, Mask
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing
@@ -27,6 +28,7 @@ class Recorder:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._log = EpisodeLog(path)
         self._sums = np.zeros((4, lanes))  # return, length, regret, similarity
+        self._safety = np.zeros((len(EpisodeSafety._fields), lanes))
         self._steps, self._total_regret, self._start = 0, 0.0, time.monotonic()
 
     @property
@@ -36,12 +38,20 @@ class Recorder:
 
     def begin(self, lanes: Any = slice(None)) -> None:
         """Forget the present episodes of some lanes."""
-        self._sums[:, lanes] = 0.0
+        self._sums[:, lanes] = self._safety[:, lanes] = 0.0
 
     def add(
-        self, rewards: Array, regret: Array, similarity: Array, terminated: Mask, ended: Mask
+        self,
+        rewards: Array,
+        regret: Array,
+        similarity: Array,
+        terminated: Mask,
+        ended: Mask,
+        safety: Array | None = None,
     ) -> dict[str, Array]:
         """Add a step of each lane, `[B]` each; those whose regret is NaN began an episode instead.
+
+        `safety` is that of `safety_of_step`, `[3, B]`.
 
         Returns:
           What `info["episode"]` has, `[B]` each, 0 where no episode ended; empty if none did.
@@ -49,6 +59,8 @@ class Recorder:
         stepped = ~np.isnan(regret)
         values = np.array([rewards, np.ones(len(regret)), regret, similarity])
         self._sums += np.where(stepped, values, 0.0)
+        if safety is not None:
+            self._safety += np.where(stepped, safety, 0.0)
         self._steps += int(stepped.sum())
         self._total_regret += float(regret[stepped].sum())
         lanes = np.flatnonzero(ended & stepped)
@@ -56,9 +68,11 @@ class Recorder:
             return {}
         seconds = round(time.monotonic() - self._start, 3)
         for lane in lanes.tolist():
-            self._finish(lane, bool(terminated[lane]), seconds)
+            self._finish(lane, bool(terminated[lane]), seconds, safety is not None)
         returns, lengths, *means = np.where(ended, self._sums, 0.0)
-        regrets, similarities = (mean / np.maximum(lengths, 1.0) for mean in means)
+        if safety is not None:
+            means += [*np.where(ended, self._safety, 0.0)]
+        regrets, similarities, *costs = (mean / np.maximum(lengths, 1.0) for mean in means)
         self.begin(lanes)
         return {
             "r": returns,
@@ -67,9 +81,10 @@ class Recorder:
             "regret": regrets,
             "similarity": similarities,
             "online_regret": np.where(ended, self.online_regret, 0.0),
+            **dict(zip(EpisodeSafety._fields, costs, strict=False)),
         }
 
-    def _finish(self, lane: int, terminated: bool, seconds: float) -> None:
+    def _finish(self, lane: int, terminated: bool, seconds: float, has_safety: bool) -> None:
         episode_return, length, regret, similarity = self._sums[:, lane].tolist()
         episode = Episode(
             episode=len(self.episodes) + 1,
@@ -80,6 +95,9 @@ class Recorder:
             similarity=similarity / length,
             terminated=int(terminated),
             wall_seconds=seconds,
+            safety=EpisodeSafety(*(self._safety[:, lane] / length).tolist())
+            if has_safety
+            else None,
         )
         self.episodes.append(episode)
         if self._log is not None:

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
+from sme_registry.envs.episode_safety import safety_of_step
 from sme_registry.wrappers.recorder import Recorder, measured
 
 
@@ -60,7 +61,8 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         values = (reward, *measured(info))
         rewards, regret, similarity = (np.array([value], np.float64) for value in values)
         ended, by_failure = np.array([terminated or truncated]), np.array([terminated])
-        episode = self._recorder.add(rewards, regret, similarity, by_failure, ended)
+        safety = safety_of_step([info])
+        episode = self._recorder.add(rewards, regret, similarity, by_failure, ended, safety)
         if episode:
             info["episode"] = {
                 **{name: value[0].item() for name, value in episode.items()},

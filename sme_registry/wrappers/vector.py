@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
+from sme_registry.envs.episode_safety import safety_of_step
 from sme_registry.wrappers.recorder import Recorder, measured
 
 
@@ -64,12 +65,16 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
         """One step of every lane."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         regret, similarity = (np.array(value, np.float64) for value in measured(info))
+        safety = safety_of_step(info)
         if "final_info" in info:  # SAME_STEP: `info` is of the next episode where one ended
             final = info["_final_info"]
             last_regret, last_similarity = measured(info["final_info"])
             regret[final], similarity[final] = last_regret[final], last_similarity[final]
+            last_safety = safety_of_step(info["final_info"])
+            if safety is not None and last_safety is not None:
+                safety[:, final] = last_safety[:, final]
         ended = terminated | truncated
-        episode = self._recorder.add(rewards, regret, similarity, terminated, ended)
+        episode = self._recorder.add(rewards, regret, similarity, terminated, ended, safety)
         if episode:
             info["episode"] = {**episode, **info.get("episode", {})}
             info["_episode"] = ended

@@ -7,7 +7,6 @@ plan runs, so its algorithms cannot be checked here: `MissingDependencyError`, o
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
@@ -19,8 +18,8 @@ from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.algorithms import find_algorithm, independent_name, reference_name
 from sme_registry.studies.engine.offline_cell import DATA_SETTINGS, offline_name
 from sme_registry.training import ALGORITHMS
-from sme_registry.training.algorithms import is_on_policy, require_sb3
-from sme_registry.training.hyperparameters import refuse_unknown
+from sme_registry.training.algorithms import check_limits, is_on_policy, require_sb3
+from sme_registry.training.hyperparameters import parameters_of, refuse_unknown
 
 __all__ = ["check_hyperparameters", "check_task", "find", "uneven_rollouts"]
 
@@ -77,7 +76,9 @@ def check_task(cell: Cell) -> None:
 
     Raises:
       SpecError: JAX does not have one of the fields, or agents in JAX cannot live in the stream.
+      OptionError: the algorithm needs a task with limits.
     """
+    check_limits(cell.uses, cell.document)
     if not in_jax(cell.uses):
         return
     from sme_registry.jax.task import check_supported
@@ -144,7 +145,7 @@ def _rollout_steps(algorithm: StudyAlgorithm) -> int:
     learner = find_algorithm(uses)
     if not is_on_policy(learner):
         return 1
-    parameter = inspect.signature(learner).parameters.get("n_steps")
+    parameter = parameters_of(learner).get("n_steps")
     return 1 if parameter is None else int(cast(Any, chosen.get("n_steps", parameter.default)))
 
 

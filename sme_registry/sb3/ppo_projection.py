@@ -1,0 +1,134 @@
+"""`PPOProjection`: PPO whose actions are projected onto the limits, which it is given.
+
+    a ← min(a, ℓ(s) − 10⁻⁵)
+
+ℓ are the task's own limits: an oracle, which no agent without a model of its constraints has. s is
+the state as the observation shows it. The projection is a part of the policy, so a saved model has
+it, too. Such a policy never costs anything, and what it earns less than the best safe action is due
+to what PPO has not learned. It is a safety layer (Dalal et al., 2018) whose constraints are known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from sme_registry.errors import OptionError
+from sme_registry.sb3.limits import spec_with_limits
+from sme_registry.spec import SMESpec
+from sme_registry.task import materialize
+
+_Array = npt.NDArray[np.float32]
+
+# Observations are float32, so limits computed from them are off: by 1e-7 at L = 1, 1e-6 at L = 10
+# and 3e-5 at L = 50, at most, in 60,000 states. Deeper limits can still be broken, by rounding.
+_MARGIN = 1e-5
+
+
+class Projection:
+    """The projection of actions onto a task's limits.
+
+    Args:
+      spec: the task; with `safety`, and states that the observation shows as they are.
+      low: the lowest action of the environment, 0 or −1; the highest is 1.
+    """
+
+    def __init__(self, spec: SMESpec, low: float) -> None:
+        self._task, self._low = materialize(spec), low
+
+    def __call__(self, actions: _Array, observations: _Array) -> _Array:
+        """The projected actions `[B, A]`, float32; observations are `[B, O]`."""
+        states = observations[:, : self._task.spec.state_dim]
+        limits = self._low + (1.0 - self._low) * (self._task.limit(states) - _MARGIN)
+        return np.minimum(actions, limits.astype(np.float32))
+
+
+class ProjectedPolicy(ActorCriticPolicy):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """PPO's policy, whose actions are projected where it acts; see the module.
+
+    Args:
+      *args: as in `ActorCriticPolicy`.
+      _limits_of: the spec of the task, as JSON.
+      **kwargs: as in `ActorCriticPolicy`.
+    """
+
+    def __init__(self, *args: Any, _limits_of: dict[str, Any], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        space: Any = self.action_space
+        self.projection = Projection(SMESpec(**_limits_of), float(space.low[0]))
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
+        actions = super()._predict(observation, deterministic)
+        projected = self.projection(actions.cpu().numpy(), observation.cpu().numpy())
+        return torch.as_tensor(projected, device=actions.device)
+
+
+class ProjectedVecEnv(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped without SB3
+    """Environments that execute projected actions, so that PPO learns from the actions it samples.
+
+    Args:
+      venv: environments of this package.
+      spec: of their task.
+    """
+
+    def __init__(self, venv: Any, spec: SMESpec) -> None:
+        super().__init__(venv)
+        self._projection = Projection(spec, float(venv.action_space.low[0]))
+        self._observations: Any = None
+
+    def reset(self) -> Any:
+        """Begin an episode in every lane."""
+        self._observations = self.venv.reset()
+        return self._observations
+
+    def step_async(self, actions: Any) -> None:
+        """Store the projected actions for `step_wait`."""
+        self.venv.step_async(self._projection(actions, self._observations))
+
+    def step_wait(self) -> Any:
+        """One step of every lane."""
+        result = self.venv.step_wait()
+        self._observations = result[0]
+        return result
+
+
+class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped class without SB3
+    """PPO with actions projected onto the limits, for tasks with `safety`; see the module.
+
+    Arguments are those of PPO.
+
+    Raises:
+      OptionError: the task has no `safety`, or its observations mix the state.
+    """
+
+    policy_aliases = {"MlpPolicy": ProjectedPolicy}  # noqa: RUF012  # as in PPO
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            limits_of = _spec(self.env).to_dict()
+            self.policy_kwargs = {**self.policy_kwargs, "_limits_of": limits_of}
+        super()._setup_model()
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> Any:
+        venv = PPO._wrap_env(env, verbose, monitor_wrapper)
+        return venv if isinstance(venv, ProjectedVecEnv) else ProjectedVecEnv(venv, _spec(venv))
+
+
+def _spec(env: Any) -> SMESpec:
+    """The spec of environments whose observations show the state; OptionError for any other."""
+    spec = spec_with_limits("PPOProjection", env)
+    observation = spec.observation
+    if observation is not None and observation.mixing != "none":
+        raise OptionError(
+            f"PPOProjection: observation.mixing={observation.mixing!r}: must be 'none', since the "
+            "limits follow from the state, which mixed observations do not show. Train "
+            "PPOLagrangian."
+        )
+    return spec

@@ -1,0 +1,38 @@
+"""`VectorStepWithCost`, for a vector of environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+
+from sme_registry.envs.arguments import refuse_without_limits
+from sme_registry.wrappers.cost import spec_of, with_cost
+
+
+class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
+    """A vector with the costs `[num_envs]` of a step as the third value that `step` returns.
+
+    All autoreset modes work; Safety-Gymnasium's vectors are in `SAME_STEP` mode.
+
+    Args:
+      envs: a vector of `make_vec`, wrapped or not, whose task has `safety`.
+
+    Raises:
+      OptionError: the task has no limits.
+    """
+
+    def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        VectorWrapper.__init__(self, envs)
+        refuse_without_limits(type(self).__name__, spec_of(envs))
+
+    def step(  # type: ignore[override]
+        self, actions: Any
+    ) -> tuple[Any, Any, Any, Any, Any, dict[str, Any]]:
+        """Observations, rewards, costs, whether terminated, whether truncated, infos."""
+        observations, rewards, costs, terminated, truncated, info = with_cost(
+            self.env.step(actions)
+        )
+        return observations, rewards, costs, terminated, truncated, info
