@@ -65,6 +65,7 @@ class MonitoredVecEnv(LanesVecEnv):
     Attributes:
       steps: environment steps taken so far.
       regret: sum of their regret.
+      cost: sum of their cost; None for a task without `safety`.
       info: of the last step; empty before the first.
       seconds: CPU time of this thread spent in them.
       after_step: called with `steps` after each step; its time is not in `seconds`. An exception
@@ -81,6 +82,7 @@ class MonitoredVecEnv(LanesVecEnv):
             self._env = SMEEnv(document, action_range=action_range)
         super().__init__([self._env])
         self.steps, self.regret, self.seconds = 0, 0.0, 0.0
+        self.cost: float | None = None if self._env.sme_spec.safety is None else 0.0
         self.info: dict[str, Any] = {}
         self.after_step: Callable[[int], None] = lambda steps: None
 
@@ -96,6 +98,8 @@ class MonitoredVecEnv(LanesVecEnv):
         begun = time.thread_time()
         observation, reward, terminated, truncated, info = self._env.step(self._take_actions()[0])
         self.regret, self.info = self.regret + info["regret"], info
+        if self.cost is not None:
+            self.cost += info["cost"]
         ended = terminated or truncated
         info["TimeLimit.truncated"] = truncated and not terminated
         if ended:

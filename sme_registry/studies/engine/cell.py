@@ -130,6 +130,7 @@ class _Recorder:
         self.rows: list[tuple[float, ...]] = []  # the fields of a `LearningCurve`, in its order
         self._agents = () if cell.spec.team is None else self._tasks.after(0).names
         self.steps, self.regret = 0, 0.0
+        self.cost: float | None = None
         self.agents_regret = np.zeros(len(self._agents))
         self.agents_rows: list[list[float]] = []  # the regret of each agent in an evaluation
         self.training_seconds = self.environment_seconds = self.evaluation_seconds = 0.0
@@ -176,12 +177,16 @@ class _Recorder:
         return LearningCurve(**fields)
 
     def online_regret(self) -> dict[str, Any]:
-        """The online regret, and that of each agent; nothing for a policy that took no steps."""
+        """The online regret, the online cost, and the regret of each agent.
+
+        Nothing for a policy that took no steps.
+        """
         if not self.steps:
             return {}
         means = (self.agents_regret / self.steps).tolist()
         return {
             "online_regret": self.regret / self.steps,
+            "online_cost": None if self.cost is None else self.cost / self.steps,
             "agents_online_regret": dict(zip(self._agents, means, strict=True)),
         }
 
@@ -249,6 +254,7 @@ def _learn(cell: Cell, run: Training, recorder: _Recorder, life: Life | None) ->
             "environment. It must take all of them, in that environment."
         )
     recorder.steps, recorder.regret = env.steps, env.regret
+    recorder.cost = getattr(env, "cost", None)
     recorder.agents_regret = getattr(env, "agents_regret", recorder.agents_regret)
     recorder.environment_seconds = env.seconds
     recorder.training_seconds = learning - env.seconds

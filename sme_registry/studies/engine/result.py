@@ -115,6 +115,7 @@ class CellResult(StrictModel):
         without fresh agents, which are cells of their own. Any other JSON omits it.
       online_regret: mean regret over all training steps, in [0, 1]; null for references and
         offline learners.
+      online_cost: mean cost over them, in [0, 1]; the JSON of a task without `safety` omits it.
       agents_online_regret: the same of each agent of a team, by name. A single agent's JSON omits
         it.
       offline: similarities of an offline cell; null for all others.
@@ -130,6 +131,7 @@ class CellResult(StrictModel):
     report: EvaluationReport | None = None
     stream_report: StreamReport | None = None
     online_regret: Real | None = None
+    online_cost: Real | None = None
     agents_online_regret: dict[str, Real] = Field(default_factory=dict)
     offline: OfflineResult | None = None
     program: ProgramResult | None = None
@@ -157,7 +159,10 @@ class CellResult(StrictModel):
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         young = ("agents_online_regret", "program", "report", "stream_report")
-        return without_empty(handler(self), *young)
+        fields = without_empty(handler(self), *young)
+        if self.online_cost is None:  # 0 is a cost
+            del fields["online_cost"]
+        return fields
 
     def _repr_html_(self) -> str:
         """The report's table, for notebooks."""

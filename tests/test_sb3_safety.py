@@ -1,0 +1,313 @@
+"""PPO with a multiplier and PPO with projected actions, on tasks with limits."""
+
+from __future__ import annotations
+
+import io
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, evaluate, materialize
+from sme_registry.errors import OptionError, PolicyError
+from sme_registry.spec import Cell
+from sme_registry.training import RunRecord, check_hyperparameters, read_episodes, train
+
+pytest.importorskip("stable_baselines3")
+
+import torch
+from stable_baselines3 import PPO
+
+from sme_registry.export import export_onnx
+from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
+from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.checks import check_task
+from sme_registry.training import checkpoint, numpy_policy
+
+SPEC = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
+SMALL: dict[str, Any] = {"n_steps": 64, "n_epochs": 2, "seed": 3}
+PROTOCOL = {"states_per_region": 50}
+ALGORITHMS = ["PPOLagrangian", "PPOProjection"]
+
+
+def lanes(count: int = 1, spec: SMESpec = SPEC, action_range: Any = "symmetric") -> SMEVecEnv:
+    return SMEVecEnv(spec, count, action_range=action_range)
+
+
+def observations(count: int = 500) -> Any:
+    return np.random.default_rng(0).random((count, SPEC.observation_dim), dtype=np.float32)
+
+
+def same_weights(one: Any, other: Any) -> bool:
+    pairs = zip(one.state_dict().values(), other.state_dict().values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def reloaded(model: Any, env: Any = None) -> Any:
+    archive = io.BytesIO()
+    model.save(archive)
+    archive.seek(0)
+    return type(model).load(archive, env=env)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_without_a_multiplier_it_is_ppo_bit_for_bit(count: int) -> None:
+    plain = PPO("MlpPolicy", lanes(count), **SMALL).learn(400)
+    fixed = PPOLagrangian("MlpPolicy", lanes(count), multiplier_learning_rate=0.0, **SMALL)
+    assert same_weights(plain.policy, fixed.learn(400).policy)
+    weighted = PPOLagrangian(
+        "MlpPolicy", lanes(count), multiplier=1.0, multiplier_learning_rate=0.0, **SMALL
+    )
+    assert not same_weights(plain.policy, weighted.learn(400).policy)
+    assert weighted.multiplier == 1.0
+
+
+def test_the_multiplier_follows_the_mean_cost_of_the_rollout() -> None:
+    costs: list[float] = []
+
+    class Watched(SMEVecEnv):
+        def step_wait(self) -> Any:
+            result = super().step_wait()
+            costs.extend(info["cost"] for info in result[3])
+            return result
+
+    env = Watched(SPEC, 2)
+    model = PPOLagrangian("MlpPolicy", env, cost_limit=0.02, multiplier_learning_rate=3.0, **SMALL)
+    expected = 0.0
+    for _ in range(3):
+        costs.clear()
+        model.learn(128)
+        expected += 3.0 * (np.mean(costs) - 0.02)
+        assert model.multiplier == pytest.approx(expected, rel=1e-5)
+    assert expected > 0.1
+
+
+def test_the_multiplier_falls_to_0_below_the_limit_and_stays_there() -> None:
+    model = PPOLagrangian("MlpPolicy", lanes(), cost_limit=0.9, multiplier=1.0, **SMALL)
+    model.learn(64)
+    assert 0.0 < model.multiplier < 0.5
+    model.learn(128)
+    assert model.multiplier == 0.0
+
+
+def test_a_multiplier_lowers_the_cost_and_the_critic_of_costs_learns() -> None:
+    model = PPOLagrangian(
+        "MlpPolicy",
+        lanes(),
+        multiplier=20.0,
+        multiplier_learning_rate=0.0,
+        learning_rate=3e-3,
+        gamma=0.5,
+        n_steps=256,
+        seed=1,
+    )
+    untrained = {k: v.clone() for k, v in model.cost_critic.state_dict().items()}
+    costs: list[float] = []
+
+    def note(local: Any, _: Any) -> bool:
+        costs.extend(info["cost"] for info in local["infos"])
+        return True
+
+    model.learn(5_000, callback=note)
+    assert np.mean(costs[-1000:]) < 0.5 * np.mean(costs[:1000])
+    # With γ = 0.5 the costs from a state on are about twice its mean cost.
+    values = model._cost_values(observations())
+    assert values.mean() == pytest.approx(2.0 * np.mean(costs[-1000:]), abs=0.05)
+    learned = model.cost_critic.state_dict()
+    assert not torch.equal(untrained["value_net.weight"], learned["value_net.weight"])
+    assert torch.equal(untrained["action_net.weight"], learned["action_net.weight"])
+
+
+def test_a_saved_model_keeps_its_multiplier_and_the_critic_of_costs() -> None:
+    model = PPOLagrangian("MlpPolicy", lanes(), cost_limit=0.0, **SMALL).learn(200)
+    again = reloaded(model, lanes())
+    assert again.multiplier == model.multiplier > 0.0
+    assert again.cost_limit == 0.0
+    assert same_weights(again.cost_critic, model.cost_critic)
+    assert again.cost_critic.optimizer.state_dict()["state"]
+    assert again.learn(64).multiplier > model.multiplier
+
+
+@pytest.mark.parametrize("action_range", ["unit", "symmetric"])
+def test_projected_actions_never_cost_anything(action_range: Any) -> None:
+    env = lanes(2, action_range=action_range)
+    costs: list[float] = []
+
+    def note(local: Any, _: Any) -> bool:
+        costs.extend(info["cost"] for info in local["infos"])
+        return True
+
+    model = PPOProjection("MlpPolicy", env, **SMALL)
+    # Biased towards high actions, so that most of them would be above the limits.
+    model.policy.action_net.bias.data += 1.0
+    model.learn(256, callback=note)
+    assert len(costs) >= 256
+    assert max(costs) == 0.0
+    task, seen = materialize(SPEC), observations()
+    states = seen[:, : SPEC.state_dim].astype(float)
+    actions, _ = model.predict(seen, deterministic=True)
+    unit = actions.astype(float) if action_range == "unit" else (actions.astype(float) + 1) / 2
+    limits = task.limit(states)
+    assert (task.cost(states, unit) == 0.0).all()
+    assert (limits - unit).min() == pytest.approx(1e-5, rel=0.2)  # as high as allowed
+    assert np.array_equal(reloaded(model).predict(seen, deterministic=True)[0], actions)
+    # Studies evaluate a copy of the network in NumPy, which must not lose the projection.
+    policy = numpy_policy(model, SPEC, action_range=action_range)
+    assert np.array_equal(policy.act(seen), actions)
+
+
+def test_projected_actions_need_states_that_the_observation_shows() -> None:
+    distracted = SPEC.derive(observation={"distractors": 2})
+    PPOProjection("MlpPolicy", lanes(spec=distracted), **SMALL).learn(64)
+    mixed = SPEC.derive(observation={"mixing": "orthogonal"})
+    with pytest.raises(OptionError, match=r"mixing='orthogonal': must be 'none'"):
+        PPOProjection("MlpPolicy", lanes(spec=mixed))
+
+
+def test_a_projection_is_not_exported_as_if_it_were_none(tmp_path: Path) -> None:
+    model = PPOProjection("MlpPolicy", lanes(), **SMALL)
+    with pytest.raises(PolicyError, match="projection cannot be exported"):
+        export_onnx(model, tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_task_without_limits_is_refused(algorithm: str, tmp_path: Path) -> None:
+    plain = SPEC.derive(safety=None)
+    with pytest.raises(OptionError, match=f"^{algorithm}: needs a task with limits"):
+        {"PPOLagrangian": PPOLagrangian, "PPOProjection": PPOProjection}[algorithm](
+            "MlpPolicy", lanes(spec=plain)
+        )
+    for name in (algorithm, algorithm.lower()):
+        with pytest.raises(OptionError, match=f"^{algorithm}: needs a task with limits"):
+            train(plain, algorithm=name, folder=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(OptionError, match=f"^{algorithm}: needs a task with limits"):
+        check_task(cell(algorithm, spec=plain))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("cost_limit", 1.5, r"in \[0, 1\]"),
+        ("cost_limit", "0.1", r"in \[0, 1\]"),
+        ("multiplier", -1.0, "of at least 0"),
+        ("multiplier_learning_rate", math.nan, "of at least 0"),
+    ],
+)
+def test_hyperparameters_out_of_range_are_refused(name: str, value: Any, allowed: str) -> None:
+    with pytest.raises(OptionError, match=rf"^{name}=.*: must be a finite number {allowed}"):
+        PPOLagrangian("MlpPolicy", lanes(), **{name: value})
+
+
+def test_hyperparameters_are_known_by_name() -> None:
+    check_hyperparameters("PPOLagrangian", {"cost_limit": 0.1, "n_steps": 64})
+    with pytest.raises(OptionError, match=r"cost_limits: .*Did you mean 'cost_limit'"):
+        check_hyperparameters("PPOLagrangian", {"cost_limits": 0.1})
+    with pytest.raises(OptionError, match=r"policy_kwargs\.limits"):
+        check_hyperparameters("PPOProjection", {"policy_kwargs": {"limits": 1}})
+
+
+def cell(uses: str, spec: SMESpec = SPEC) -> Cell:
+    return Cell(
+        spec=spec,
+        uses=uses,
+        hyperparameters={"n_steps": 64, "n_epochs": 1},
+        action_range="symmetric",
+        seed=0,
+        steps=128,
+        evaluations=2,
+        evaluation_episodes=1,
+        protocol=PROTOCOL,
+    )
+
+
+def test_studies_train_both_and_record_the_online_cost() -> None:
+    costs = {}
+    for uses in ALGORITHMS:
+        result = run_cell(cell(uses))
+        assert result.online_cost is not None
+        assert result.to_dict()["online_cost"] == result.online_cost
+        costs[uses] = result.online_cost
+    assert costs["PPOProjection"] == 0.0 < costs["PPOLagrangian"]
+    plain = run_cell(cell("PPO", SPEC.derive(safety=None)))
+    assert "online_cost" not in plain.to_dict()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_logs_and_draws_the_cost_of_its_episodes(algorithm: str, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = train(
+        SPEC,
+        algorithm=algorithm,
+        steps=128,
+        folder=tmp_path,
+        hyperparameters={"n_steps": 64, "n_epochs": 1},
+        protocol=PROTOCOL,
+        progress=False,
+    )
+    read = read_episodes(tmp_path / "episodes.csv")
+    assert len(read) == 6
+    for episode in read:
+        assert episode.safety is not None
+        assert (episode.safety.cost == 0.0) == (algorithm == "PPOProjection")
+        assert (episode.safety.violating_share == 0.0) == (algorithm == "PPOProjection")
+        assert -1.0 <= episode.safety.safe_regret <= 1.0
+    assert tmp_path / "cost_curve.png" in result.figures
+    assert evaluate(str(result.model_path), SPEC, PROTOCOL).wd_regret == result.report.wd_regret
+
+
+_SCRIPT = """
+import sys
+from sme_registry import SMESpec
+from sme_registry.training import train
+spec = SMESpec(state_dim=3, action_dim=2, horizon=20, safety={"tightness": 0.2}, seed=5)
+train(spec, algorithm="PPOLagrangian", steps=100_000, folder=sys.argv[1], checkpoint_every=64,
+      hyperparameters={"n_steps": 64, "n_epochs": 1, "cost_limit": 0.0},
+      protocol={"states_per_region": 50}, progress=False)
+"""
+
+
+def test_a_killed_run_resumes_with_its_multiplier(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = subprocess.Popen([sys.executable, "-c", _SCRIPT, str(folder)])
+    try:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and process.poll() is None:
+            record = RunRecord.read(folder) if (folder / "run.json").exists() else None
+            if record is not None and record.steps_done >= 192:
+                break
+            time.sleep(0.05)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    record = RunRecord.read(folder)
+    assert record is not None
+    assert record.steps_done >= 192
+    before = checkpoint.load(PPOLagrangian, folder / "checkpoint.zip", lanes()).multiplier
+    assert before > 0.1
+    result = train(
+        SPEC,
+        algorithm="PPOLagrangian",
+        steps=record.steps_done + 64,
+        folder=folder,
+        checkpoint_every=64,
+        protocol=PROTOCOL,
+        progress=False,
+        resume=True,
+    )
+    # It only rises, since the limit is 0.
+    assert PPOLagrangian.load(result.model_path).multiplier > before
+    assert all(episode.safety is not None for episode in result.episodes)
+
+
+def test_an_environment_of_another_package_is_refused() -> None:
+    from stable_baselines3.common.env_util import make_vec_env
+
+    with pytest.raises(OptionError, match="has no `sme_spec`"):
+        PPOLagrangian("MlpPolicy", make_vec_env("Pendulum-v1"))
