@@ -173,7 +173,7 @@ def test_projected_actions_need_states_that_the_observation_shows() -> None:
 def test_a_projection_is_not_exported_as_if_it_were_none(tmp_path: Path) -> None:
     model = PPOProjection("MlpPolicy", lanes(), **SMALL)
     with pytest.raises(PolicyError, match="projection cannot be exported"):
-        export_onnx(model, tmp_path / "policy.onnx")
+        export_onnx(model, SPEC, tmp_path / "policy.onnx")
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

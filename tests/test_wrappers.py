@@ -16,7 +16,12 @@ import sme_registry
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
 from sme_registry.training import read_episodes
-from sme_registry.wrappers import RecordRegret, RecordVectorRegret
+from sme_registry.wrappers import (
+    RecordRegret,
+    RecordVectorRegret,
+    StepWithCost,
+    VectorStepWithCost,
+)
 
 # Some episodes end by D, others at the horizon.
 SPEC = SMESpec(state_dim=3, action_dim=1, D=0.1, r_min=0.1, horizon=3)
@@ -155,3 +160,101 @@ def test_another_environment_is_refused_at_its_first_step() -> None:
     env.reset(seed=0)
     with pytest.raises(OptionError, match="info has no 'regret'"):
         env.step(np.zeros(1, np.float32))
+
+
+LIMITED = SMESpec(state_dim=3, action_dim=2, horizon=4, safety={"tightness": 0.3})
+
+
+def high_actions(lanes: int, steps: int = 11) -> Any:
+    return np.random.default_rng(2).uniform(0.5, 1.0, (steps, lanes, 2)).astype(np.float32)
+
+
+def singles(taken: Any) -> Any:
+    """Cost and safe regret of each step, `[steps, lanes, 2]`, of single environments."""
+    rows = []
+    for lane in range(taken.shape[1]):
+        env = sme_registry.make(LIMITED)
+        env.reset(seed=lane)
+        rows.append([])
+        for action in taken[:, lane]:
+            *_, truncated, info = env.step(action)
+            rows[-1].append((info["cost"], info["safe_regret"]))
+            if truncated:
+                env.reset()
+    return np.array(rows).swapaxes(0, 1)
+
+
+def test_a_step_with_cost_has_the_six_values_of_safety_gymnasium() -> None:
+    env = StepWithCost(sme_registry.make(LIMITED))
+    env.reset(seed=0)
+    taken = high_actions(1)[:4]
+    costs = []
+    for action in taken[:, 0]:
+        observation, reward, cost, terminated, truncated, info = env.step(action)
+        assert env.observation_space.contains(observation)
+        assert (reward, terminated) == (info["step_reward"], False)
+        assert type(cost) is float
+        costs.append(cost)
+    assert truncated
+    assert costs == singles(taken)[:, 0, 0].tolist()
+    assert max(costs) > 0.0
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+def test_a_vector_with_costs_has_those_of_its_singles(mode: str) -> None:
+    lanes = 3
+    taken = high_actions(lanes)
+    expected = singles(taken)[:, :, 0]
+    envs = VectorStepWithCost(sme_registry.make_vec(LIMITED, lanes, autoreset_mode=mode))
+    envs.reset(seed=0)
+    index, begins = 0, False
+    while index < len(taken):
+        observations, _, costs, _, truncated, info = envs.step(taken[index])
+        if begins:  # the step that begins an episode in the mode NEXT_STEP
+            assert costs.tolist() == [0.0] * lanes
+            begins = False
+            continue
+        assert costs.tolist() == expected[index].tolist()
+        if truncated.any():
+            begins = mode == "NextStep"
+            if mode == "Disabled":
+                envs.reset(options={"reset_mask": truncated})
+            if mode == "SameStep":
+                assert not np.array_equal(info["final_observation"][0], observations[0])
+                assert info["_final_observation"].all()
+        index += 1
+
+
+@pytest.mark.parametrize("kind", ["single", "SameStep", "NextStep"])
+def test_recorded_episodes_have_their_cost(kind: str, tmp_path: Path) -> None:
+    path, lanes = tmp_path / "episodes.csv", 1 if kind == "single" else 2
+    taken = high_actions(lanes, 4)
+    infos = {}
+    if kind == "single":
+        env: Any = RecordRegret(sme_registry.make(LIMITED), path)
+        env.reset(seed=0)
+        for action in taken[:, 0]:
+            infos = env.step(action)[4]
+    else:
+        env = RecordVectorRegret(sme_registry.make_vec(LIMITED, 2, autoreset_mode=kind), path)
+        env.reset(seed=0)
+        for action in taken:
+            infos = env.step(action)[4]
+    env.close()
+    values = singles(taken)
+    expected = [
+        (cost.mean(), (cost > 0).mean(), regret.mean())
+        for cost, regret in values.transpose(1, 2, 0)
+    ]
+    for episodes in (env.episodes, read_episodes(path)):
+        np.testing.assert_allclose([each.safety for each in episodes], expected, rtol=1e-8)
+    assert np.ravel(infos["episode"]["cost"]) == pytest.approx([row[0] for row in expected])
+
+
+def test_a_task_without_limits_has_no_costs() -> None:
+    with pytest.raises(OptionError, match=r"^StepWithCost: needs a task with limits"):
+        StepWithCost(sme_registry.make(SPEC))
+    with pytest.raises(OptionError, match=r"^VectorStepWithCost: needs a task with limits"):
+        VectorStepWithCost(sme_registry.make_vec(SPEC, 2))
+    with pytest.raises(OptionError, match="has no `sme_spec`"):
+        StepWithCost(gymnasium.make("Pendulum-v1"))

@@ -177,7 +177,7 @@ def train(
 
       sme train Switch5 -a PPO --agents jax
 
-      sme train safe.json -a PPOLagrangian -n 100000 --set cost_limit=0.02
+      sme train Safety20 -a PPOLagrangian -n 100000 --set cost_limit=0.02
 
       sme train --suite mine.json -a PPO --out runs/mine
     """

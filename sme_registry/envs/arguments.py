@@ -234,6 +234,6 @@ def refuse_without_limits(who: str, spec: SMESpec) -> None:
     """Raise OptionError if a task has no `safety`, which an algorithm or a wrapper needs."""
     if spec.safety is None:
         raise OptionError(
-            f"{who}: needs a task with limits, and this one has none. Give a task with safety; "
-            "`sme new task.json --safety '{\"tightness\": 0.2}'` writes one."
+            f"{who}: needs a task with limits, and this one has none. Give a task with safety, "
+            "such as Safety20."
         )

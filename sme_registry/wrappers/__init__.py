@@ -14,7 +14,7 @@ and for a task with safety `cost`, `violating_share` and `safe_regret` (`Episode
 
 The file is that of `sme train`: `plots.training_curve` and `sme diagnose --log` read it.
 
-    env = StepWithCost(sme_registry.make({"safety": {"tightness": 0.2}}))
+    env = StepWithCost(sme_registry.make("Safety20"))
     observation, reward, cost, terminated, truncated, info = env.step(action)
 
 is the interface of Safety-Gymnasium, which OmniSafe and SafePO expect.
