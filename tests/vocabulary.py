@@ -68,6 +68,7 @@ QUANTITIES = {
     "length": "mean steps of an episode",
     "mean_length": "the same in a diagnosis",
     "online_regret": "mean regret over training",
+    "online_cost": "mean cost over training",
     "agents_online_regret": "online regret of each agent of a team",
     "first_regret": "regret at the start of training",
     "best_regret": "lowest regret in training",
