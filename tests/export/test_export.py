@@ -58,6 +58,17 @@ def test_a_linear_map_is_exported(tmp_path: Path) -> None:
     same(policy, export_onnx(policy, SPEC, tmp_path / "linear.onnx"))
 
 
+def test_a_policy_that_sees_distractors_is_exported(tmp_path: Path) -> None:
+    observed = {"distractors": 4, "mixing": "orthogonal"}
+    spec = SPEC.derive(safety={"tightness": 0.2}, observation=observed)
+    policy = Perceptron([(arrays(9, 2), np.zeros(2), "identity")])
+    path = export_onnx(policy, spec, tmp_path / "wide.onnx")
+    exported, own = (evaluate(one, spec, PROTOCOL) for one in (path, policy))
+    for found, expected in zip(exported.regions, own.regions, strict=True):
+        assert found.normalised_regret == pytest.approx(expected.normalised_regret, abs=1e-5)
+    refused(policy, tmp_path, r"have shape \(9,\): must be \(5,\)", SPEC)
+
+
 def test_an_offline_policy_is_exported(tmp_path: Path) -> None:
     layers = [(arrays(16, 5), arrays(16)), (arrays(2, 16), arrays(2))]
     policy = OfflinePolicy(layers)

@@ -9,6 +9,7 @@ from sme_registry.datasets.collect import collect
 from sme_registry.errors import OptionError, SpecError, UnknownNameError
 from sme_registry.spec import Cell, EvaluationProtocol, SMESpec, StudyFile, StudyPlan
 from sme_registry.studies.engine.cell import run_cell
+from sme_registry.studies.engine.checks import check_task
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.runner import run_study
 from sme_registry.task import materialize
@@ -52,6 +53,27 @@ def test_a_cell_learns_from_the_data_of_its_seed_and_is_judged_as_every_cell(lea
     assert done.offline.similarity == done.curve.similarity[-1]
     again = run_cell(cell(f"offline:{learner}"))
     assert (again.curve, again.report, again.offline) == (done.curve, done.report, done.offline)
+
+
+@pytest.mark.parametrize("uses", ["offline:bc", "PPO"])
+def test_cells_have_limits_and_distractors_and_repeat_to_the_bit(uses: str) -> None:
+    observed = {"distractors": 3, "mixing": "orthogonal"}
+    spec = SMESpec(state_dim=2, action_dim=1, horizon=20, seed=1).derive(
+        safety={"tightness": 0.2}, observation=observed
+    )
+    own = {} if uses == "PPO" else {"hyperparameters": {"nu": 0.5, "transitions": 500}}
+    plain = cell(uses, spec=spec).model_copy(update={"hyperparameters": {}, **own})
+    done, again = run_cell(plain), run_cell(plain)
+    assert (again.curve, again.report) == (done.curve, done.report)
+    assert done.report is not None
+    assert done.report.safety is not None
+    assert done.report.observation is not None
+
+
+def test_agents_in_jax_refuse_limits_before_they_begin() -> None:
+    spec = SMESpec(state_dim=2, action_dim=1).derive(safety={"tightness": 0.2})
+    with pytest.raises(SpecError, match="tasks in JAX have no safety"):
+        check_task(cell("jax:PPO", spec=spec))
 
 
 def test_more_noise_makes_worse_data_and_other_cells() -> None:
