@@ -37,8 +37,9 @@ from sme_registry.task.draw import Array
 PROBE_STATES = 2**14  # of which half are held out
 _MOST_NUMBERS = 2**24  # of all their observations, 128 MiB as float64
 
-HiddenLayers = Callable[[Observation], Iterable[Array]]
-"""From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order."""
+HiddenLayers = Callable[[Observation], Iterable[Array] | None]
+"""From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order; None if they
+are unknown."""
 
 
 class Invariance(StrictModel):
@@ -127,6 +128,8 @@ def probe_layers(
 ) -> tuple[LayerProbe, ...]:
     """Probe what an agent sees and each of its hidden layers, in states of WD.
 
+    There are no probes of a policy whose hidden layers are unknown.
+
     Args:
       hidden: the outputs of the policy's hidden layers.
       task: a task with `observation`.
@@ -153,11 +156,11 @@ def probe_layers(
             distractor_r2=float(d_r2.mean()) if m else None,
         )
 
-    def layers() -> Iterator[Array]:
-        yield observation[:, :-2].astype(np.float64)
-        yield from hidden(observation.copy())
-
-    return tuple(probe(layer, h) for layer, h in enumerate(layers()))
+    layers = hidden(observation.copy())
+    if layers is None:
+        return ()
+    seen = observation[:, :-2].astype(np.float64)
+    return tuple(probe(layer, h) for layer, h in enumerate([seen, *layers]))
 
 
 def held_out_r2(h: Array, y: Array) -> Array:

@@ -218,6 +218,52 @@ def test_torch_modules_and_models_have_the_probes_of_their_layers():
         assert all(-0.1 < probe.state_r2 <= 1.0 for probe in probes)
 
 
+def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
+    torch = pytest.importorskip("torch")
+    nn = torch.nn
+    O = SPEC.observation_dim
+
+    class Tokens(nn.Module):  # each entry of the observation is a row
+        def __init__(self):
+            super().__init__()
+            self.embed, self.head = nn.Linear(1, 4), nn.Linear(4 * O, A)
+
+        def forward(self, o):
+            return torch.sigmoid(self.head(self.embed(o[..., None]).flatten(1)))
+
+    class Rows(nn.Module):  # one call for each state
+        def __init__(self):
+            super().__init__()
+            self.network = nn.Sequential(nn.Linear(O, 8), nn.ReLU(), nn.Linear(8, A))
+
+        def forward(self, o):
+            return torch.stack([self.network(row) for row in o])
+
+    class Branches(nn.Module):  # the second one's input is no output of the first
+        def __init__(self):
+            super().__init__()
+            self.state, self.distractors = nn.Linear(M, M), nn.Linear(M, M)
+            self.head = nn.Linear(2 * M, A)
+
+        def forward(self, o):
+            h = [self.state(o[:, :M]), self.distractors(o[:, M : 2 * M])]
+            return self.head(torch.relu(torch.cat(h, dim=1)))
+
+    class Towers(nn.Module):  # two networks side by side
+        def __init__(self):
+            super().__init__()
+            self.one, self.other = (
+                nn.Sequential(nn.Linear(O, 8), nn.ReLU(), nn.Linear(8, A)) for _ in range(2)
+            )
+
+        def forward(self, o):
+            return self.one(o) + self.other(o)
+
+    protocol = EvaluationProtocol(states_per_region=64, epsilons=(0.5,))
+    for module in (Tokens(), Rows(), Branches(), Towers()):
+        assert evaluate(module, SPEC, protocol).observation.probes == (), type(module).__name__
+
+
 def test_a_policy_for_another_width_is_refused_with_the_number_of_distractors():
     narrow = Perceptron([(np.ones((S + 2, A)), np.zeros(A), "identity")])
     with pytest.raises(PolicyError):

@@ -181,7 +181,7 @@ def _prepare(
         name = Path(policy).stem if name is None else name
         policy = _load(Path(policy), interface)
     act, episodes = policy, None
-    hidden: Callable[[Observation], Iterable[Any]] | None = None
+    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
     if hasattr(policy, "predict"):
         interface.check(
             "policy",

@@ -44,10 +44,12 @@ def module_predictor(module: Any) -> Callable[[Observation], Any]:
 
 def hidden_layers(
     act: Callable[[Observation], Any], module: Any
-) -> Callable[[Observation], list[Any]]:
+) -> Callable[[Observation], list[Any] | None]:
     """The outputs of a module's hidden layers: the inputs of its linear layers but the first one's.
 
-    So an activation counts as part of its layer, whether it is a module or a function.
+    So an activation counts as part of its layer, whether it is a module or a function. They are
+    None unless the linear layers form a chain from the observation, in which each is called once:
+    of branches, tokens or rows, it is unknown which inputs are a hidden layer.
 
     Args:
       act: acts by calling the module.
@@ -55,12 +57,11 @@ def hidden_layers(
     """
     linear = [part for part in module.modules() if isinstance(part, _torch().nn.Linear)]
 
-    def hidden(observations: Observation) -> list[Any]:
-        inputs: list[Any] = []
+    def hidden(observations: Observation) -> list[Any] | None:
+        calls: list[tuple[Any, Any]] = []
 
-        def keep(_: Any, arguments: tuple[Any, ...]) -> None:
-            # Two heads of a network, such as mean and spread, have the same input.
-            inputs.extend(x for x in arguments[:1] if not any(x is known for known in inputs))
+        def keep(layer: Any, arguments: tuple[Any, ...]) -> None:
+            calls.extend((layer, x) for x in arguments[:1])
 
         hooks = [part.register_forward_pre_hook(keep) for part in linear]
         try:
@@ -68,9 +69,35 @@ def hidden_layers(
         finally:
             for hook in hooks:
                 hook.remove()
-        return [without_tensor(x) for x in inputs[1:]]
+        inputs = _chain(calls, observations.shape)
+        return None if inputs is None else [without_tensor(x) for x in inputs[1:]]
 
     return hidden
+
+
+def _chain(calls: list[tuple[Any, Any]], observed: tuple[int, ...]) -> list[Any] | None:
+    """The different inputs of linear layers, in order; None if the layers form no chain.
+
+    Args:
+      calls: each called layer, with its input.
+      observed: the shape of the observations, `(B, O)`, which the first input must have.
+    """
+    if len({layer for layer, _ in calls}) < len(calls):
+        return None
+    links: list[tuple[Any, list[int]]] = []  # an input, and the widths of the layers that take it
+    for layer, x in calls:
+        # Two heads of a network, such as mean and spread, have the same input.
+        widths = next((widths for known, widths in links if known is x), None)
+        if widths is None:
+            links.append((x, widths := []))
+        widths.append(layer.out_features)
+    B, O = observed
+    before = [[O], *(widths for _, widths in links)]
+    linked = all(
+        any(tuple(x.shape) == (B, width) for width in widths)
+        for (x, _), widths in zip(links, before, strict=False)
+    )
+    return [x for x, _ in links] if linked else None
 
 
 def without_tensor(returned: Any) -> Any:

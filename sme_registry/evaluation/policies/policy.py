@@ -72,7 +72,7 @@ class Policy:
     action_dim: int
     hint: str = ""
     episodes: Callable[[], Callable[[Observation], Any]] | None = None
-    hidden: Callable[[Observation], Iterable[Any]] | None = None
+    hidden: Callable[[Observation], Iterable[Any] | None] | None = None
 
     def start(self) -> Policy:
         """This policy at the start of a batch of episodes; a recurrent one keeps its state."""
