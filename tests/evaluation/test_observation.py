@@ -221,12 +221,12 @@ def test_torch_modules_and_models_have_the_probes_of_their_layers():
 def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
     torch = pytest.importorskip("torch")
     nn = torch.nn
-    O = SPEC.observation_dim
+    entries = SPEC.observation_dim
 
     class Tokens(nn.Module):  # each entry of the observation is a row
         def __init__(self):
             super().__init__()
-            self.embed, self.head = nn.Linear(1, 4), nn.Linear(4 * O, A)
+            self.embed, self.head = nn.Linear(1, 4), nn.Linear(4 * entries, A)
 
         def forward(self, o):
             return torch.sigmoid(self.head(self.embed(o[..., None]).flatten(1)))
@@ -234,7 +234,7 @@ def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
     class Rows(nn.Module):  # one call for each state
         def __init__(self):
             super().__init__()
-            self.network = nn.Sequential(nn.Linear(O, 8), nn.ReLU(), nn.Linear(8, A))
+            self.network = nn.Sequential(nn.Linear(entries, 8), nn.ReLU(), nn.Linear(8, A))
 
         def forward(self, o):
             return torch.stack([self.network(row) for row in o])
@@ -253,7 +253,7 @@ def test_torch_modules_whose_linear_layers_form_no_chain_have_no_probes():
         def __init__(self):
             super().__init__()
             self.one, self.other = (
-                nn.Sequential(nn.Linear(O, 8), nn.ReLU(), nn.Linear(8, A)) for _ in range(2)
+                nn.Sequential(nn.Linear(entries, 8), nn.ReLU(), nn.Linear(8, A)) for _ in range(2)
             )
 
         def forward(self, o):

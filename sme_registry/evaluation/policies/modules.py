@@ -91,10 +91,10 @@ def _chain(calls: list[tuple[Any, Any]], observed: tuple[int, ...]) -> list[Any]
         if widths is None:
             links.append((x, widths := []))
         widths.append(layer.out_features)
-    B, O = observed
-    before = [[O], *(widths for _, widths in links)]
+    rows, entries = observed
+    before = [[entries], *(widths for _, widths in links)]
     linked = all(
-        any(tuple(x.shape) == (B, width) for width in widths)
+        any(tuple(x.shape) == (rows, width) for width in widths)
         for (x, _), widths in zip(links, before, strict=False)
     )
     return [x for x, _ in links] if linked else None

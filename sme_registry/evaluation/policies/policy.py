@@ -63,7 +63,7 @@ class Policy:
       episodes: a new `act` for a batch of episodes that start together: it keeps the state of a
         recurrent policy from call to call, row by row. None: it has no state.
       hidden: observations to the outputs `[B, H]` of each hidden layer of its network, in order;
-        None of an unknown one.
+        None, or a result of None, of an unknown one.
     """
 
     name: str
