@@ -23,6 +23,7 @@ pytest.importorskip("stable_baselines3")
 
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sme_registry.export import export_onnx
 from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
@@ -168,6 +169,23 @@ def test_projected_actions_need_states_that_the_observation_shows() -> None:
     mixed = SPEC.derive(observation={"mixing": "orthogonal"})
     with pytest.raises(OptionError, match=r"mixing='orthogonal': must be 'none'"):
         PPOProjection("MlpPolicy", lanes(spec=mixed))
+
+
+@pytest.mark.parametrize("wrapper", [VecNormalize, lambda venv: VecFrameStack(venv, 2)])
+def test_projected_actions_need_the_observations_of_the_environment_itself(wrapper: Any) -> None:
+    with pytest.raises(OptionError, match=r"must be those of the environment itself, Box\(0\.0"):
+        PPOProjection("MlpPolicy", wrapper(lanes()))
+    rewards_only = VecNormalize(lanes(), norm_obs=False)
+    PPOProjection("MlpPolicy", rewards_only, **SMALL).learn(64)
+
+
+def test_a_projection_goes_on_in_its_own_task_only() -> None:
+    model = PPOProjection("MlpPolicy", lanes(), **SMALL)
+    model.set_env(lanes())
+    tighter = SPEC.derive(safety={"tightness": 0.4})
+    with pytest.raises(OptionError, match="set_env: the environment's task is sha256:.*load"):
+        model.set_env(lanes(spec=tighter))
+    assert reloaded(model, lanes(spec=tighter)).learn(64)
 
 
 def test_a_projection_is_not_exported_as_if_it_were_none(tmp_path: Path) -> None:

@@ -4,8 +4,9 @@
 
 ℓ are the task's own limits: an oracle, which no agent without a model of its constraints has. s is
 the state as the observation shows it. The projection is a part of the policy, so a saved model has
-it, too. Such a policy never costs anything, and what it earns less than the best safe action is due
-to what PPO has not learned. It is a safety layer (Dalal et al., 2018) whose constraints are known.
+it, too. Up to L = 10 such a policy never costs anything, and deeper limits are violated by rounding
+at most. Its shortfall from the best safe action is what PPO has not learned. It is a safety layer
+(Dalal et al., 2018) whose constraints are known.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnvWrapper, unwrap_vec_normalize
 
 from sme_registry.errors import OptionError
 from sme_registry.sb3.limits import spec_with_limits
@@ -27,7 +29,7 @@ from sme_registry.task import materialize
 _Array = npt.NDArray[np.float32]
 
 # Observations are float32, so limits computed from them are off: by 1e-7 at L = 1, 1e-6 at L = 10
-# and 3e-5 at L = 50, at most, in 60,000 states. Deeper limits can still be broken, by rounding.
+# and 3e-5 at L = 50, at most, in 60,000 states. So limits of L = 50 can be violated, by 2e-5.
 _MARGIN = 1e-5
 
 
@@ -104,7 +106,8 @@ class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
     Arguments are those of PPO.
 
     Raises:
-      OptionError: the task has no `safety`, or its observations mix the state.
+      OptionError: the task has no `safety`, or its observations mix the state; the environment is
+        wrapped such that observations do not begin with the state; in `set_env`, another task.
     """
 
     policy_aliases = {"MlpPolicy": ProjectedPolicy}  # noqa: RUF012  # as in PPO
@@ -114,6 +117,18 @@ class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
             limits_of = _spec(self.env).to_dict()
             self.policy_kwargs = {**self.policy_kwargs, "_limits_of": limits_of}
         super()._setup_model()
+
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """Go on in another environment of the same task, whose limits are those of the policy."""
+        venv = self._wrap_env(env, self.verbose)
+        here, other = SMESpec(**self.policy_kwargs["_limits_of"]), _spec(venv)
+        if here.digest != other.digest:
+            raise OptionError(
+                f"PPOProjection: set_env: the environment's task is {other.digest[:19]}…, and the "
+                f"policy projects onto the limits of {here.digest[:19]}…. Use an environment of "
+                "that task, or load the model with the other: load(path, env=env)."
+            )
+        super().set_env(venv, force_reset)
 
     @staticmethod
     def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> Any:
@@ -131,4 +146,17 @@ def _spec(env: Any) -> SMESpec:
             "limits follow from the state, which mixed observations do not show. Train "
             "PPOLagrangian."
         )
+    space, normalised = Box(0.0, 1.0, (spec.observation_dim,), np.float32), _normalises(env)
+    if normalised or env.observation_space != space:
+        shown = "normalised" if normalised else f"{env.observation_space}"
+        raise OptionError(
+            f"PPOProjection: observations are {shown}: must be those of the environment itself, "
+            f"{space}, since the limits follow from the state with which they begin. Take off the "
+            "wrappers that change observations, and use VecNormalize with norm_obs=False."
+        )
     return spec
+
+
+def _normalises(env: Any) -> bool:
+    normaliser = unwrap_vec_normalize(env)
+    return normaliser is not None and normaliser.norm_obs
