@@ -183,7 +183,7 @@ def test_a_projection_goes_on_in_its_own_task_only() -> None:
     model = PPOProjection("MlpPolicy", lanes(), **SMALL)
     model.set_env(lanes())
     tighter = SPEC.derive(safety={"tightness": 0.4})
-    with pytest.raises(OptionError, match="set_env: the environment's task is sha256:.*load"):
+    with pytest.raises(OptionError, match=r"set_env: the environment's task is sha256:.*load"):
         model.set_env(lanes(spec=tighter))
     assert reloaded(model, lanes(spec=tighter)).learn(64)
 
