@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
-from sme_registry.errors import ActionError, StateError
+from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.spec import SMESpec
 from sme_registry.task import draw
 from sme_registry.task.draw import Array, Layer
@@ -149,9 +149,9 @@ class Task:
         return self.limit_of(through(self.limiting, s))
 
     def safe_action(self, s: npt.ArrayLike) -> Array:
-        """min(π*, ℓ), `[B, A]` or `[A]`: of all actions of cost 0 the one of the highest reward.
+        """min(π*, ℓ), `[B, A]` or `[A]`: of all actions of cost 0 the nearest to π* in L1.
 
-        The nearest one to π* in the L1 norm, and unique, since each channel has its own limit.
+        Unique as such, since each channel has its own limit. None of cost 0 earns more.
         """
         s = self._states(s)
         return np.minimum(self.policy(s), self.limit(s))
@@ -162,8 +162,9 @@ class Task:
         return self.cost_of(a, self.limit(s))
 
     def limit_of(self, v: Array) -> Array:
-        """ℓ = 1 − 2τ v of the outputs of v, of any shape."""
-        assert self.spec.safety is not None
+        """ℓ = 1 − 2τ v of the outputs of v, of any shape; SpecError without safety."""
+        if self.spec.safety is None:
+            raise SpecError("limit_of: this task has no safety. Give its spec safety.")
         return 1.0 - 2.0 * self.spec.safety.tightness * v
 
     def cost_of(self, a: Array, limit: Array) -> Array:
@@ -179,10 +180,19 @@ class Task:
         Args:
           d: `[B, m]` or `[m]` autonomous or driven distractors.
           u: `[B, A]` or `[A]` what drives them: uniform random numbers, or the agent's actions.
+
+        Raises:
+          SpecError: the task has no distractors, or they are noise, which is drawn anew each step.
         """
-        assert self.distractor_transition is not None
-        d = _checked(d, self.spec.distractors, "distractors", StateError)
-        return _moved(d, self._actions(u), *self.distractor_transition)
+        if self.distractor_transition is None:
+            found = "has noise, drawn anew each step" if self.spec.distractors else "has none"
+            raise SpecError(
+                f"distractor_step: needs distractors with a transition; this task {found}. Give "
+                "its spec observation with distractors, of dynamics='autonomous' or 'driven'."
+            )
+        d, u = self._distractors(d), self._actions(u)
+        _refuse_unequal("action", u, d, "one row for each of the {} distractors", ActionError)
+        return _moved(d, u, *self.distractor_transition)
 
     def seen(self, s: npt.ArrayLike, d: npt.ArrayLike | None = None) -> Array:
         """M(s, d), what the agent sees of the state: `[B, S + m]` or `[S + m]`.
@@ -190,14 +200,15 @@ class Task:
         Args:
           s: `[B, S]` or `[S]` states, any real numbers.
           d: `[B, m]` or `[m]` distractors; None where the task has none.
+
+        One state may be given with a batch of distractors, and the other way round.
         """
-        x = self._states(s)
+        x, d = self._states(s), self._distractors(np.empty(0) if d is None else d)
+        _refuse_unequal("distractors", d, x, "one row for each of the {} states", StateError)
         if self.spec.distractors:
-            d = _checked(
-                np.empty(0) if d is None else d, self.spec.distractors, "distractors", StateError
-            )
-            x = np.concatenate([x, d], axis=-1)
-        assert self.spec.observation is not None or not self.mixing
+            lanes = np.broadcast_shapes(x.shape[:-1], d.shape[:-1])
+            both = (np.broadcast_to(each, (*lanes, each.shape[-1])) for each in (x, d))
+            x = np.concatenate(tuple(both), axis=-1)
         if self.spec.observation is not None and self.spec.observation.mixing == "orthogonal":
             ((W, b),) = self.mixing
             return x @ W.T + b
@@ -280,15 +291,14 @@ class Task:
     def _pairs(self, s: npt.ArrayLike, a: npt.ArrayLike) -> tuple[Array, Array]:
         """Checked states and actions; one of them may be single while the other is a batch."""
         s, a = self._states(s), self._actions(a)
-        if s.ndim == a.ndim == 2 and len(s) != len(a):
-            raise ActionError(
-                f"action of shape {a.shape}: must be [{len(s)}, {a.shape[1]}], one action for each "
-                f"of the {len(s)} states."
-            )
+        _refuse_unequal("action", a, s, "one action for each of the {} states", ActionError)
         return s, a
 
     def _states(self, s: npt.ArrayLike) -> Array:
         return _checked(s, self.spec.state_dim, "state", StateError)
+
+    def _distractors(self, d: npt.ArrayLike) -> Array:
+        return _checked(d, self.spec.distractors, "distractors", StateError)
 
     def _actions(self, a: npt.ArrayLike) -> Array:
         return np.clip(_checked(a, self.spec.action_dim, "action", ActionError), 0.0, 1.0)
@@ -309,6 +319,17 @@ def _moved(s: Array, a: Array, W: Array, b: Array) -> Array:
     return np.asarray(2.0 * np.abs(y - np.rint(y)))
 
 
+def _refuse_unequal(
+    name: str, values: Array, others: Array, rule: str, error: type[Exception]
+) -> None:
+    """Raise `error` if both are batches, and not of one size."""
+    if values.ndim == others.ndim == 2 and len(values) != len(others):
+        raise error(
+            f"{name} of shape {values.shape}: must be [{len(others)}, {values.shape[1]}], "
+            f"{rule.format(len(others))}."
+        )
+
+
 def _checked(values: npt.ArrayLike, width: int, name: str, error: type[Exception]) -> Array:
     """`values` as float64 of shape `[..., width]`, finite."""
     try:
@@ -319,9 +340,10 @@ def _checked(values: npt.ArrayLike, width: int, name: str, error: type[Exception
     except (TypeError, ValueError):
         raise error(f"{name}={values!r:.80}: must be an array of {width} numbers.") from None
     if array.ndim not in (1, 2) or array.shape[-1] != width:
+        field = "number of distractors" if name == "distractors" else f"{name}_dim"
         raise error(
             f"{name} of shape {array.shape}: must be [{width}] or [B, {width}] "
-            f"(this task's {name}_dim is {width})."
+            f"(this task's {field} is {width})."
         )
     if not (np.abs(array) < _LARGEST).all():
         raise error(

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.special import ndtr, ndtri
 
 from sme_registry import SMESpec
-from sme_registry.errors import ActionError, StateError
+from sme_registry.errors import ActionError, SpecError, StateError
 from sme_registry.task import materialize
 from tests.strategies import observations, spec_fields
 
@@ -166,3 +166,29 @@ def test_bad_distractors_are_refused_with_their_shape():
         task.distractor_step(np.zeros(3), np.zeros(3))
     with pytest.raises(StateError, match="state of shape"):
         task.seen(np.zeros(7), np.zeros(3))
+    with pytest.raises(StateError, match=r"number of distractors is 3"):
+        task.seen(s)
+    with pytest.raises(StateError, match=r"distractors of shape \(3, 3\): must be \[5, 3\], one"):
+        task.seen(np.zeros((5, 8)), np.zeros((3, 3)))
+    with pytest.raises(ActionError, match=r"action of shape \(3, 4\): must be \[5, 4\], one"):
+        task.distractor_step(np.zeros((5, 3)), np.zeros((3, 4)))
+
+
+def test_a_state_is_seen_with_each_of_many_distractors_and_they_with_it():
+    task = task_of(distractors=3, mixing="orthogonal")
+    s, d = inside(task, 5)
+    ones = np.ones((5, 1))
+    assert np.array_equal(task.seen(s[0], d), task.seen(ones * s[0], d))
+    assert np.array_equal(task.seen(s, d[0]), task.seen(s, ones * d[0]))
+
+
+def test_tasks_without_what_is_asked_for_say_so():
+    plain = materialize(SMESpec(seed=3))
+    with pytest.raises(StateError, match=r"distractors of shape \(3,\): must be \[0\]"):
+        plain.seen(np.zeros(8), np.zeros(3))
+    with pytest.raises(SpecError, match=r"distractor_step: .* this task has none"):
+        plain.distractor_step(np.zeros(3), np.zeros(4))
+    with pytest.raises(SpecError, match=r"drawn anew each step.*dynamics='autonomous'"):
+        task_of(distractors=3).distractor_step(np.zeros(3), np.zeros(4))
+    with pytest.raises(SpecError, match="limit_of: this task has no safety"):
+        plain.limit_of(np.zeros(4))
