@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, cast
 
 import gymnasium
@@ -73,6 +74,7 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
         self._action_shape = (A,)
         self._state = "created"
+        self._keyed_by: np.random.Generator | None = None  # of which the distractors' stream is
         self._extended = ExtendedLane(self._task) if self.sme_spec.extended else None
         self._load_engine()
 
@@ -164,7 +166,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         """Begin an episode at a state drawn uniformly from the cube, or at one of your choice.
 
         Args:
-          seed: seeds the environment's generator; None continues its stream.
+          seed: seeds the environment's generator; None continues its stream. Distractors follow
+            from the seed, or from `np_random` where you have set it.
           options: `{"state": s}` begins at s `[S]`, each entry in [0, 1], and where the task has
             distractors `{"distractors": d}` at d `[m]`.
 
@@ -191,9 +194,9 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         self._lane[LANE_STATE:] = s
         shown: npt.NDArray[Any] = s
         if self._extended is not None:
-            begins = seed is not None or self._state == "created"
-            if begins and self.np_random_seed >= 0:  # -1 where the user has set the generator
-                self._extended.seed(0, self.np_random_seed)
+            if self._keyed_by is not self.np_random:
+                self._extended.seed(0, self._distractors_seed())
+                self._keyed_by = self.np_random
             shown = self._extended.begin_lane(distractors)
         observation = np.zeros(len(shown) + 2 + len(self._phase_shown), np.float32)
         observation[: len(shown)], observation[len(shown) + 2 :] = shown, self._phase_shown
@@ -202,6 +205,14 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
         if self.render_mode is not None:
             self._record(self, None)
         return observation, {**infos.at_reset(self.sme_spec), **life}
+
+    def _distractors_seed(self) -> int:
+        """The seed of the generator, or a number that follows from one that the user has set.
+
+        That number is drawn from a copy, so that initial states are as without `observation`.
+        """
+        seed: int = self.np_random_seed  # -1 where the user has set the generator
+        return seed if seed >= 0 else int(copy.deepcopy(self.np_random).integers(2**63))
 
     def _live(self, lifetime: int | None) -> dict[str, Any]:
         """Called by each reset before it draws a state; what it returns is added to the info.
