@@ -17,10 +17,11 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from sme_registry.evaluation import references
 from sme_registry.evaluation.observation import ObservationReport
 from sme_registry.evaluation.region_report import RegionReport, RegionReports
 from sme_registry.evaluation.report_file import ReportFile
@@ -38,6 +39,8 @@ NOT_COMPARABLE = (
     "Levels ε are not comparable between different state_dim: with more channels, the states of "
     "a shell lie nearer to its outer face."
 )
+
+_REMEDY = "Get the report from its source again, or repeat the evaluation."
 
 LABELS = {
     "optimal": "optimal",
@@ -101,6 +104,45 @@ class EvaluationReport(ReportFile):
     safety: SafetyReport | None = None
     observation: ObservationReport | None = None
     versions: dict[str, str]
+
+    @model_validator(mode="after")
+    def _safety_and_observation_fit(self) -> Self:
+        """Both are there exactly if the task has them, with the regions and references of all."""
+        for field in ("safety", "observation"):
+            given, of_task = getattr(self, field) is not None, getattr(self.spec, field) is not None
+            if given != of_task:
+                raise ValueError(
+                    f"{field}: is {'present' if given else 'missing'}, but the task is one "
+                    f"{'with' if of_task else 'without'} {field}. {_REMEDY}"
+                )
+        for field, names, expected in self._names():
+            if names != expected:
+                raise ValueError(
+                    f"{field}: is of {', '.join(names) or 'nothing'}: must be of "
+                    f"{', '.join(expected) or 'nothing'}. {_REMEDY}"
+                )
+        return self
+
+    def _names(self) -> Iterator[tuple[str, list[str], list[str]]]:
+        """Fields that must have entries of certain names: the field, its names and those names."""
+        regions = [region.name for region in self.regions]
+        if self.safety is not None:
+            expected = sorted(references.names(self.spec))
+            yield "agents", list(self.agents), []
+            yield "references", sorted(self.references), expected
+            yield "safety.references", sorted(self.safety.references), expected
+            yield "safety.regions", [score.name for score in self.safety.regions], regions
+            for name, scores in self.safety.references.items():
+                own = [region.name for region in self.references[name]]
+                yield f"references.{name}", own, regions
+                own = [score.name for score in scores]
+                yield f"safety.references.{name}", own, regions
+        if self.observation is not None:
+            seen = regions if self.spec.distractors else []
+            own = [each.name for each in self.observation.invariance]
+            yield "observation.invariance", own, seen
+            own = [region.name for region in self.observation.distractor_regions]
+            yield "observation.distractor_regions", own, [f"d-{name}" for name in seen[1:]]
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -175,7 +217,8 @@ class EvaluationReport(ReportFile):
         """
         columns: dict[str, float] = {}
         if self.safety is not None:
-            scores = self.safety.references.get(reference, self.safety.regions)
+            safety = self.safety
+            scores = safety.references[reference] if reference else safety.regions
             columns |= scores[index].model_dump(exclude={"name"})
         if self.observation is not None and self.observation.invariance:
             own = 0.0 if reference else self.observation.invariance[index].invariance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
-from sme_registry.errors import PolicyError
+from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Perceptron, evaluate_many, regions
 from sme_registry.evaluation.observation import held_out_r2
 from sme_registry.evaluation.regions import expansion
@@ -280,6 +280,14 @@ def test_evaluating_together_gives_the_same_reports_and_the_report_survives_its_
     assert last.observation == evaluate(ignorant, SPEC.derive(horizon=9), PROTOCOL).observation
     report.write(tmp_path / "evaluation.json")
     assert EvaluationReport.read(tmp_path / "evaluation.json") == report
+
+
+@pytest.mark.parametrize("field", ["invariance", "distractor_regions"])
+def test_a_stored_report_without_a_region_of_distractors_is_refused(report, field):
+    document = report.to_dict()
+    document["observation"][field].pop()
+    with pytest.raises(SpecError, match=f"observation.{field}: is of"):
+        EvaluationReport.from_dict(document)
 
 
 def test_the_table_and_the_frame_show_distractors_and_probes():

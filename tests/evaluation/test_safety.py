@@ -107,6 +107,50 @@ def test_the_report_survives_its_file_and_plain_reports_have_no_safety(report, t
     assert tuple(plain["references"]) == NAMES
 
 
+def without_shrunk(document):
+    del document["safety"]["references"]["shrunk_optimal"]
+
+
+def without_linear(document):
+    del document["safety"]["references"]["linear_least_squares"]
+
+
+def one_region(document):
+    del document["safety"]["regions"][1:]
+
+
+def one_region_of_a_reference(document):
+    del document["safety"]["references"]["optimal"][1:]
+
+
+def without_safety(document):
+    del document["safety"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_shrunk, "safety.references: is of"),
+        (without_linear, "safety.references: is of"),
+        (one_region, "safety.regions: is of WD: must be of WD, OOD 1, OOD 2"),
+        (one_region_of_a_reference, "safety.references.optimal: is of WD: must be of"),
+        (without_safety, "safety: is missing"),
+    ],
+)
+def test_a_stored_report_whose_safety_does_not_fit_its_task_is_refused(report, change, message):
+    document = report.to_dict()
+    change(document)
+    with pytest.raises(SpecError, match=message):
+        EvaluationReport.from_dict(document)
+
+
+def test_a_stored_report_of_a_plain_task_has_no_safety(report):
+    plain = SPEC.derive(safety=None)
+    document = report.to_dict() | {"spec": plain.to_dict(), "spec_digest": plain.digest}
+    with pytest.raises(SpecError, match="safety: is present, but the task is one without safety"):
+        EvaluationReport.from_dict(document)
+
+
 def test_limits_change_no_other_number(report):
     plain = evaluate(linear, SPEC.derive(safety=None), PROTOCOL)
     assert report.regions == plain.regions
