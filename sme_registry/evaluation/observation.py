@@ -35,7 +35,8 @@ from sme_registry.task import Task
 from sme_registry.task.draw import Array
 
 PROBE_STATES = 2**14  # of which half are held out
-_MOST_NUMBERS = 2**24  # of all their observations, 128 MiB as float64
+_PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
+_STATES_PER_UNKNOWN = 4  # of the fit; with fewer, R² would tell how few they are
 
 HiddenLayers = Callable[[Observation], Iterable[Array] | None]
 """From observations `[B, O]` to the outputs `[B, H]` of each hidden layer, in order; None if they
@@ -76,7 +77,8 @@ class ObservationReport(StrictModel):
     Attributes:
       invariance: in WD, OOD 1, 2, …; empty without distractors.
       distractor_regions: d-OOD 1, 2, …: s in the cube and d in a shell; empty without distractors.
-      probes: of the observation and of each hidden layer; empty if the policy's network is unknown.
+      probes: of the observation and of each hidden layer; empty if the policy's network is unknown,
+        or it or the task is too wide (see `probe_layers`).
     """
 
     invariance: Annotated[tuple[Invariance, ...], Field(strict=False)] = ()
@@ -128,18 +130,20 @@ def probe_layers(
 ) -> tuple[LayerProbe, ...]:
     """Probe what an agent sees and each of its hidden layers, in states of WD.
 
-    There are no probes of a policy whose hidden layers are unknown.
+    There are no probes of a policy whose hidden layers are unknown or too wide for the fit (above
+    2,047 units), and none of a task with more than 512 channels of s and d.
 
     Args:
       hidden: the outputs of the policy's hidden layers.
       task: a task with `observation`.
-      protocol: for the seed; there are always `PROBE_STATES` states, fewer of a large task.
+      protocol: for the seed; there are always `PROBE_STATES` states.
 
     Raises:
       PolicyError: outputs that are not finite.
     """
-    m, width = task.spec.distractors, task.spec.observation_dim
-    count = max(64, min(PROBE_STATES, _MOST_NUMBERS // width) // 2 * 2)
+    m, count = task.spec.distractors, PROBE_STATES
+    if task.spec.state_dim + m > _PROBED_CHANNELS:
+        return ()
     [batch] = states(protocol.model_copy(update={"states_per_region": count}), 0, task.spec, count)
     observation = batch.observation(batch.seen(task), task.spec.horizon)
     targets = np.concatenate([batch.s, batch.d], axis=1).astype(np.float64)
@@ -160,7 +164,10 @@ def probe_layers(
     if layers is None:
         return ()
     seen = observation[:, :-2].astype(np.float64)
-    return tuple(probe(layer, h) for layer, h in enumerate([seen, *layers]))
+    outputs = [seen, *layers]
+    if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
+        return ()
+    return tuple(probe(layer, h) for layer, h in enumerate(outputs))
 
 
 def held_out_r2(h: Array, y: Array) -> Array:

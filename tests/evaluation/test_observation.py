@@ -8,7 +8,7 @@ import pytest
 from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Perceptron, evaluate_many, regions
-from sme_registry.evaluation.observation import held_out_r2
+from sme_registry.evaluation.observation import held_out_r2, probe_layers
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import EvaluationProtocol
 
@@ -162,6 +162,16 @@ def test_probes_are_held_out():
     r2 = held_out_r2(random.normal(size=(100, 60)), random.normal(size=(100, 8)))
     assert r2.shape == (8,)
     assert r2.mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("distractors", "units", "layers"), [(508, 1, 2), (509, 1, 0), (M, 2048, 0)]
+)
+def test_probes_that_the_states_cannot_fit_are_left_out(distractors, units, layers):
+    # 512 channels in all is the most. With 2,048 units, an unknown has fewer than four states.
+    task = materialize(SPEC.derive(observation={"distractors": distractors}))
+    probes = probe_layers(lambda o: [o[:, :1].repeat(units, axis=1)], task, PROTOCOL)
+    assert [probe.layer for probe in probes] == list(range(layers))
 
 
 def test_a_nonlinear_mixing_is_what_a_linear_map_cannot_undo():
