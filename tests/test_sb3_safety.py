@@ -163,6 +163,14 @@ def test_projected_actions_never_cost_anything(action_range: Any) -> None:
     assert np.array_equal(policy.act(seen), actions)
 
 
+def test_a_saved_model_leaves_its_last_rollout_out() -> None:
+    model = PPOLagrangian("MlpPolicy", lanes(), **SMALL).learn(64)
+    assert {"_costs", "_cut"} <= set(vars(model))
+    again = reloaded(model, lanes())
+    assert not {"_costs", "_cut"} & set(vars(again))
+    again.learn(64)
+
+
 def test_projected_actions_need_states_that_the_observation_shows() -> None:
     distracted = SPEC.derive(observation={"distractors": 2})
     PPOProjection("MlpPolicy", lanes(spec=distracted), **SMALL).learn(64)

@@ -88,6 +88,9 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
         names, variables = super()._get_torch_save_params()
         return [*names, "cost_critic", "cost_critic.optimizer"], variables
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_costs", "_cut"]  # the last rollout
+
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> bool:
         """Collect a rollout as PPO does, and its costs."""
         self._costs: list[_Array] = []  # [lanes] of each step
