@@ -256,5 +256,10 @@ def test_a_task_without_limits_has_no_costs() -> None:
         StepWithCost(sme_registry.make(SPEC))
     with pytest.raises(OptionError, match=r"^VectorStepWithCost: needs a task with limits"):
         VectorStepWithCost(sme_registry.make_vec(SPEC, 2))
-    with pytest.raises(OptionError, match="has no `sme_spec`"):
+    with pytest.raises(OptionError, match=r"^StepWithCost: .* has no `sme_spec`"):
         StepWithCost(gymnasium.make("Pendulum-v1"))
+    vector = gymnasium.vector.SyncVectorEnv([lambda: sme_registry.make(LIMITED)])
+    with pytest.raises(
+        OptionError, match=r"^VectorStepWithCost: .* vector of sme_registry\.make_vec"
+    ):
+        VectorStepWithCost(vector)

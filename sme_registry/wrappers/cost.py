@@ -31,7 +31,7 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gymnasium.Wrapper.__init__(self, env)
-        refuse_without_limits(type(self).__name__, spec_of(env))
+        refuse_without_limits(type(self).__name__, spec_of(type(self).__name__, env))
 
     def step(  # type: ignore[override]
         self, action: Any
@@ -41,13 +41,19 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         return observation, reward, float(info["cost"]), terminated, truncated, info
 
 
-def spec_of(env: Any) -> Any:
-    """The spec of an environment or a vector of this package; OptionError for any other."""
+def spec_of(wrapper: str, env: Any) -> Any:
+    """The spec of an environment or a vector of this package; OptionError for any other.
+
+    Args:
+      wrapper: its name in the error's message.
+      env: an environment or a vector, wrapped or not.
+    """
     try:
         return env.unwrapped.sme_spec
     except AttributeError:
         raise OptionError(
-            f"StepWithCost: {env!r:.80} has no `sme_spec`. Wrap an environment of sme_registry."
+            f"{wrapper}: {env!r:.80} has no `sme_spec`. Wrap an environment of sme_registry.make, "
+            "or a vector of sme_registry.make_vec."
         ) from None
 
 

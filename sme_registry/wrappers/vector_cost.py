@@ -20,13 +20,13 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
       envs: a vector of `make_vec`, wrapped or not, whose task has `safety`.
 
     Raises:
-      OptionError: the task has no limits.
+      OptionError: the task has no limits, or the vector is not one of `make_vec`.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, envs)
-        refuse_without_limits(type(self).__name__, spec_of(envs))
+        refuse_without_limits(type(self).__name__, spec_of(type(self).__name__, envs))
 
     def step(  # type: ignore[override]
         self, actions: Any
