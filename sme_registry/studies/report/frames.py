@@ -53,6 +53,7 @@ Where the plan has tasks with safety or with observation, `results` has these co
 or NA for the other tasks:
 
     tightness                                             of the task's limits, τ
+    online_cost                                           of the run: mean cost over training
     cost, violating_share, safe_regret, price_of_safety   of the region
     distractors, dynamics, mixing, mixing_depth           fields of the task's observation
     distractor_regret                                     of the run: mean over the shells of d
@@ -87,7 +88,7 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 # Columns of a run, and of its regions, where the plan has tasks with these fields.
 _EXTENSIONS = {
-    "safety": ("tightness", "cost violating_share safe_regret price_of_safety"),
+    "safety": ("tightness online_cost", "cost violating_share safe_regret price_of_safety"),
     "observation": (
         "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 distractor_regret",
         "invariance",
@@ -273,6 +274,8 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
     for field in ("safety", "observation"):
         block = getattr(cell.spec, field)
         columns |= {} if block is None else block.to_dict()
+    if cell.spec.safety is not None:
+        columns["online_cost"] = math.nan if result.online_cost is None else result.online_cost
     if report.observation is not None:
         columns["distractor_regret"] = report.distractor_regret
     for name, agent in report.agents.items():

@@ -117,6 +117,7 @@ def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
     assert list(of_class["driven"].invariance) == [e.invariance for e in observation.invariance]
     assert of_class["driven"].distractor_regret[0] == reports["driven"].distractor_regret
     run = frames.runs(results).set_index("class_name")
+    assert run.online_cost.isna().all()  # a reference does not train
     assert run.tightness.dropna().to_dict() == {"safe": 0.4}
     assert run.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
     assert run.dynamics.dropna().to_dict() == {"driven": "driven"}
@@ -129,7 +130,14 @@ def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
 
 def test_plans_without_limits_and_observations_have_no_such_columns() -> None:
     plain, safe, driven = (set(frames_of(name)[0].results) for name in ("plain", "safe", "driven"))
-    limits = {"tightness", "cost", "violating_share", "safe_regret", "price_of_safety"}
+    limits = {
+        "tightness",
+        "online_cost",
+        "cost",
+        "violating_share",
+        "safe_regret",
+        "price_of_safety",
+    }
     assert safe - plain == limits
     fields = {"distractors", "dynamics", "mixing", "mixing_depth"}
     assert driven - plain == fields | {"distractor_regret", "invariance"}
