@@ -210,12 +210,11 @@ def initial_states(state: Any, shape: tuple[int, ...], name: str = "state") -> A
 
 
 def without_extension(task: Task) -> Task:
-    """The task; SpecError if it has `safety` or `observation`, which teams have not."""
+    """The task; SpecError if it has `safety` or `observation`, which teams do not support."""
     for field in ("safety", "observation"):
         if getattr(task.spec, field) is not None:
             raise SpecError(
-                f"{field}: environments of teams do not run it. Use sme_registry.make, or leave it "
-                "out."
+                f"{field}: not supported for teams. Use sme_registry.make, or leave it out."
             )
     return task
 

@@ -78,6 +78,8 @@ class Extended:
 
     def seed_by_states(self, lanes: Lanes, states: Array, seed: int) -> None:
         """Restart the streams of lanes from their initial states; see `Batch.seed_by_states`."""
+        if not self._task.spec.distractors:
+            return
         for lane, s in zip(lanes.tolist(), states, strict=True):
             self.seed(lane, seed + int.from_bytes(s.astype("<f8").tobytes(), "little"))
 

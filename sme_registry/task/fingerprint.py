@@ -77,7 +77,9 @@ def check_fingerprint(published: Fingerprint, task: Task) -> None:
         if rows is None and not here.ndim:
             continue
         if rows is None or not here.ndim:
-            difference = "is missing" if rows is None else "is of something that the task has not"
+            difference = (
+                "is missing" if rows is None else "is present, but this task has no such numbers"
+            )
         elif [len(row) for row in rows] != [here.shape[1]] * len(here):
             difference = "has another shape"
         else:

@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 import sme_registry
 from sme_registry import SMESpec, StreamSpec, testing
 from sme_registry.envs import SMEEnv, SMEVectorEnv
+from sme_registry.envs.extension import Extended
 from sme_registry.envs.team import SMETeamEnv
 from sme_registry.errors import OptionError, SpecError, StateError
+from sme_registry.task import materialize
 from sme_registry.task.streams import counted
 from sme_registry.wrappers import RecordRegret
 from tests.strategies import specs
@@ -297,6 +299,17 @@ def test_a_generator_of_the_users_serves() -> None:
 
 
 @pytest.mark.parametrize("name", SPECS)
+def test_streams_are_derived_from_states_only_where_distractors_draw_from_them(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeded: list[int] = []
+    extended = Extended(materialize(SPECS[name]), 2)
+    monkeypatch.setattr(extended, "seed", lambda lane, seed: seeded.append(lane))
+    extended.seed_by_states(np.arange(2), np.zeros((2, SPECS[name].state_dim)), 0)
+    assert seeded == ([0, 1] if SPECS[name].distractors else [])
+
+
+@pytest.mark.parametrize("name", SPECS)
 @pytest.mark.parametrize("here", ["numba", "numpy"])
 def test_an_episode_pickled_under_one_back_end_goes_on_under_the_other(
     name: str, here: str, monkeypatch: pytest.MonkeyPatch
@@ -384,5 +397,5 @@ def test_streams_and_environments_of_teams_refuse_them(name: str) -> None:
     field = "safety" if name == "safe" else "observation"
     with pytest.raises(SpecError, match=rf"phases.0.spec: has {field}.*Remove its {field}"):
         StreamSpec.from_dict({"phases": [{"spec": SPECS[name].to_dict(), "steps": 10}]})
-    with pytest.raises(SpecError, match=rf"{field}: environments of teams do not run it"):
+    with pytest.raises(SpecError, match=rf"{field}: not supported for teams"):
         SMETeamEnv(SPECS[name])
