@@ -45,7 +45,7 @@ __all__ = [
     "time_dependence",
 ]
 
-MAX_NUMBERS = 2**23  # of states and actions held at once: 64 MiB as float64
+MAX_NUMBERS = 2**23  # of states, distractors and actions held at once: 64 MiB as float64
 _BOUND = 0.01  # an action this close to 0 or 1 is saturated
 _BINS = 5
 _SHELL_STATES = 2000
@@ -71,8 +71,10 @@ class Sample(NamedTuple):
 
 
 def affordable(task: Task, states: int) -> int:
-    """How many of some states fit in memory at once; fewer if states are large, at least 64."""
-    return max(64, min(states, MAX_NUMBERS // (task.spec.state_dim + task.spec.action_dim)))
+    """How many of some states, with their distractors, fit in memory at once; at least 64."""
+    spec = task.spec
+    width = spec.state_dim + spec.distractors + spec.action_dim
+    return max(64, min(states, MAX_NUMBERS // width))
 
 
 def clipped_actions(policy: Policy, observation: Observation) -> Array:

@@ -5,8 +5,7 @@ Policies whose tasks have the same draw share states, optimal actions and refere
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from sme_registry.evaluation import references
 from sme_registry.evaluation.accumulators import Errors
 from sme_registry.evaluation.observation import Distraction
 from sme_registry.evaluation.policies import Policy, TeamPolicy
-from sme_registry.evaluation.regions import Observations, States, Uniform, states
+from sme_registry.evaluation.regions import Observations, States, Uniform, batch_rows, states
 from sme_registry.evaluation.safety import SafetyAccumulator
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task
@@ -142,9 +141,10 @@ def measure(
     fitted: references.References | None = None
     total, done = protocol.states_per_region * len(protocol.edges), 0
     for region in range(len(protocol.edges)):
-        batches = _batches(task, oracle, protocol, region, horizons)
+        known: list[Array] = []
         if fitted is None:
-            fitted, batches = _fit_references(batches, task)
+            fitted, known = _fit_references(task, oracle, protocol)
+        batches = _batches(task, oracle, protocol, region, horizons, known)
         measured = Measured.begin(subjects, task, protocol, region, channels)
         random = Uniform(protocol.seed, f"evaluation/{region}/random_action")
         for batch in batches:
@@ -179,14 +179,26 @@ def _actions(
 
 
 def _batches(
-    task: Task, oracle: Engine, protocol: EvaluationProtocol, region: int, horizons: Sequence[int]
+    task: Task,
+    oracle: Engine,
+    protocol: EvaluationProtocol,
+    region: int,
+    horizons: Sequence[int],
+    known: Iterable[Array],
 ) -> Iterator[_Batch]:
-    """The states of a region, with the observations that tasks of each horizon make of them."""
+    """The states of a region, with the observations that tasks of each horizon make of them.
+
+    `known` are the π* `[B, A]` of the first batches, as far as they have been computed.
+    """
     limit_of = _limit(task, oracle) if task.spec.safety is not None else lambda s: None
+    known = iter(known)
     for drawn in states(protocol, region, task.spec):
         x, s = drawn.seen(task), drawn.s.astype(np.float64)
         shown = {T: drawn.observation(x, T) for T in horizons}
-        yield _Batch(drawn, shown, s, oracle.optimal_action(s), limit_of(s))
+        optimal = next(known, None)
+        if optimal is None:
+            optimal = oracle.optimal_action(s)
+        yield _Batch(drawn, shown, s, optimal, limit_of(s))
 
 
 def _limit(task: Task, oracle: Engine) -> Callable[[Array], Array]:
@@ -198,14 +210,19 @@ def _limit(task: Task, oracle: Engine) -> Callable[[Array], Array]:
 
 
 def _fit_references(
-    batches: Iterator[_Batch], task: Task
-) -> tuple[references.References, Iterator[_Batch]]:
-    """The references fitted on the first states, and all batches from the first one on."""
-    count = references.fit_states(task.spec)
-    first: list[_Batch] = []
-    while sum(len(batch.s) for batch in first) < count and (batch := next(batches, None)):
-        first.append(batch)
-    s = np.concatenate([batch.s for batch in first])[:count]
-    optimal = np.concatenate([batch.optimal for batch in first])[:count]
+    task: Task, oracle: Engine, protocol: EvaluationProtocol
+) -> tuple[references.References, list[Array]]:
+    """The references fitted on the first states of WD, and the π* `[B, A]` of their batches.
+
+    The states are drawn without what else an observation shows, which would not fit in memory.
+    """
+    count, rows = references.fit_states(task.spec), batch_rows(task.spec)
+    s, optimal = [], []
+    for drawn in states(protocol, 0, task.spec.derive(observation=None), rows):
+        s.append(drawn.s.astype(np.float64))
+        optimal.append(oracle.optimal_action(s[-1]))
+        if rows * len(s) >= count:
+            break
     agents = zip(task.observed, task.owned, strict=True)
-    return references.fit(s, optimal, agents), itertools.chain(first, batches)
+    first = np.concatenate(s)[:count], np.concatenate(optimal)[:count]
+    return references.fit(*first, agents), optimal

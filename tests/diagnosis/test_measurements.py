@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sme_registry import evaluate, materialize
-from sme_registry.diagnosis import rollouts
+from sme_registry.diagnosis import measure, rollouts
 from sme_registry.diagnosis.document import POLICY
 from tests.diagnosis.policies import (
     DEEP,
@@ -43,6 +43,12 @@ def test_the_shares_of_the_squared_error_are_those_of_its_causes() -> None:
     assert error.offset == pytest.approx(offset / (offset + scale), abs=0.01)
     assert error.residual == pytest.approx(0.0, abs=1e-6)
     assert measured.response.sensitivity == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_states_held_at_once_are_bounded_however_many_distractors_there_are() -> None:
+    task = materialize(SPEC.derive(observation={"distractors": 2**17}))
+    assert measure.affordable(task, 8192) * 2**17 <= measure.MAX_NUMBERS
+    assert measure.affordable(materialize(SPEC), 8192) == 8192
 
 
 def test_scores_and_shells_agree_with_evaluate() -> None:

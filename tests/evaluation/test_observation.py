@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,19 @@ def test_states_are_those_of_the_task_without_distractors():
     seeing = evaluate(ignorant, SPEC, PROTOCOL)
     assert seeing.regions == plain.regions
     assert seeing.references == plain.references
+
+
+def test_memory_does_not_grow_with_distractors_times_states(monkeypatch):
+    monkeypatch.setattr(regions, "BATCH_ROWS", 64)
+    spec, protocol = SPEC.derive(observation={"distractors": 400}), PROTOCOL
+    evaluate(ignorant, spec, protocol)  # caches what it computes once
+    tracemalloc.start()
+    try:
+        evaluate(ignorant, spec, protocol)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 4 * 2**20  # all distractors of WD are 6 MiB, twelve batches of them 2 MiB
 
 
 @pytest.mark.parametrize("region", [0, 1, 2])
