@@ -25,8 +25,8 @@ from sme_registry.diagnosis.stream_questions import (
     outcome_of,
 )
 from sme_registry.diagnosis.stream_subject import StreamSubject
+from sme_registry.evaluation import regions
 from sme_registry.evaluation.policies import Perceptron
-from sme_registry.evaluation.regions import batch_rows, observations
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, StreamSpec
 
@@ -74,9 +74,10 @@ class _States:
     def __init__(self, stream: StreamSpec, states: int, seed: int) -> None:
         self._stream = stream
         spec = stream.phases[0].spec
-        count = min(states, _MOST_STATES, batch_rows(spec))
+        count = min(states, _MOST_STATES, regions.batch_rows(spec))
         protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-        (self._observation,) = observations(protocol, 0, spec, rows=count)
+        (drawn,) = regions.states(protocol, 0, spec, rows=count)
+        self._observation = drawn.observation(drawn.s, spec.horizon)
 
     def of(self, network: Perceptron | None, phase: int | None) -> NetworkState | None:
         """The state of a network; None of an unknown one.

@@ -24,8 +24,7 @@ from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLD
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY
 from sme_registry.envs.types import Observation
-from sme_registry.evaluation import Policy, TeamPolicy
-from sme_registry.evaluation.regions import observations
+from sme_registry.evaluation import Policy, TeamPolicy, regions
 from sme_registry.io import versions
 from sme_registry.spec import EvaluationProtocol, SMESpec
 from sme_registry.task import Task, materialize
@@ -155,9 +154,9 @@ def _uniform(task: Task, policy: TeamPolicy, states: int, seed: int) -> tuple[Ar
     """The uniform states `[N, S]` in which every agent is measured, and the joint actions."""
     count = measure.affordable(task, states)
     protocol = EvaluationProtocol(states_per_region=count, seed=seed)
-    (observation,) = observations(protocol, 0, task.spec, rows=count)
-    s = observation[:, : task.spec.state_dim].astype(np.float64)
-    return s, np.clip(policy(observation), 0.0, 1.0)
+    (drawn,) = regions.states(protocol, 0, task.spec, rows=count)
+    observation = drawn.observation(drawn.s, task.spec.horizon)
+    return drawn.s.astype(np.float64), np.clip(policy(observation), 0.0, 1.0)
 
 
 class _Team(NamedTuple):

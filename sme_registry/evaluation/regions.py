@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from sme_registry.errors import OptionError
 from sme_registry.spec import EvaluationProtocol, SMESpec
-from sme_registry.task import Task, materialize
+from sme_registry.task import Task
 from sme_registry.task.draw import Array
 from sme_registry.task.streams import bit_generator, to_uniform
 
@@ -105,21 +105,6 @@ def states(
     for first in range(0, protocol.states_per_region, rows):
         count = min(rows, protocol.states_per_region - first)
         yield States(points(count), distractors(count, spec.distractors), times(count))
-
-
-def observations(
-    protocol: EvaluationProtocol, region: int, spec: SMESpec, rows: int | None = None
-) -> Iterator[Observations]:
-    """The observations of the `states` of a region, `[B, S + m + 2]` float32, batch by batch.
-
-    They are (x, t/T, r_cum/k), of which x is the state, or what the agent sees in its place.
-
-    Raises:
-      OptionError: no float32 number lies between the faces of this shell.
-    """
-    task = materialize(spec)
-    for batch in states(protocol, region, spec, rows):
-        yield batch.observation(batch.seen(task), spec.horizon)
 
 
 class Uniform:

@@ -30,8 +30,9 @@ from sme_registry.evaluation import (
 )
 from sme_registry.evaluation.continual import RegretBlocks, metrics
 from sme_registry.evaluation.continual.report import METRICS, Retention
-from sme_registry.evaluation.continual.retention import final_specs
-from sme_registry.spec import StreamSpec
+from sme_registry.evaluation.continual.retention import Subject, final_specs, measure
+from sme_registry.spec import EvaluationProtocol, StreamSpec
+from sme_registry.task import loading
 
 PROTOCOL = {"states_per_region": 300, "epsilons": [0.5, 1.0]}
 SPEC = SMESpec(state_dim=4, action_dim=2, hidden_width=8, complexity=2, horizon=10)
@@ -68,6 +69,15 @@ def report(seed=0):
 
 
 # Retention
+
+
+def test_retention_draws_each_task_once_even_if_it_is_too_large_to_keep(monkeypatch):
+    drawn = []
+    draw = loading._draw
+    monkeypatch.setattr(loading, "_CACHED_BYTES", 0)
+    monkeypatch.setattr(loading, "_draw", lambda spec: drawn.append(spec) or draw(spec))
+    measure(THREE, [Subject(0, range(3))], EvaluationProtocol(**PROTOCOL))
+    assert drawn == list(final_specs(THREE))
 
 
 def test_the_matrix_has_the_normalised_regret_of_an_evaluation_on_each_phases_task():

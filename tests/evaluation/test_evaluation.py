@@ -22,6 +22,7 @@ from sme_registry.errors import (
 from sme_registry.evaluation import references, regions
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
+from tests.evaluation.shown import observations
 
 SPEC = SMESpec(state_dim=4, action_dim=3, complexity=3)
 PROTOCOL = EvaluationProtocol(states_per_region=3_000)
@@ -69,7 +70,7 @@ def test_numbers_are_those_of_the_definition(report):
     task = materialize(SPEC)
     inside = None
     for index, region in enumerate(report.regions):
-        o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
+        o = observations(PROTOCOL, index, SPEC)
         s, a = o[:, :4].astype(np.float64), np.clip(linear(o), 0.0, 1.0).astype(np.float64)
         optimal = task.optimal_action(s)
         similarity = task.similarity(s, a)

@@ -7,8 +7,9 @@ import pytest
 from scipy import stats
 
 from sme_registry.errors import OptionError
-from sme_registry.evaluation.regions import _Shell, expansion, observations, region_name
+from sme_registry.evaluation.regions import _Shell, expansion, region_name
 from sme_registry.spec import EvaluationProtocol, SMESpec
+from tests.evaluation.shown import observations
 
 SIGNIFICANCE = 1e-3  # of each test below; the seeds are fixed, so it fails always or never
 
@@ -16,7 +17,7 @@ SIGNIFICANCE = 1e-3  # of each test below; the seeds are fixed, so it fails alwa
 def drawn(region, state_dim, rows=None, **fields):
     protocol = EvaluationProtocol(**{"states_per_region": 20_000, **fields})
     spec = SMESpec(state_dim=state_dim)
-    return np.concatenate(list(observations(protocol, region, spec, rows)))
+    return observations(protocol, region, spec, rows)
 
 
 def states(region, state_dim, **fields):

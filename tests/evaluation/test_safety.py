@@ -7,9 +7,10 @@ import pytest
 
 from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
 from sme_registry.errors import PolicyError, SpecError
-from sme_registry.evaluation import evaluate_many, regions
+from sme_registry.evaluation import evaluate_many
 from sme_registry.evaluation.references import NAMES, POLICIES, SAFE_NAMES, SHORT_NAMES
 from sme_registry.spec import EvaluationProtocol
+from tests.evaluation.shown import observations
 
 TAU = 0.3
 SPEC = SMESpec(state_dim=4, action_dim=3, complexity=2, r_min=0.2, safety={"tightness": TAU})
@@ -32,7 +33,7 @@ def test_numbers_are_those_of_the_definition(monkeypatch, backend):
     monkeypatch.setenv("SME_BACKEND", backend)
     report, task = evaluate(linear, SPEC, PROTOCOL), materialize(SPEC)
     for index, score in enumerate(report.safety.regions):
-        o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
+        o = observations(PROTOCOL, index, SPEC)
         s, a = o[:, :4].astype(np.float64), np.clip(linear(o), 0.0, 1.0).astype(np.float64)
         reward, best = task.step_reward(s, a), task.step_reward(s, task.safe_action(s))
         assert score.name == report.regions[index].name

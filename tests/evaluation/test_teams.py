@@ -20,6 +20,7 @@ from sme_registry.envs.shared import (
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation import as_policy, references, regions
 from sme_registry.spec import EvaluationProtocol
+from tests.evaluation.shown import observations
 
 AGENTS = [
     {"name": "left_0", "action_dim": 1, "observes": [0, 2]},
@@ -103,7 +104,7 @@ def test_constant_half_has_normalised_regret_of_exactly_1_for_every_agent(policy
 def test_an_agents_numbers_are_those_of_the_definition(report):
     assert tuple(report.agents) == NAMES
     for index in range(3):
-        o = np.concatenate(list(regions.observations(PROTOCOL, index, SPEC)))
+        o = observations(PROTOCOL, index, SPEC)
         best = TASK.optimal_action(o[:, :4].astype(np.float64))
         parts, clipped = [], []
         for agent, (name, own) in enumerate(zip(NAMES, TASK.owned, strict=True)):
@@ -222,7 +223,7 @@ def test_a_shared_policy_is_asked_for_each_agent_with_its_shared_observation():
 
     evaluate(policy, SPEC, SMALL)
     for index in range(2):
-        (o,) = regions.observations(SMALL, index, SPEC)
+        o = observations(SMALL, index, SPEC)
         joint = np.concatenate([o, np.zeros((200, 2), np.float32)], axis=1)
         expected = shared_observation(TASK, joint)
         for agent in range(3):

@@ -23,7 +23,7 @@ from sme_registry.errors import OptionError, PolicyError, UnknownNameError
 from sme_registry.evaluation.evaluate import same_draw
 from sme_registry.evaluation.measure import Progress
 from sme_registry.evaluation.policies import Policy, as_policy
-from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, observations
+from sme_registry.evaluation.regions import BATCH_NUMBERS, batch_rows, states
 from sme_registry.spec import EvaluationProtocol, SMESpec, StreamSpec
 from sme_registry.task import materialize_together
 from sme_registry.task.draw import Array
@@ -113,8 +113,9 @@ def measure(
     rows = max(1, min(rows, BATCH_NUMBERS // (len(oracles) * stream.action_dim)))
     done, total = 0, protocol.states_per_region * K
     for region in range(K):
-        for batch in observations(protocol, region, specs[0], rows):
-            s = batch[:, : stream.state_dim].astype(np.float64)
+        for drawn in states(protocol, region, specs[0], rows):
+            batch = drawn.observation(drawn.s, specs[0].horizon)
+            s = drawn.s.astype(np.float64)
             by_key = {key: oracle.optimal_action(s) for key, oracle in oracles.items()}
             optimal = [by_key[key] for key in keys]
             of_half[:, region] += [_distance(np.full_like(a, 0.5), a) for a in optimal]
