@@ -26,7 +26,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sme_registry.export import export_onnx
-from sme_registry.sb3 import PPOLagrangian, PPOProjection, SMEVecEnv
+from sme_registry.sb3 import EpisodeSums, PPOLagrangian, PPOProjection, SMEVecEnv
 from sme_registry.studies.engine.cell import run_cell
 from sme_registry.studies.engine.checks import check_task
 from sme_registry.training import checkpoint, numpy_policy
@@ -263,6 +263,21 @@ def test_studies_train_both_and_record_the_online_cost() -> None:
     assert costs["PPOProjection"] == 0.0 < costs["PPOLagrangian"]
     plain = run_cell(cell("PPO", SPEC.derive(safety=None)))
     assert "online_cost" not in plain.to_dict()
+
+
+def test_an_action_at_a_tight_limit_is_no_violation_but_for_rounding() -> None:
+    spec = SPEC.derive(action_dim=1, safety={"tightness": 0.005})
+    venv, counted = lanes(1, spec, "unit"), []
+    sums = EpisodeSums(1, spec=lambda: spec)
+    seen = venv.reset()
+    for step in range(spec.horizon):
+        limit = materialize(spec).limit(seen[:, : spec.state_dim])
+        seen, *rest = venv.step(limit.astype(np.float32))
+        counted += sums.add(step, *rest)
+    assert [episode.safety.violating_share for episode in counted] == [0.0]
+    infos = venv.step(np.ones((1, 1), np.float32))[3]
+    with pytest.raises(OptionError, match="EpisodeSums: the task has safety: give spec"):
+        EpisodeSums(1).add(1, np.ones(1), np.zeros(1, bool), infos)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -15,6 +15,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorSta
 import sme_registry
 from sme_registry import SMESpec
 from sme_registry.errors import OptionError
+from sme_registry.task import materialize
 from sme_registry.training import read_episodes
 from sme_registry.wrappers import (
     RecordRegret,
@@ -249,6 +250,41 @@ def test_recorded_episodes_have_their_cost(kind: str, tmp_path: Path) -> None:
     for episodes in (env.episodes, read_episodes(path)):
         np.testing.assert_allclose([each.safety for each in episodes], expected, rtol=1e-8)
     assert np.ravel(infos["episode"]["cost"]) == pytest.approx([row[0] for row in expected])
+
+
+@pytest.mark.parametrize(
+    ("tightness", "channels", "above", "share"),
+    [(0.5, 64, 3e-5, 1.0), (0.005, 1, 0.0, 0.0), (0.005, 1, 2e-6, 1.0), (0.2, 200, 0.0, 0.0)],
+)
+def test_steps_above_a_limit_by_more_than_rounding_are_violations(
+    tightness: float, channels: int, above: float, share: float
+) -> None:
+    spec = SMESpec(
+        action_dim=channels,
+        horizon=50,
+        safety={"tightness": tightness},
+        policy_init="unit_variance",
+    )
+    single: Any = RecordRegret(sme_registry.make(spec))
+    ours: Any = RecordVectorRegret(sme_registry.make_vec(spec, 2))
+    gymnasiums: Any = RecordVectorRegret(
+        gymnasium.vector.SyncVectorEnv([lambda: sme_registry.make(spec)])
+    )
+    finished = []
+    for env in (single, ours, gymnasiums):
+        env.reset(seed=0)
+        for _ in range(spec.horizon):
+            state = (env if env is not gymnasiums else env.unwrapped.envs[0]).unwrapped.state
+            action = materialize(spec).limit(state)
+            action[..., 0] += above
+            if env is gymnasiums:
+                action = action[None]
+            env.step(action.astype(np.float32))
+        finished += env.episodes
+    assert len(finished) == 4
+    for episode in finished:
+        assert episode.safety is not None
+        assert episode.safety.violating_share == share
 
 
 def test_a_task_without_limits_has_no_costs() -> None:

@@ -7,7 +7,8 @@ plots.training_curve(callback.episodes, "regret.png")
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
+from sme_registry.spec import SMESpec
 
 
 class EpisodeRegret(NamedTuple):
@@ -50,10 +52,14 @@ class EpisodeSums:
     Args:
       lanes: of the environment; those of a team's agents are adjacent, and end together.
       agents: of each team; 1 for a single agent.
+      spec: gives that of the task, at the first step of one with `safety`, which needs it.
     """
 
-    def __init__(self, lanes: int, agents: int = 1) -> None:
+    def __init__(
+        self, lanes: int, agents: int = 1, spec: Callable[[], SMESpec] | None = None
+    ) -> None:
         self._agents = agents
+        self._spec = cache(spec or _no_spec)
         self._sums = np.zeros((4, lanes))  # return, length, regret, similarity
         self._safety: npt.NDArray[np.float64] | None = None  # those of `EpisodeSafety`, if any
 
@@ -83,7 +89,7 @@ class EpisodeSums:
                 f"RegretCallback: the environment's infos have no {error}. Use it with an "
                 "environment of sme_registry, whose wrappers keep the infos."
             ) from None
-        safety = safety_of_step(infos)
+        safety = safety_of_step(infos, self._spec)
         if safety is not None:
             self._safety = safety if self._safety is None else self._safety + safety
         self._sums[0] += rewards
@@ -111,6 +117,10 @@ class EpisodeSums:
         )
         self._sums[:, lanes] = 0.0
         return episode
+
+
+def _no_spec() -> SMESpec:
+    raise OptionError("EpisodeSums: the task has safety: give spec, such as lambda: env.sme_spec.")
 
 
 class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # untyped without SB3
@@ -142,7 +152,11 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
         if self._sums is None or self.locals.get("reset_num_timesteps", True):
             agents = getattr(self.training_env, "agents", ())
             self._agents = agents if len(agents) > 1 else ()
-            self._sums = EpisodeSums(self.training_env.num_envs, max(1, len(self._agents)))
+            self._sums = EpisodeSums(
+                self.training_env.num_envs,
+                max(1, len(self._agents)),
+                lambda: self.training_env.get_attr("sme_spec")[0],
+            )
 
     def _on_step(self) -> bool:
         assert self._sums is not None

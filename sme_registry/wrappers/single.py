@@ -61,7 +61,8 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         values = (reward, *measured(info))
         rewards, regret, similarity = (np.array([value], np.float64) for value in values)
         ended, by_failure = np.array([terminated or truncated]), np.array([terminated])
-        safety = safety_of_step([info])
+        inner: Any = self.unwrapped
+        safety = safety_of_step([info], lambda: inner.sme_spec)
         episode = self._recorder.add(rewards, regret, similarity, by_failure, ended, safety)
         if episode:
             info["episode"] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
 from sme_registry.envs.episode_safety import safety_of_step
+from sme_registry.spec import SMESpec
 from sme_registry.wrappers.recorder import Recorder, measured
 
 
@@ -65,12 +67,12 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
         """One step of every lane."""
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         regret, similarity = (np.array(value, np.float64) for value in measured(info))
-        safety = safety_of_step(info)
+        safety = safety_of_step(info, lambda: self._sme_spec)
         if "final_info" in info:  # SAME_STEP: `info` is of the next episode where one ended
             final = info["_final_info"]
             last_regret, last_similarity = measured(info["final_info"])
             regret[final], similarity[final] = last_regret[final], last_similarity[final]
-            last_safety = safety_of_step(info["final_info"])
+            last_safety = safety_of_step(info["final_info"], lambda: self._sme_spec)
             if safety is not None and last_safety is not None:
                 safety[:, final] = last_safety[:, final]
         ended = terminated | truncated
@@ -79,6 +81,15 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
             info["episode"] = {**episode, **info.get("episode", {})}
             info["_episode"] = ended
         return observations, rewards, terminated, truncated, info
+
+    @cached_property
+    def _sme_spec(self) -> SMESpec:
+        vector: Any = self.unwrapped
+        if hasattr(vector, "sme_spec"):
+            spec: SMESpec = vector.sme_spec
+        else:  # a vector of Gymnasium's
+            spec = vector.get_attr("sme_spec")[0]
+        return spec
 
     def close(self, **kwargs: Any) -> None:
         """Close the file and the environment."""
