@@ -93,12 +93,16 @@ EXTENDED = {
 }
 
 
-def frames_of(*names: str) -> tuple[studies.StudyFrames, dict[str, EvaluationReport]]:
-    """The frames of these classes under one reference, and the report of each class."""
+def frames_of(
+    *names: str, **changed: float
+) -> tuple[studies.StudyFrames, dict[str, EvaluationReport]]:
+    """The frames of these classes under one reference, with fields of results changed; reports."""
     small = {"state_dim": 2, "action_dim": 2}
     classes = [{"name": n, "setting": small | EXTENDED[n], "seeds": [1]} for n in names]
     plan = small_file(seeds=1, algorithms=["linear_least_squares"], classes=classes).plan
-    results = {cell.cell.digest: run_cell(cell.cell) for cell in plan.cells}
+    results = {
+        cell.cell.digest: run_cell(cell.cell).model_copy(update=changed) for cell in plan.cells
+    }
     reports = {cell.class_name: results[cell.cell.digest].report for cell in plan.cells}
     assert all(reports.values())
     return frames.study_frames(plan, results), reports  # type: ignore[return-value]
@@ -118,6 +122,7 @@ def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
     assert of_class["driven"].distractor_regret[0] == reports["driven"].distractor_regret
     run = frames.runs(results).set_index("class_name")
     assert run.online_cost.isna().all()  # a reference does not train
+    assert set(frames_of("safe", online_cost=0.25)[0].results.online_cost) == {0.25}
     assert run.tightness.dropna().to_dict() == {"safe": 0.4}
     assert run.distractors.dropna().to_dict() == {"driven": 3, "mixed": 0}
     assert run.dynamics.dropna().to_dict() == {"driven": "driven"}
