@@ -169,7 +169,7 @@ def test_a_fingerprint_holds_limits_distractors_and_what_is_seen(field):
         check_fingerprint(Fingerprint.from_dict(missing), task)
     plain = materialize(SMESpec(state_dim=3, action_dim=2))
     foreign = fingerprint_of(plain).to_dict() | {field: published[field]}
-    with pytest.raises(FingerprintMismatchError, match=f"fingerprint.{field}: is of something"):
+    with pytest.raises(FingerprintMismatchError, match=f"fingerprint.{field}: is present"):
         check_fingerprint(Fingerprint.from_dict(foreign), plain)
 
 
