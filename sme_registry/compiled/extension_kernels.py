@@ -22,9 +22,11 @@ from sme_registry.compiled.kernels import (
     PACKED_LANE_FLOAT32,
     PACKED_LANE_FLOAT64,
     block_layers,
+    clipped,
     lane_layers,
     lane_step,
     layer_parts,
+    reward_of,
 )
 from sme_registry.compiled.values import (
     COST,
@@ -96,18 +98,6 @@ def _uniform(start, place):  # type: ignore[no-untyped-def]
     return (float64(_mixed(start + GOLDEN * place) >> _U12) + 0.5) * 2.0**-52
 
 
-@njit(inline="always", error_model="numpy")
-def _clipped(a):  # type: ignore[no-untyped-def]
-    a = a if a > 0.0 else 0.0
-    return a if a < 1.0 else 1.0
-
-
-@njit(inline="always", error_model="numpy")
-def _reward(similarity, r_min):  # type: ignore[no-untyped-def]
-    graded = 4.0 * (similarity - 0.75)
-    return graded if graded > 0.0 and graded > r_min else 0.0
-
-
 @njit(error_model="numpy")
 def _lane_limits(q, lane, v, extra, action, optimal, step_reward):  # type: ignore[no-untyped-def]
     """Limits and safe action of one lane, behind `optimal`; cost and safe regret. v is given."""
@@ -116,13 +106,13 @@ def _lane_limits(q, lane, v, extra, action, optimal, step_reward):  # type: igno
     for i in range(A):
         limit = 1.0 - 2.0 * tightness * lane[v + i]
         safe = optimal[i] if optimal[i] < limit else limit
-        above = _clipped(float64(action[i])) - limit
+        above = clipped(float64(action[i])) - limit
         excess += above if above > 0.0 else 0.0
         missed += abs(safe - optimal[i])
         optimal[A + i] = limit
         optimal[A + A + i] = safe
     lane[extra + _COST] = excess / (2.0 * tightness * float64(A))
-    lane[extra + _SAFE_REGRET] = _reward(1.0 - missed / float64(A), q[4]) - step_reward
+    lane[extra + _SAFE_REGRET] = reward_of(1.0 - missed / float64(A), q[4]) - step_reward
 
 
 @njit(error_model="numpy")
@@ -143,7 +133,7 @@ def _lane_distractors(q, at, lane, own, free, action):  # type: ignore[no-untype
         if dynamics == _AUTONOMOUS:
             lane[free + i] = float64(float32(_uniform(start, drawn + i + _U1)))
         else:
-            lane[free + i] = _clipped(float64(float32(action[i])))
+            lane[free + i] = clipped(float64(float32(action[i])))
     if dynamics == _AUTONOMOUS:
         lane[own + _OWN_DRAWN] += float64(A)
     b = at + A * m
@@ -203,7 +193,7 @@ def step_extended_lane(p, lane, action, optimal, observation):  # type: ignore[n
 
     Args:
       p: the packed task, and its packed extension behind it.
-      lane: the lane's own numbers, `extended_lane_size` of them; advanced in place.
+      lane: the lane's own numbers, `lane_size` of them and then `extra_size`; advanced in place.
       action: `[A]`; any numbers, clipped here.
       optimal: `[A]`, written; with `safety` `[3A]`: also the limits and the safe action.
       observation: `[S + m + 2]`, written.
@@ -233,14 +223,14 @@ def _block_limits(q, first, count, action, optimal, x, excess, missed, values, l
             best = optimal[first + lane, i]
             limit = 1.0 - 2.0 * tightness * x[i, lane]
             safe = best if best < limit else limit
-            above = _clipped(action[first + lane, i]) - limit
+            above = clipped(action[first + lane, i]) - limit
             excess[lane] += above if above > 0.0 else 0.0
             missed[lane] += abs(safe - best)
             limits[0, first + lane, i] = limit
             limits[1, first + lane, i] = safe
     for lane in range(count):
         values[COST, 0, first + lane] = excess[lane] / (2.0 * tightness * float64(A))
-        best_safe = _reward(1.0 - missed[lane] / float64(A), r_min)
+        best_safe = reward_of(1.0 - missed[lane] / float64(A), r_min)
         values[SAFE_REGRET, 0, first + lane] = best_safe - values[STEP_REWARD, 0, first + lane]
 
 
@@ -300,7 +290,7 @@ def _block_distractors(q, at, own, first, count, action, driving, start, column)
         for lane in range(count):
             if dynamics != _AUTONOMOUS:
                 driving[i, lane] = action[first + lane, i]
-            driving[i, lane] = _clipped(float64(float32(driving[i, lane])))
+            driving[i, lane] = clipped(float64(float32(driving[i, lane])))
     _block_driven(q, at, own, first, count, driving, column)
     return at + A * m + m
 
@@ -345,7 +335,7 @@ def extend_many(q, own, before, after, action, optimal, values, observation, lim
             for j in range(S):
                 for lane in range(count):
                     x[j, lane] = before[j, first + lane]
-            x, y, at = block_layers(q, at, int(q[8]), x, y, cells, count, True)
+            x, y, at, _ = block_layers(q, at, int(q[8]), x, y, cells, count, True)
             _block_limits(q, first, count, action, optimal, x, column, second, values, limits)
         if m > 0:
             at = _block_distractors(q, at, own, first, count, action, driving, start, column)
@@ -354,7 +344,7 @@ def extend_many(q, own, before, after, action, optimal, values, observation, lim
                 of_t, of_r_cum = observation[lane, S], observation[lane, S + 1]
                 observation[lane, S + m], observation[lane, S + m + 1] = of_t, of_r_cum
             _block_inputs(after, own, first, count, x)
-            x, y, at = block_layers(q, at, mixing, x, y, cells, count, q[6] == 1.0)
+            x, y, at, _ = block_layers(q, at, mixing, x, y, cells, count, q[6] == 1.0)
             for lane in range(count):
                 for j in range(S + m):
                     observation[first + lane, j] = x[j, lane]

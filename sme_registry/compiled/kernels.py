@@ -86,6 +86,20 @@ _REGRET, _REWARD, _R_CUM = np.uint64(REGRET), np.uint64(REWARD), np.uint64(ACCUM
 _PACKED = types.Array(float64, 1, "C", readonly=True)
 
 
+@njit(inline="always", error_model="numpy")
+def clipped(a):  # type: ignore[no-untyped-def]
+    """The action a in [0, 1]."""
+    a = a if a > 0.0 else 0.0
+    return a if a < 1.0 else 1.0
+
+
+@njit(inline="always", error_model="numpy")
+def reward_of(similarity, r_min):  # type: ignore[no-untyped-def]
+    """The step reward of a similarity."""
+    graded = 4.0 * (similarity - 0.75)
+    return graded if graded > 0.0 and graded > r_min else 0.0
+
+
 @njit(error_model="numpy")
 def lane_layers(p, at, layers, room, x, y, uniform):  # type: ignore[no-untyped-def]
     """Packed layers for one lane, Φ(W x + b) each, or W x + b where not `uniform`.
@@ -171,21 +185,15 @@ def lane_step(p, lane, start, action, optimal, observation):  # type: ignore[no-
 
     missed = 0.0
     for i in range(A):
-        a = float64(action[i])
-        a = a if a > 0.0 else 0.0
-        a = a if a < 1.0 else 1.0
-        missed += abs(a - optimal[i])
+        missed += abs(clipped(float64(action[i])) - optimal[i])
     similarity = 1.0 - missed / float64(A)
-    graded = 4.0 * (similarity - 0.75)
-    step_reward = graded if graded > 0.0 and graded > r_min else 0.0
+    step_reward = reward_of(similarity, r_min)
 
     b = np.uint64(_HEADER) + A * S
     for j in range(S):
         moved = lane[s + j] + p[b + j]
         for i in range(A):
-            a = float64(float32(action[i]))
-            a = a if a > 0.0 else 0.0
-            a = a if a < 1.0 else 1.0
+            a = clipped(float64(float32(action[i])))
             moved = moved + p[np.uint64(_HEADER) + i * S + j] * a
         folded = 2.0 * abs(moved - np.rint(moved))
         lane[s + j] = folded
@@ -303,7 +311,7 @@ def _one_sum(W, b, x, y, o, count):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _block_layer(W, b, x, y, cells, count, uniform=True):  # type: ignore[no-untyped-def]
+def _block_layer(W, b, x, y, cells, count, uniform):  # type: ignore[no-untyped-def]
     """y = Φ(W x + b) for `count` lanes: x `[in, count]`, y `[out, count]`, W transposed.
 
     `cells` `[count]` is room for those of Φ's table. Not `uniform`: y = W x + b. Each sum runs over
@@ -329,8 +337,10 @@ def block_layers(p, at, layers, x, y, cells, count, uniform):  # type: ignore[no
     """Packed layers, the first at `p[at]`, for `count` lanes; x has the inputs, see `_block_layer`.
 
     Returns:
-      `(x, y, at)`: the outputs, the other room, and what follows the layers in `p`.
+      `(x, y, at, outputs)`: the outputs, the other room, what follows the layers in `p`, and how
+      many outputs there are, 0 without layers.
     """
+    outputs = 0
     for _ in range(layers):
         inputs, outputs = int(p[at]), int(p[at + 1])
         at += 2
@@ -339,7 +349,7 @@ def block_layers(p, at, layers, x, y, cells, count, uniform):  # type: ignore[no
         _block_layer(W, p[b : b + outputs], x, y, cells, count, uniform)
         at = b + outputs
         x, y = y, x
-    return x, y, at
+    return x, y, at, outputs
 
 
 # The parts of `step_many`, in its order. Inlined, so that the compiler sees that the arrays of a
@@ -362,15 +372,7 @@ def _block_policy(p, s, first, count, x, y, cells, optimal, owner, owned):  # ty
             for lane in range(count):
                 x[j, lane] = s[observed, first + lane]
         at += inputs
-        outputs = 0
-        for _ in range(layers):
-            inputs, outputs = int(p[at]), int(p[at + 1])
-            at += 2
-            b = at + inputs * outputs
-            W = p[at:b].reshape(inputs, outputs)
-            _block_layer(W, p[b : b + outputs], x, y, cells, count)
-            at = b + outputs
-            x, y = y, x
+        x, y, at, outputs = block_layers(p, at, layers, x, y, cells, count, True)
         for o in range(outputs):
             for lane in range(count):
                 optimal[channel, lane] = x[o, lane]
@@ -391,8 +393,7 @@ def _block_distance(action, first, count, best, owner, distance, acted, optimal)
         agent = owner[i]
         for lane in range(count):
             unclipped = action[first + lane, i]
-            a = unclipped if unclipped > 0.0 else 0.0
-            a = a if a < 1.0 else 1.0
+            a = clipped(unclipped)
             # The last term is 0, but NaN for NaN and for infinities, which clipping hides.
             distance[agent, lane] += abs(a - best[i, lane]) + (unclipped - unclipped)
             acted[i, lane] = float64(float32(a))
@@ -585,7 +586,7 @@ def network(p, s, uniform, out):  # type: ignore[no-untyped-def]
         for j in range(s.shape[0]):
             for lane in range(count):
                 x[j, lane] = s[j, first + lane]
-        x, y, _ = block_layers(p, 2, layers, x, y, cells, count, uniform)
+        x, y, _, _ = block_layers(p, 2, layers, x, y, cells, count, uniform)
         for o in range(out.shape[0]):
             for lane in range(count):
                 out[o, first + lane] = x[o, lane]
