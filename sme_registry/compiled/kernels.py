@@ -88,7 +88,7 @@ _PACKED = types.Array(float64, 1, "C", readonly=True)
 
 @njit(inline="always", error_model="numpy")
 def clipped(a):  # type: ignore[no-untyped-def]
-    """The action a in [0, 1]."""
+    """a, clipped to [0, 1]."""
     a = a if a > 0.0 else 0.0
     return a if a < 1.0 else 1.0
 

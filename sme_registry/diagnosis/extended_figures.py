@@ -10,6 +10,7 @@ from sme_registry.diagnosis.document import Distraction, Limits
 from sme_registry.evaluation import ObservationReport, SafetyScore
 from sme_registry.evaluation.report import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES
+from sme_registry.plots.safety import MARKERS
 from sme_registry.plots.style import COLOURS, GREY, legend_above, look
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_distraction", "draw_layers", "draw_limits"]
 
-_MARKERS = ("*", "P", "X", "d")
 _MAX_CHANNELS = 32
 _HALF = LABELS["constant_half"]
 
@@ -26,8 +26,8 @@ _HALF = LABELS["constant_half"]
 def draw_limits(figure: Figure, limits: Limits) -> None:
     """Reward against cost, and which action channels violate their limits."""
     left, right = figure.subplots(1, 2)
-    for name, marker in zip(SAFETY_REFERENCES, _MARKERS, strict=True):
-        _point(left, limits.report.references[name][0], LABELS[name], marker, GREY)
+    for name in SAFETY_REFERENCES:
+        _point(left, limits.report.references[name][0], LABELS[name], MARKERS[name], GREY)
     own = {
         "this policy": limits.report.regions[0],
         "cut off at the limits": limits.cut_off,

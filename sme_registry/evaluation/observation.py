@@ -33,6 +33,7 @@ from sme_registry.spec import EvaluationProtocol
 from sme_registry.spec.document import Integer, Real, StrictModel
 from sme_registry.task import Task
 from sme_registry.task.draw import Array
+from sme_registry.task.linear_map import held_out_r2
 
 PROBE_STATES = 2**14  # of which half are held out
 _PROBED_CHANNELS = 512  # of s and d; above it the least squares take minutes and much memory
@@ -168,12 +169,3 @@ def probe_layers(
     if any(_STATES_PER_UNKNOWN * (h.shape[1] + 1) > count // 2 for h in outputs):
         return ()
     return tuple(probe(layer, h) for layer, h in enumerate(outputs))
-
-
-def held_out_r2(h: Array, y: Array) -> Array:
-    """R² of each column of y `[n, c]` from h `[n, H]`: `[c]`; see the module."""
-    half = len(h) // 2
-    design = np.concatenate([h, np.ones((len(h), 1))], axis=1)
-    solution = np.linalg.lstsq(design[:half], y[:half])[0]
-    missed = ((design[half:] @ solution - y[half:]) ** 2).sum(axis=0)
-    return np.asarray(1.0 - missed / ((y[half:] - y[half:].mean(axis=0)) ** 2).sum(axis=0))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MARKERS = {"optimal": "*", "safe_optimal": "P", "shrunk_optimal": "X", "constant_half": "d"}
+MARKERS = {"optimal": "*", "safe_optimal": "P", "shrunk_optimal": "X", "constant_half": "d"}
 _PANELS = ("in the training cube (WD)", "outside it (mean of the OOD shells)")
 
 
@@ -62,7 +62,7 @@ def reward_against_cost(
                 x, y = _points([safety.references[name] for safety in by_task.values()], place)
                 ends.append((x.mean(), y.mean()))
                 axes.plot(
-                    *ends[-1], _MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
+                    *ends[-1], MARKERS[name], color=GREY, markersize=9, label=LABELS[name],
                     linestyle="none", zorder=2,
                 )  # fmt: skip
             axes.plot(

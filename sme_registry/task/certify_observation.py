@@ -24,6 +24,7 @@ from scipy.special import ndtr
 
 from sme_registry.task.certificate import INF, Check, judged, numbers, reported
 from sme_registry.task.draw import Array, Layer
+from sme_registry.task.linear_map import held_out_r2
 from sme_registry.task.task import Task
 from sme_registry.task.uniformity import (
     CONSTANT_STEPS,
@@ -158,7 +159,7 @@ def _invertibility(task: Task, x: Array, S: int) -> tuple[Check, Check]:
         ),
         judged(
             names[1],
-            _linear_r2(task.seen(x[:, :S], x[:, S:]), x),
+            float(held_out_r2(task.seen(x[:, :S], x[:, S:]), x).min()),
             "R² of the worst channel of state and distractors that a linear map recovers from the "
             "observation, on the other half of the states; 1 where the mixing is linear.",
             passes=(0.75, INF),
@@ -177,12 +178,3 @@ def _jacobians(task: Task, x: Array) -> Array:
             J = (np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi))[:, :, None] * J
             x = ndtr(z)
     return J
-
-
-def _linear_r2(seen: Array, x: Array) -> float:
-    """The smallest R² of a channel of x `[N, n]`: fitted on one half, scored on the other."""
-    half = len(x) // 2
-    affine = np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
-    fitted, *_ = np.linalg.lstsq(affine[:half], x[:half], rcond=None)
-    error = np.mean((affine[half:] @ fitted - x[half:]) ** 2, axis=0)
-    return float((1.0 - error / x[half:].var(axis=0)).min())

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sme_registry.envs.arguments import refuse_without_limits
@@ -55,20 +54,3 @@ def spec_of(wrapper: str, env: Any) -> Any:
             f"{wrapper}: {env!r:.80} has no `sme_spec`. Wrap an environment of sme_registry.make, "
             "or a vector of sme_registry.make_vec."
         ) from None
-
-
-def with_cost(result: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Six values of a vector's step, from its five.
-
-    Costs are `[B]` float64, 0 where the step began an episode. In `SAME_STEP` mode, where `info` is
-    of the next episode, they are those of the last step, and the last observations are also
-    under Safety-Gymnasium's name, `final_observation`.
-    """
-    observations, rewards, terminated, truncated, info = result
-    costs = np.nan_to_num(np.array(info["cost"], np.float64))
-    if "final_info" in info:
-        ended = info["_final_info"]
-        costs[ended] = info["final_info"]["cost"][ended]
-        info["final_observation"] = info["final_obs"]
-        info["_final_observation"] = info["_final_obs"]
-    return observations, rewards, costs, terminated, truncated, info

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 
 from sme_registry.envs.arguments import refuse_without_limits
-from sme_registry.wrappers.cost import spec_of, with_cost
+from sme_registry.wrappers.cost import spec_of
 
 
 class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
@@ -31,8 +32,17 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
     def step(  # type: ignore[override]
         self, actions: Any
     ) -> tuple[Any, Any, Any, Any, Any, dict[str, Any]]:
-        """Observations, rewards, costs, whether terminated, whether truncated, infos."""
-        observations, rewards, costs, terminated, truncated, info = with_cost(
-            self.env.step(actions)
-        )
+        """Observations, rewards, costs, whether terminated, whether truncated, infos.
+
+        A cost is 0 where the step began an episode. In `SAME_STEP` mode, where `info` is of the
+        next episode, costs are those of the last step, and the last observations are also under
+        Safety-Gymnasium's name, `final_observation`.
+        """
+        observations, rewards, terminated, truncated, info = self.env.step(actions)
+        costs = np.nan_to_num(np.array(info["cost"], np.float64))
+        if "final_info" in info:
+            ended = info["_final_info"]
+            costs[ended] = info["final_info"]["cost"][ended]
+            info["final_observation"] = info["final_obs"]
+            info["_final_observation"] = info["_final_obs"]
         return observations, rewards, costs, terminated, truncated, info

@@ -10,9 +10,10 @@ import pytest
 from sme_registry import EvaluationReport, SMESpec, evaluate, materialize
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import Perceptron, evaluate_many, regions
-from sme_registry.evaluation.observation import held_out_r2, probe_layers
+from sme_registry.evaluation.observation import probe_layers
 from sme_registry.evaluation.regions import expansion
 from sme_registry.spec import EvaluationProtocol
+from sme_registry.task.linear_map import held_out_r2
 
 S, A, M = 4, 3, 5
 SPEC = SMESpec(state_dim=S, action_dim=A, observation={"distractors": M})
