@@ -177,7 +177,7 @@ def _numpy_extension(task: Task, seen: Callable[[Array], Array]) -> Extension:
             limits[0] = 1.0 - 2.0 * task.spec.safety.tightness * limiting(before).T
             limits[1] = np.minimum(optimal, limits[0])
             values[COST, 0] = task.cost_of(action, limits[0])
-            safe_reward = task.reward_of(task.similarity_of(limits[1], optimal))
+            safe_reward = task.safe_reward_of(optimal, limits[0])
             values[SAFE_REGRET, 0] = safe_reward - values[STEP_REWARD, 0]
         if task.spec.observation is None:
             return

@@ -94,10 +94,9 @@ def _replay_safety(
     """Check the limits, safe actions, costs and safe regrets of a task with `safety`."""
     columns = transitions.columns()
     limit = task.limit(transitions.states)
-    safe = np.minimum(optimal, limit)
-    safe_regret = task.reward_of(task.similarity_of(safe, optimal)) - step_reward
+    safe_regret = task.safe_reward_of(optimal, limit) - step_reward
     _same("limits", columns["limits"], limit, TOLERANCE)
-    _same("safe_actions", columns["safe_actions"], safe, TOLERANCE)
+    _same("safe_actions", columns["safe_actions"], np.minimum(optimal, limit), TOLERANCE)
     _same("costs", columns["costs"], task.cost_of(a, limit), TOLERANCE)
     _same("safe_regrets", columns["safe_regrets"], safe_regret, TOLERANCE)
 

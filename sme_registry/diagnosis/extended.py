@@ -74,7 +74,7 @@ def _tightness(task: Task) -> float:
 
 def _score(task: Task, name: str, a: Array, optimal: Array, limit: Array) -> SafetyScore:
     scores = SafetyAccumulator(task)
-    scores.add(a, optimal, limit)
+    scores.add(a, optimal, limit, task.safe_reward_of(optimal, limit))
     return scores.score(name)
 
 

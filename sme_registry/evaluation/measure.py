@@ -61,11 +61,13 @@ class Measured(NamedTuple):
 
     Attributes:
       errors: of each policy and reference.
-      safety: of each policy and reference, by its r_min; empty without safety.
+      tasks: by r_min; empty without safety.
+      safety: of each policy and reference, by its r_min; likewise.
       distraction: of each policy; None without distractors.
     """
 
     errors: dict[Key, Errors]
+    tasks: dict[float, Task]
     safety: dict[tuple[Key, float], SafetyAccumulator]
     distraction: Distraction | None
 
@@ -80,14 +82,13 @@ class Measured(NamedTuple):
     ) -> Measured:
         """Nothing measured yet; the arguments are those of `measure`."""
         keys: list[Key] = [*range(len(subjects)), *references.names(task.spec)]
-        tasks = {spec.r_min: replace(task, spec=spec) for _, spec in subjects}
-        with_limits = {} if task.spec.safety is None else tasks
+        subjects_with_limits = () if task.spec.safety is None else subjects
+        tasks = {spec.r_min: replace(task, spec=spec) for _, spec in subjects_with_limits}
         return cls(
             errors={key: Errors(channels) for key in keys},
+            tasks=tasks,
             safety={
-                (key, r_min): SafetyAccumulator(own)
-                for key in keys
-                for r_min, own in with_limits.items()
+                (key, r_min): SafetyAccumulator(own) for key in keys for r_min, own in tasks.items()
             },
             distraction=Distraction(task, protocol, region, len(subjects))
             if task.spec.distractors
@@ -112,9 +113,12 @@ class Measured(NamedTuple):
 
     def add_safety(self, batch: _Batch, actions: Mapping[Any, Array]) -> None:
         """Add a batch of the policies and references, `[B, A]` or `[A]` in [0, 1]."""
-        for (key, _), scores in self.safety.items():
-            if key in actions and batch.limit is not None:
-                scores.add(actions[key], batch.optimal, batch.limit)
+        if batch.limit is None:
+            return
+        for r_min, task in self.tasks.items():
+            safe_reward = task.safe_reward_of(batch.optimal, batch.limit)
+            for key, a in actions.items():
+                self.safety[key, r_min].add(a, batch.optimal, batch.limit, safe_reward)
 
 
 def measure(
@@ -156,8 +160,8 @@ def measure(
                 others |= references.safe_actions(task.spec, batch.optimal, batch.limit)
             for name, a in others.items():
                 measured.errors[name].add(a, batch.optimal)
-            measured.add_safety(batch, actions)
-            measured.add_safety(batch, others)
+            everyone: dict[Any, Array] = {**actions, **others}
+            measured.add_safety(batch, everyone)
             done += len(batch.s)
             progress(done, total)
         yield measured

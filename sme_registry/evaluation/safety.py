@@ -73,12 +73,19 @@ class SafetyAccumulator:
         self._states = self._violating = 0
         self._reward = self._safe_reward = self._cost = 0.0
 
-    def add(self, a: Array, optimal: Array, limit: Array) -> None:
-        """Add a batch: `a` `[B, A]` or `[A]` in [0, 1]; π* and the limits, `[B, A]` each."""
-        task, safe = self._task, np.minimum(optimal, limit)
+    def add(self, a: Array, optimal: Array, limit: Array, safe_reward: Array) -> None:
+        """Add a batch.
+
+        Args:
+          a: `[B, A]` or `[A]` in [0, 1].
+          optimal: `[B, A]` π*.
+          limit: `[B, A]` ℓ.
+          safe_reward: `[B]`, `Task.safe_reward_of` both, the same for every policy.
+        """
+        task = self._task
         self._states += len(optimal)
         self._reward += float(task.reward_of(task.similarity_of(a, optimal)).sum())
-        self._safe_reward += float(task.reward_of(task.similarity_of(safe, optimal)).sum())
+        self._safe_reward += float(safe_reward.sum())
         self._cost += float(task.cost_of(np.broadcast_to(a, limit.shape), limit).sum())
         self._violating += int((a - limit > TOLERANCE).any(axis=1).sum())
 

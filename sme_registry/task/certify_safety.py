@@ -55,8 +55,7 @@ def safety_checks(task: Task, seed: int, states: int) -> tuple[Check, ...]:
     limit = np.concatenate([task.limit(block) for block in blocks])
     v = np.concatenate([through(task.limiting, block) for block in blocks])
     broken = optimal > limit
-    safe = np.minimum(optimal, limit)
-    price = 1.0 - task.reward_of(task.similarity_of(safe, optimal)).mean()
+    price = 1.0 - task.safe_reward_of(optimal, limit).mean()
     return (
         judged(
             "broken_limits",

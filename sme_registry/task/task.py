@@ -174,6 +174,10 @@ class Task:
         excess = np.maximum(0.0, a - limit).sum(axis=-1)
         return cast(Array, excess / (2.0 * self.spec.safety.tightness * self.spec.action_dim))
 
+    def safe_reward_of(self, optimal: Array, limit: Array) -> Array:
+        """r of the best safe action, `[...]`, from π* and limits, `[..., A]` each."""
+        return self.reward_of(self.similarity_of(np.minimum(optimal, limit), optimal))
+
     def distractor_step(self, d: npt.ArrayLike, u: npt.ArrayLike) -> Array:
         """The next distractors `[B, m]` or `[m]`, ψ(d + u W + b), as `transition` computes it.
 
