@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
 from sme_registry.io import require_packages
 
@@ -73,7 +74,7 @@ class SigningKey:
         from nacl import signing
 
         try:
-            return cls(signing.SigningKey(bytes.fromhex(data.decode("ascii").strip())))
+            return cls(signing.SigningKey(parse_secret(data)))
         except ValueError:
             raise _no_key(path, "not 64 hex digits") from None
 
@@ -83,21 +84,7 @@ class SigningKey:
         Raises:
           BoardError: the file exists (an overwritten key is lost) or cannot be written.
         """
-        path = Path(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        except FileExistsError:
-            raise BoardError(
-                f"{path} already exists and is not replaced. Give another path with --key."
-            ) from None
-        except OSError as error:
-            raise BoardError(f"{path}: cannot be written: {error.strerror}.") from None
-        with os.fdopen(handle, "w") as stream:
-            stream.write(self._private.encode().hex() + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        return path
+        return write_secret(path, self._private.encode())
 
     @property
     def public(self) -> str:

@@ -1,0 +1,141 @@
+"""Seasons: terms that fit their track, a commitment to the secret, secrets that do not collide."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import stat
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from leaderboard.documents.master import Master, Place, Purpose
+from leaderboard.documents.season import Season, Terms
+from leaderboard.errors import BoardError
+from sme_registry import SMESpec
+from sme_registry.errors import SpecError
+
+MASTER = Master(bytes(range(32)))
+SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5}
+
+
+def online(**fields: Any) -> dict[str, Any]:
+    return {
+        "id": "autumn",
+        "title": "Autumn",
+        "track": "sealed-online",
+        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "budget": 1000}],
+        "opens": "2026-01-01T00:00:00Z",
+        "closes": "2026-02-01T00:00:00Z",
+        "protocol_name": "quick-v1",
+        "protocol": {},
+        "ticket_hours": 24,
+        "tickets_per_key": 3,
+        **fields,
+    }
+
+
+def offline(**fields: Any) -> dict[str, Any]:
+    digests = {"data": "sha256:" + "1" * 64, "challenge": "sha256:" + "2" * 64}
+    data = {"nu": 0.5, "transitions": 100}
+    own = {
+        "track": "sealed-offline",
+        "ticket_hours": None,
+        "tickets_per_key": None,
+        "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "data": data}],
+        "published": [{"class_name": "deep", "instance": i, **digests} for i in (0, 1)],
+    }
+    return online(**{**own, **fields})
+
+
+def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term() -> None:
+    for fields in (online(), offline()):
+        season = Terms.from_dict(fields).commit(MASTER)
+        assert Season.from_dict(season.to_dict()) == season
+        assert season.is_committed_to(MASTER)
+        assert not season.is_committed_to(Master(bytes(32)))
+        later = Season.from_dict({**season.to_dict(), "closes": "2026-02-02T00:00:00Z"})
+        assert not later.is_committed_to(MASTER)
+
+
+def test_the_commitment_is_the_documented_hash() -> None:
+    terms = Terms.from_dict(online())
+    message = b"sme-seal/1" + MASTER.raw + terms.canonical_json()
+    expected = "sha256:" + hashlib.sha256(message).hexdigest()
+    assert terms.commit(MASTER).commitment == expected
+    assert b"commitment" not in terms.canonical_json()
+
+
+def test_every_purpose_and_place_has_a_secret_of_its_own() -> None:
+    places = [
+        Place(*parts)
+        for parts in itertools.product(
+            ("a", "b"), ("a", "ab"), (0, 1, 10), ("", "1", "b"), ("", "2", "b2")
+        )
+    ]
+    purposes = get_args(Purpose)
+    drawn = {MASTER.secret(purpose, place) for purpose in purposes for place in places}
+    assert len(drawn) == len(purposes) * len(places)
+    assert MASTER.secret("task", places[0]) != Master(bytes(32)).secret("task", places[0])
+
+
+def test_a_seed_has_256_bits_and_makes_a_spec() -> None:
+    seeds = [MASTER.seed(Place("autumn", "deep", i)) for i in range(64)]
+    assert max(int(seed, 16).bit_length() for seed in seeds) > 250
+    assert SMESpec.from_dict({**SETTING, "seed": seeds[0]}).seed == seeds[0]
+    assert 0 <= MASTER.number("states", Place("autumn", "deep", 0)) < 2**53
+
+
+def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path: Path) -> None:
+    path = MASTER.write(tmp_path / "new" / "season.master")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert Master.read(path) == MASTER
+    assert MASTER.raw.hex() not in repr(MASTER)
+    assert repr(MASTER.raw) not in repr(MASTER)
+    with pytest.raises(BoardError, match="already exists"):
+        MASTER.write(path)
+    assert Master.read(path) == MASTER
+
+
+@pytest.mark.parametrize("content", ["", "00", "z" * 64, "0" * 66])
+def test_a_file_without_a_master_is_named(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "season.master"
+    path.write_text(content)
+    with pytest.raises(BoardError, match=r"season\.master: no master secret"):
+        Master.read(path)
+    with pytest.raises(BoardError, match="no master secret"):
+        Master.read(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (online(classes=[{**online()["classes"][0], "setting": {"complexity": 4}}]), "at least 5"),
+        (
+            online(
+                classes=[
+                    {
+                        **online()["classes"][0],
+                        "setting": {"complexity": 5, "safety": {"tightness": 0.2}},
+                    }
+                ]
+            ),
+            "safety: must be null",
+        ),
+        (online(classes=online()["classes"] * 2), "different names"),
+        (online(classes=[{**online()["classes"][0], "instances": 1001}]), "1000"),
+        (online(classes=[{**online()["classes"][0], "budget": None}]), r"budget: must be given"),
+        (offline(classes=online()["classes"]), r"deep\.budget: must be null"),
+        (online(ticket_hours=None), "ticket_hours: must be given"),
+        (offline() | {"tickets_per_key": 3}, "tickets_per_key: must be null"),
+        (offline() | {"published": []}, "published: must list every instance"),
+        (online(published=offline()["published"]), "published: must list every instance"),
+        (online(closes="2026-01-01T00:00:00Z"), "must be after opens"),
+        (online(opens="2026-02-30T00:00:00Z"), "opens"),
+        (online(protocol={"seed": 1}), "seed=1: must be 0"),
+    ],
+)
+def test_terms_that_do_not_fit_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        Terms.from_dict(fields)
