@@ -19,6 +19,10 @@ EXTENSIONS: dict[str, tuple[dict[str, Any], float]] = {
         {"observation": {"distractors": 32, "mixing": "nonlinear"}},
         1 / 3,
     ),
+    "32 driven distractors, nonlinear": (
+        {"observation": {"distractors": 32, "dynamics": "driven", "mixing": "nonlinear"}},
+        1 / 3,
+    ),
 }
 
 

@@ -84,6 +84,7 @@ class _Draws(NamedTuple):
     regret: float  # N over states and draws
     averaged: float  # N of the mean action of each state
     variance: float  # of the actions of a state, mean over states and channels
+    squared_error: float  # mean over draws, states and channels; never below the variance
 
 
 def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distraction:
@@ -113,11 +114,10 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
             yield from (d, 1.0 - d)
 
     varied = _draws(act, distractors(), optimal, half)
-    repeated = _Draws(0.0, 0.0, 0.0)
+    repeated = _Draws(0.0, 0.0, 0.0, 0.0)
     if (act(drawn.d) != act(drawn.d)).any():
         repeated = _draws(act, [drawn.d] * _DRAWS, optimal, half)
     owed = max(0.0, (varied.regret - varied.averaged) - (repeated.regret - repeated.averaged))
-    error = float(((states.a - states.optimal) ** 2).mean())
     centre = act(np.full((few, m), 0.5))
     return Distraction(
         states=few,
@@ -127,7 +127,8 @@ def distraction(policy: Policy, task: Task, states: Sample, seed: int) -> Distra
         half_regret=float(np.abs(centre - optimal).mean()) / half,
         owed_regret=owed,
         owed_similarity=100.0 * half * owed,
-        distractor_share=max(0.0, varied.variance - repeated.variance) / max(error, _TINY),
+        distractor_share=max(0.0, varied.variance - repeated.variance)
+        / max(varied.squared_error, _TINY),
     )
 
 
@@ -141,4 +142,5 @@ def _draws(
         regret=float(np.abs(actions - optimal).mean()) / half,
         averaged=float(np.abs(mean - optimal).mean()) / half,
         variance=float(((actions - mean) ** 2).mean()),
+        squared_error=float(((actions - optimal) ** 2).mean()),
     )

@@ -211,7 +211,8 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
 
         That number is drawn from a copy, so that initial states are as without `observation`.
         """
-        seed: int = self.np_random_seed  # -1 where the user has set the generator
+        # −1 where the user has set the generator; Gymnasium before 1.0 has no such attribute.
+        seed: int = getattr(self, "np_random_seed", -1)
         return seed if seed >= 0 else int(copy.deepcopy(self.np_random).integers(2**63))
 
     def _live(self, lifetime: int | None) -> dict[str, Any]:

@@ -284,6 +284,13 @@ def test_an_environment_without_a_seed_can_be_repeated() -> None:
     assert (SMEVectorEnv(SPECS["noise"], 2).reset()[0] != first).any()
 
 
+def test_gymnasium_0_29_which_does_not_keep_the_seed_serves(monkeypatch: Any) -> None:
+    monkeypatch.delattr(gymnasium.Env, "np_random_seed")
+    env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
+    np.testing.assert_array_equal(env.reset(seed=1)[0], twin.reset(seed=1)[0])
+    assert (env.reset(seed=2)[0] != twin.reset(seed=3)[0]).any()
+
+
 def test_a_generator_of_the_users_serves() -> None:
     env, twin = SMEEnv(SPECS["noise"]), SMEEnv(SPECS["noise"])
     env.reset(seed=1)
