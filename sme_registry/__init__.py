@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from sme_registry import offline as offline
     from sme_registry import plots as plots
     from sme_registry import sb3 as sb3
+    from sme_registry import sealed as sealed
     from sme_registry import spec as spec
     from sme_registry import statistics as statistics
     from sme_registry import studies as studies
@@ -91,6 +92,7 @@ _SUBMODULES = (
     "offline",
     "plots",
     "sb3",
+    "sealed",
     "spec",
     "statistics",
     "studies",

@@ -16,6 +16,7 @@
     ├── WrapperError              an outer wrapper that would change the task
     ├── PolicyError               a policy that cannot be loaded, or whose actions cannot be used
     ├── OptionError               an argument or option outside its range (also a ValueError)
+    ├── WireError                 a malformed message of a sealed season (also a ValueError)
     └── MissingDependencyError    an optional package is not installed (also an ImportError)
 
 A message gives the field, its value, the allowed range and the fix:
@@ -93,6 +94,10 @@ class PolicyError(SMEError):
 
 class OptionError(SMEError, ValueError):
     """An argument or an option is outside its range."""
+
+
+class WireError(SMEError, ValueError):
+    """A message between a sealed season's server and a client has a wrong size or form."""
 
 
 class MissingDependencyError(SMEError, ImportError):

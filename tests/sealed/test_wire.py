@@ -1,0 +1,204 @@
+"""The messages of sealed-online seasons: what is sent arrives, and nothing else is read."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sme_registry.errors import ActionError, OptionError, SpecError, WireError
+from sme_registry.sealed import (
+    Begun,
+    StepFormat,
+    Steps,
+    Ticket,
+    TicketStatus,
+    instance_path,
+    pack_table,
+    table_bytes,
+    unpack_table,
+)
+
+LANES, S, A = 3, 5, 2
+FORMAT = StepFormat(LANES, S, A)
+TICKET = {
+    "season": "winter",
+    "ticket": 7,
+    "token": "ab" * 32,
+    "deadline": "2026-12-01T00:00:00Z",
+    "lanes": 256,
+    "classes": [
+        {"name": "deep", "setting": {"complexity": 5}, "instances": 2, "budget": 1000},
+        {"name": "wide", "setting": {"complexity": 6}, "instances": 1, "budget": 500},
+    ],
+}
+
+
+def random(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).random(shape, dtype=np.float32)
+
+
+def saved(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def test_an_address_has_the_season_the_ticket_and_the_instance():
+    path = instance_path("winter", 7, 3, "steps")
+    assert path == "/api/seasons/winter/tickets/7/instances/3/steps"
+
+
+def test_the_answer_to_start_arrives():
+    begun = FORMAT.unpack_begun(FORMAT.pack_begun(Begun(2**40, random(LANES, S + 2))))
+    assert begun.number == 2**40
+    assert np.array_equal(begun.observation, random(LANES, S + 2))
+
+
+def test_numbers_and_actions_arrive_from_double_precision_too():
+    body = FORMAT.pack_request(9, random(LANES, A).astype(np.float64))
+    number, actions = FORMAT.unpack_request(body)
+    assert (number, len(body)) == (9, FORMAT.request_bytes)
+    assert actions.dtype == np.float32
+    assert np.array_equal(actions, random(LANES, A))
+
+
+def test_the_bytes_of_a_request_are_little_endian():
+    body = StepFormat(1, S, 1).pack_request(1, np.array([[0.5]]))
+    assert body == b"\1\0\0\0\0\0\0\0\0\0\0\x3f"
+
+
+def test_actions_that_are_not_finite_are_refused():
+    with pytest.raises(ActionError, match="NaN or infinite"):
+        FORMAT.unpack_request(FORMAT.pack_request(1, np.full((LANES, A), np.nan)))
+
+
+@pytest.mark.parametrize("body", [b"", FORMAT.pack_request(1, random(LANES, A)) + b"\0"])
+def test_a_request_of_another_size_is_refused(body: bytes):
+    with pytest.raises(WireError, match=f"must have {FORMAT.request_bytes}"):
+        FORMAT.unpack_request(body)
+
+
+def steps(terminated: list[bool], truncated: list[bool]) -> Steps:
+    return Steps(
+        random(LANES, S + 2), random(LANES), np.array(terminated), np.array(truncated),
+        random(LANES, S + 2)[::-1],
+    )  # fmt: skip
+
+
+def test_steps_arrive_with_every_kind_of_end():
+    sent = steps([True, False, True], [False, True, True])
+    data = FORMAT.pack_steps(sent)
+    assert len(data) == FORMAT.answer_bytes == 4 * LANES * (2 * (S + 2) + 2)
+    for given, arrived in zip(sent, FORMAT.unpack_steps(data), strict=True):
+        assert np.array_equal(given, arrived)
+        assert given.dtype == arrived.dtype
+        assert arrived.flags.writeable
+
+
+def test_an_answer_has_the_same_size_whatever_ends():
+    kinds = [steps([False] * 3, [False] * 3), steps([True] * 3, [True] * 3)]
+    assert len({len(FORMAT.pack_steps(each)) for each in kinds}) == 1
+
+
+@pytest.mark.parametrize("ends", [4.0, 0.5, -1.0, np.nan])
+def test_ends_that_do_not_exist_are_refused(ends: float):
+    table = np.zeros((LANES, 2 * (S + 2) + 2), "<f4")
+    table[1, S + 3] = ends
+    with pytest.raises(WireError, match="must be 0, 1, 2 or 3"):
+        FORMAT.unpack_steps(table.tobytes())
+
+
+@pytest.mark.parametrize("rows", [0, 1, 1000, 123456])
+def test_a_table_is_the_file_that_numpy_reads_and_writes(rows: int):
+    table = random(rows, A)
+    assert np.array_equal(np.load(io.BytesIO(pack_table(table)), allow_pickle=False), table)
+    assert len(pack_table(table)) <= table_bytes(rows, A)
+    for data in (pack_table(table), saved(table)):
+        assert np.array_equal(unpack_table(data, A, rows), table)
+
+
+def other_header(shape: str) -> bytes:
+    data = pack_table(random(4, A))
+    return data.replace(f"({4}, {A})".encode(), shape.encode())
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x93NUMPY",
+        saved(random(4, A).astype(np.float64)),
+        saved(np.asfortranarray(random(4, A))),
+        saved(random(4 * A)),
+        saved(np.array([{"code": 1}, None], dtype=object)),
+        pack_table(random(4, A)).replace(b"\x01\x00", b"\x02\x00", 1),
+        other_header("(-4, 2)"),
+    ],
+)
+def test_nothing_but_a_table_of_float32_is_read(data: bytes):
+    with pytest.raises(WireError, match=r"must be an \.npy file"):
+        unpack_table(data, A)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (pack_table(random(4, A + 1)), r"\(4, 3\): must be of shape \(4, 2\)"),
+        (pack_table(random(5, A)), r"\(5, 2\): must be of shape \(4, 2\)"),
+        (pack_table(random(4, A))[:-1], "bytes: must have"),
+        (pack_table(random(4, A)) + b"\0", "bytes: must have"),
+    ],
+)
+def test_a_table_of_another_size_is_refused(data: bytes, message: str):
+    with pytest.raises(WireError, match=message):
+        unpack_table(data, A, 4)
+
+
+@pytest.mark.parametrize("entry", [np.nan, np.inf, -np.inf])
+def test_a_table_with_an_entry_that_is_not_finite_is_refused(entry: float):
+    table = random(4, A)
+    table[3, 1] = entry
+    with pytest.raises(ActionError, match="NaN or infinite"):
+        unpack_table(pack_table(table), A, 4)
+
+
+def test_a_ticket_counts_its_instances_class_by_class():
+    ticket = Ticket.from_dict(TICKET)
+    assert [(place.member.name, place.instance) for place in ticket.places] == [
+        ("deep", 0), ("deep", 1), ("wide", 0),
+    ]  # fmt: skip
+    assert ticket.place(2).member.budget == 500
+    with pytest.raises(OptionError, match=r"instance=3: must be an integer in \[0, 2\]"):
+        ticket.place(3)
+
+
+def test_a_ticket_s_file_is_its_owner_s_alone_and_is_not_replaced(tmp_path: Path):
+    ticket = Ticket.from_dict(TICKET)
+    path = ticket.write(tmp_path / "new" / "ticket.json")
+    assert Ticket.read(path) == ticket
+    assert os.stat(path).st_mode & 0o777 == 0o600
+    with pytest.raises(OptionError, match="already exists"):
+        ticket.write(path)
+    assert [each.name for each in path.parent.iterdir()] == ["ticket.json"]
+
+
+def test_a_ticket_is_shown_without_its_token():
+    assert "ab" * 32 not in repr(Ticket.from_dict(TICKET))
+
+
+def test_a_file_that_is_no_ticket_is_refused(tmp_path: Path):
+    with pytest.raises(SpecError, match=r"ticket\.json"):
+        Ticket.read(tmp_path / "ticket.json")
+
+
+def test_a_status_has_the_phase_of_each_instance():
+    instance = {"phase": "stepping", "lanes": 4, "requests": 3, "used": 12}
+    plain = {"ticket": 7, "phase": "running", "deadline": "2026-12-01T00:00:00Z"}
+    status = TicketStatus.from_dict({**plain, "instances": [instance]})
+    assert status.instances[0].requests == 3
+    with pytest.raises(SpecError, match="phase"):
+        TicketStatus.from_dict({**plain, "phase": "paused", "instances": []})
