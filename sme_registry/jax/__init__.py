@@ -11,7 +11,8 @@ Every module below imports JAX, which nothing outside this folder does. Importin
     task        a drawn task as a pytree; several of one group, padded to equal shapes
     pairs       float64 numbers as pairs of uint32, for devices without float64
     transition  next states, exact: in float64 or in pairs
-    oracle      the optimal action, similarity and step reward
+    oracle      the optimal action, similarity, step reward and cost
+    observing   distractors, and what the agent sees in place of the state
     env         reset and step of one environment; vmap them
     gymnax      the same as a class with gymnax's methods
     networks    perceptrons whose weights have Stable-Baselines3's names; Adam and clipping as Torch

@@ -4,7 +4,8 @@
     observation, state, reward, done, info = step(key, state, action, params)
 
 The rules are those of `sme_registry.task.step`, for one agent. `S` state_dim, `A` action_dim, both
-padded. An observation is `[S + 2]` float32: s, t/T and r_cum/k.
+padded; `m` distractors. An observation is `[S + m + 2]` float32: s, or with `observation` M(s, d),
+then t/T and r_cum/k.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from sme_registry.errors import ActionError, OptionError, StateError
-from sme_registry.jax import oracle, pairs
+from sme_registry.jax import observing, oracle
 from sme_registry.jax.pairs import Pair
 from sme_registry.jax.task import TaskParams
-from sme_registry.jax.transition import States, next_state
+from sme_registry.jax.transition import States, from_words, next_state
 
 Info = dict[str, jax.Array]
 
@@ -34,17 +35,20 @@ class EnvState(NamedTuple):
       s: `[S]` the state, float64 or a pair, as the params say.
       t: completed steps, int32.
       accumulated_reward: r_cum.
+      distractors: `[m]`, of the kind of states; None in a task without distractors.
     """
 
     s: States
     t: jax.Array
     accumulated_reward: jax.Array
+    distractors: States | None = None
 
 
 def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
     """Begin an episode at a uniform state, on the grid 2⁻³².
 
-    Padding does not change the numbers that a key draws.
+    Padding does not change the numbers that a key draws, nor do `safety` and `observation` change
+    its state.
 
     Raises:
       OptionError: the params are of several tasks.
@@ -52,21 +56,24 @@ def reset(key: jax.Array, params: TaskParams) -> tuple[jax.Array, EnvState]:
     _, S = _widths(params)
     bits = jax.random.bits(key, (S,), jnp.uint32)
     bits = jnp.where(params.state_mask, bits, jnp.uint32(0))
-    if isinstance(params.b, Pair):
-        return start(pairs.from_fraction(bits), params)
-    return start(bits.astype(jnp.float64) * 2.0**-32, params)
+    return start(from_words(bits, params), params, observing.first_distractors(key, params))
 
 
-def start(s: States, params: TaskParams) -> tuple[jax.Array, EnvState]:
+def start(
+    s: States, params: TaskParams, distractors: States | None = None
+) -> tuple[jax.Array, EnvState]:
     """Begin an episode at state s `[S]`; padded channels must be 0.
 
+    `distractors` are `[m]`, and None in a task without distractors.
+
     Raises:
-      StateError: s has another shape, or is not as the params have states.
+      StateError: s or the distractors have another shape, or are not as the params have states.
       OptionError: the params are of several tasks.
     """
-    s = s if isinstance(s, Pair) else jnp.asarray(s, jnp.float64)
+    s, d = _as_states(s), None if distractors is None else _as_states(distractors)
     _check_state(s, params)
-    state = EnvState(s, jnp.zeros((), jnp.int32), jnp.zeros((), params.r_min.dtype))
+    _check_distractors(d, params)
+    state = EnvState(s, jnp.zeros((), jnp.int32), jnp.zeros((), params.r_min.dtype), d)
     return observe(state, params), state
 
 
@@ -76,7 +83,7 @@ def step(
     """One step; where the episode ends, the observation and state are those of a new one.
 
     Args:
-      key: of the new episode's start.
+      key: of the new episode's start, and of what moves distractors at random.
       state: the episode.
       action: `[A]` in the unit range, clipped; see `to_unit`.
       params: one task.
@@ -89,41 +96,60 @@ def step(
       ActionError, StateError: the action or the state has another shape than the task's.
       OptionError: the params are of several tasks.
     """
-    observation, after, reward, done, info = step_env(key, state, action, params)
-    info["final_observation"] = observation
-    fresh_observation, fresh = _reset_where(done, key, params)
+    last, after, reward, done, info = step_env(key, state, action, params)
+    info["final_observation"] = last
+    first, fresh = _reset_where(done, key, params)
     after = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
-    return jnp.where(done, fresh_observation, observation), after, reward, done, info
+    return jnp.where(done, first, last), after, reward, done, info
 
 
 def step_env(
     key: jax.Array, state: EnvState, action: jax.Array, params: TaskParams
 ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
-    """`step` without a new episode at the end; nothing in it is random.
+    """`step` without a new episode at the end; only distractors of some tasks need the key.
 
-    `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`.
+    `info` has `similarity` r̃, `step_reward` r and `regret` 1 − r, `terminated` and `truncated`; of
+    a task with `safety` also `cost` and `safe_regret`.
     """
+    return advance(state, action, observing.drawn(key, params), params)
+
+
+def advance(
+    state: EnvState, action: jax.Array, numbers: States | None, params: TaskParams
+) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, Info]:
+    """`step_env` with the random numbers of `observing.drawn`: nothing in it is random."""
     action = jnp.asarray(action)
     _check_state(state.s, params)
+    _check_distractors(state.distractors, params)
     A, _ = _widths(params)
     if action.shape != (A,):
         raise ActionError(f"action of shape {action.shape}: must be of shape ({A},). {_OF_LANES}")
-    similarity, step_reward = oracle.judge(params, state.s, action)
+    judged = oracle.judge(params, state.s, action)
+    after = moved(state, action, numbers, params)
 
-    total = state.accumulated_reward + step_reward
-    t = state.t + 1
-    terminated, truncated = step_reward < params.D, t >= params.horizon
-    paid = truncated | (t % params.k == 0)
-    after = EnvState(next_state(params, state.s, action), t, jnp.where(paid, 0.0, total))
+    total = state.accumulated_reward + judged.step_reward
+    terminated, truncated = judged.step_reward < params.D, after.t >= params.horizon
+    paid = truncated | (after.t % params.k == 0)
+    after = after._replace(accumulated_reward=jnp.where(paid, 0.0, total))
     info = {
-        "similarity": similarity,
-        "step_reward": step_reward,
-        "regret": 1.0 - step_reward,
+        **{name: each for name, each in judged._asdict().items() if each is not None},
+        "regret": 1.0 - judged.step_reward,
         "terminated": terminated,
         "truncated": truncated,
     }
     reward = jnp.where(paid, total, 0.0)
     return observe(after, params), after, reward, terminated | truncated, info
+
+
+def moved(
+    state: EnvState, action: jax.Array, numbers: States | None, params: TaskParams
+) -> EnvState:
+    """The episode one step later, with r_cum as it was; see `advance`."""
+    return state._replace(
+        s=next_state(params, state.s, action),
+        t=state.t + 1,
+        distractors=observing.next_distractors(params, state.distractors, action, numbers),
+    )
 
 
 reset_env = reset
@@ -140,6 +166,10 @@ def _widths(params: TaskParams) -> tuple[int, int]:
     return A, S
 
 
+def _as_states(s: States) -> States:
+    return s if isinstance(s, Pair) else jnp.asarray(s, jnp.float64)
+
+
 def _check_state(s: States, params: TaskParams) -> None:
     _, S = _widths(params)
     as_pairs = isinstance(params.b, Pair)
@@ -149,6 +179,19 @@ def _check_state(s: States, params: TaskParams) -> None:
     shape = s.high.shape if isinstance(s, Pair) else s.shape
     if shape != (S,):
         raise StateError(f"state of shape {shape}: must be of shape ({S},). {_OF_LANES}")
+
+
+def _check_distractors(d: States | None, params: TaskParams) -> None:
+    m, as_pairs = params.form.distractors, isinstance(params.b, Pair)
+    if d is None and m == 0:
+        return
+    shape = None if d is None else d.high.shape if isinstance(d, Pair) else d.shape
+    if m == 0 or shape != (m,) or isinstance(d, Pair) != as_pairs:
+        must = f"of shape ({m},), {'a Pair' if as_pairs else 'float64'}" if m else "left out"
+        raise StateError(
+            f"distractors {'left out' if d is None else f'of shape {shape}'}: must be {must}, "
+            f"since the task has {m} distractors."
+        )
 
 
 @custom_vmap
@@ -183,20 +226,21 @@ def _reset_lanes_where(
 def observe(state: EnvState, params: TaskParams) -> jax.Array:
     """The observation (s, t/T, r_cum/k, phase), `[S + 2 + P]` float32.
 
-    s and t/T have the bits of NumPy's. P = 0 except in streams with `observes_phase`. r_cum/k is at
-    most 1, also where r_cum was carried over from a task of a larger k.
+    With `observation` it is (M(s, d), t/T, r_cum/k), `[S + m + 2]`.
+
+    s, distractors and t/T have the bits of NumPy's; see `observing` for a mixing. P = 0 except in
+    streams with `observes_phase`. r_cum/k is at most 1, also where r_cum was carried over from a
+    task of a larger k.
     """
-    if isinstance(state.s, Pair):
-        s, real = pairs.to_float32(state.s), jnp.float32
-    else:
-        s, real = state.s.astype(jnp.float32), jnp.float64
+    x = observing.seen(params, state.s, state.distractors)
+    real = jnp.float32 if isinstance(state.s, Pair) else jnp.float64
     # XLA turns a division by a constant, or by one scalar of all lanes, into a product, which is
     # an ulp off; max(t, T), which is T, is neither.
     t = state.t.astype(real)
     time = t / jnp.maximum(t, params.horizon.astype(real))
     accumulated = state.accumulated_reward.astype(real) / params.k.astype(real)
     rest = jnp.stack([time, jnp.minimum(accumulated, 1.0)]).astype(jnp.float32)
-    return jnp.concatenate([s, rest, params.phase])
+    return jnp.concatenate([x, rest, params.phase])
 
 
 def to_unit(action: jax.Array, symmetric: bool, dtype: Any = jnp.float64) -> jax.Array:

@@ -71,7 +71,7 @@ class Environment:
 
     @partial(jax.jit, static_argnames="self")
     def reset(self, key: jax.Array, params: TaskParams | None = None) -> tuple[jax.Array, EnvState]:
-        """Begin an episode: the observation `[S + 2]`, and its state."""
+        """Begin an episode: the observation `[S + m + 2]`, and its state."""
         return self.reset_env(key, params)
 
     @partial(jax.jit, static_argnames="self")
@@ -101,8 +101,8 @@ class Environment:
         return observation, state, reward, terminated, info
 
     def observation_space(self, params: TaskParams | None = None) -> Any:
-        """(s, t/T, r_cum/k), each in [0, 1]."""
-        return _box(0.0, 1.0, (self.sme_spec.state_dim + 2,))
+        """(s, t/T, r_cum/k), or what the agent sees in place of s; each in [0, 1]."""
+        return _box(0.0, 1.0, (self.sme_spec.observation_dim,))
 
     def action_space(self, params: TaskParams | None = None) -> Any:
         """`[A]` in the action range."""

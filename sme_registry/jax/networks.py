@@ -33,11 +33,23 @@ def perceptron(
     Layer i is at index 2 i of the sequence: `<prefix>.0.weight`, `<prefix>.0.bias`, `<prefix>.2…`.
     The last one is linear; apply an output activation outside.
     """
+    *_, x = x, *hidden_layers(weights, prefix, x, layers - 1, activation)
+    return linear(weights, f"{prefix}.{2 * (layers - 1)}", x)
+
+
+def hidden_layers(
+    weights: Weights,
+    prefix: str,
+    x: jax.Array,
+    layers: int,
+    activation: Callable[[jax.Array], jax.Array],
+) -> list[jax.Array]:
+    """The outputs `[..., H]` of the first layers of `perceptron`, each with its activation."""
+    outputs = []
     for i in range(layers):
-        x = linear(weights, f"{prefix}.{2 * i}", x)
-        if i + 1 < layers:
-            x = activation(x)
-    return x
+        x = activation(linear(weights, f"{prefix}.{2 * i}", x))
+        outputs.append(x)
+    return outputs
 
 
 def linear(weights: Weights, name: str, x: jax.Array) -> jax.Array:

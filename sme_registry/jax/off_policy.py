@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sme_registry.jax import replay
 from sme_registry.jax.env import EnvState, observe, reset, step, to_unit
@@ -124,8 +123,8 @@ class OffPolicyProgram(Program):
             size = min(PIECE, max(0, self.lives.until(self.steps, end) - self.steps))
             log = self._loop(self.steps, self.steps + size, acts=True)
             self._go_on(size)
-            pieces.append(StepLog(*(np.asarray(each)[:size] for each in log)))
-        return StepLog(*map(np.concatenate, zip(*pieces, strict=True)))
+            pieces.append(log.rows(slice(size)))
+        return StepLog.joined(pieces)
 
     def finish(self) -> None:
         """Make the update that follows the last step."""
@@ -214,7 +213,8 @@ def _steps(
 
     real: Any = jnp.zeros((PIECE, lanes), params.r_min.dtype)
     flag: Any = jnp.zeros((PIECE, lanes), bool)
-    begun = state, StepLog(real, real, real, flag, flag)
+    costs = (real, real) if params.form.safety else ()
+    begun = state, StepLog(real, real, real, flag, flag, *costs)
     ended: tuple[OffPolicyState, StepLog] = jax.lax.fori_loop(begin, end, body, begun)
     return ended
 
@@ -291,12 +291,13 @@ def _acted(
     terminated = info["terminated"]
     written = Transitions(state.observation, action, final, reward, terminated)
     row: Any = reward, info["regret"], info["similarity"], terminated, info["truncated"]
+    costs: Any = info.get("cost"), info.get("safe_regret")
     after = state._replace(
         buffer=replay.write(state.buffer, n, written, acts),
         episode=_chosen(acts, episode, state.episode),
         observation=_chosen(acts, observation, state.observation),
     )
-    return after, StepLog(*row)
+    return after, StepLog(*row, *costs)
 
 
 def _chosen(acts: jax.Array, new: Any, old: Any) -> Any:

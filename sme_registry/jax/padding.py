@@ -1,7 +1,7 @@
 """Weights of a lane in networks of a wider observation or action: exact padding, and its removal.
 
-A padded observation is `[s padded to S_pad, t/T, r_cum/k, phase]`, a padded action
-`[a padded to A_pad]`.
+A padded observation is `[s padded to S_pad, d, t/T, r_cum/k, phase]`, also where the agent sees a
+mixture of s and the distractors d; a padded action is `[a padded to A_pad]`.
 Weights of what is padded are 0.
 """
 
@@ -27,16 +27,18 @@ class Dimensions(NamedTuple):
       state_dim: S.
       action_dim: A.
       phases: P, of a stream that has `observes_phase`, else 0.
+      distractors: m, the same of all lanes.
     """
 
     state_dim: int
     action_dim: int
     phases: int = 0
+    distractors: int = 0
 
     @property
     def observation_dim(self) -> int:
-        """S + 2 + P."""
-        return self.state_dim + 2 + self.phases
+        """S + m + 2 + P."""
+        return self.state_dim + self.distractors + 2 + self.phases
 
 
 class Padding:

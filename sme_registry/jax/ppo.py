@@ -25,17 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sme_registry.errors import OptionError
-from sme_registry.jax import oracle
-from sme_registry.jax.env import EnvState, observe, reset, step_env, to_unit
+from sme_registry.jax import observing, oracle
+from sme_registry.jax.env import EnvState, advance, observe, reset, to_unit
 from sme_registry.jax.networks import (
     Adam,
     HostWeights,
     Weights,
     adam,
     clipped,
+    hidden_layers,
     initial_orthogonal,
     linear,
-    perceptron,
 )
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.jax.ranges import Count, Flag, Positive, Share, Weight, Widths
@@ -44,7 +44,6 @@ from sme_registry.jax.task import TaskParams
 _LOG_ROOT_TAU = 0.5 * math.log(2.0 * math.pi)
 _JUDGED_AT_ONCE = 256  # steps of a rollout
 _ADAM_EPSILON = 1e-5  # SB3's for on-policy algorithms
-_NO_KEY: Any = None  # `step_env` draws nothing
 
 
 @dataclass(frozen=True)
@@ -175,6 +174,7 @@ def collect(
     *,
     symmetric: bool,
     separable: bool,
+    numbers: Any = None,
 ) -> tuple[EnvState, Steps, StepLog]:
     """The steps `begin` … `end` − 1 of a rollout of n.
 
@@ -190,6 +190,7 @@ def collect(
       symmetric: whether actions are in [−1, 1] instead of [0, 1].
       separable: whether k = 1 and D = 0, so that no reward changes an observation or ends an
         episode. The oracle is then asked once for all steps.
+      numbers: `[n, …]` of each step, `observing.drawn`.
 
     Returns:
       The environment after the last step, the steps, and their log, `[n]`; those that were not to
@@ -198,36 +199,39 @@ def collect(
     sigma = jnp.exp(weights["log_std"])
     n = noise.shape[1]
 
-    def one(episode: EnvState, noise: jax.Array, fresh: EnvState) -> tuple[EnvState, Any]:
-        observation = observe(episode, params)
-        action = mean(settings, weights, observation) + sigma * noise
+    def one(
+        episode: EnvState, noise: jax.Array, numbers: Any, fresh: EnvState
+    ) -> tuple[EnvState, Any]:
+        now = observe(episode, params)
+        action = mean(settings, weights, now) + sigma * noise
         a = to_unit(action, symmetric)
-        _, after, reward, ended, info = step_env(_NO_KEY, episode, a, params)
-        judged: Any = info["similarity"], info["step_reward"], reward, info["terminated"]
+        _, after, reward, ended, info = advance(episode, a, numbers, params)
+        parts: Any = map(info.get, oracle.Judgement._fields)
+        judged: Any = oracle.Judgement(*parts), reward, info["terminated"]
         if separable:  # XLA drops the oracle from the loop, since no result of it is used
             after = after._replace(accumulated_reward=episode.accumulated_reward)
             ended, judged = info["truncated"], (episode.s, a)
-        taken = observation, action, info["truncated"], observe(after, params)
+        taken = now, action, info["truncated"], observe(after, params)
         after = jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, after)
         return after, (taken, judged)
 
     def body(i: jax.Array, carry: tuple[EnvState, Any]) -> tuple[EnvState, Any]:
         episode, rows = carry
-        episode, row = one(episode, noise.T[i], _at(fresh, i))
+        episode, row = one(episode, noise.T[i], _at(numbers, i), _at(fresh, i))
         return episode, jax.tree.map(lambda all, own: all.at[i].set(own), rows, row)
 
-    shapes = jax.eval_shape(one, episode, noise[:, 0], _at(fresh, 0))[1]
+    shapes = jax.eval_shape(one, episode, noise[:, 0], _at(numbers, 0), _at(fresh, 0))[1]
     rows = jax.tree.map(lambda x: jnp.zeros((n, *x.shape), x.dtype), shapes)
     # No scan, whose length is fixed: parts of rollouts are of any length.
     episode, (taken, judged) = jax.lax.fori_loop(begin, end, body, (episode, rows))
-    observation, action, truncated, last_observation = taken
+    observed, action, truncated, last_observation = taken
     if separable:
-        similarity, step_reward = _judged(params, judged, begin, end)
-        judged = similarity, step_reward, step_reward, jnp.zeros_like(truncated)
-    similarity, step_reward, reward, terminated = judged
-    log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated)
+        judgement = _judged(params, judged, begin, end)
+        judged = judgement, judgement.step_reward, jnp.zeros_like(truncated)
+    (similarity, step_reward, *costs), reward, terminated = judged
+    log = StepLog(reward, 1.0 - step_reward, similarity, terminated, truncated, *costs)
     reward = reward.astype(jnp.float32)
-    steps = Steps(observation, action, reward, terminated, truncated, last_observation)
+    steps = Steps(observed, action, reward, terminated, truncated, last_observation)
     return episode, steps, log
 
 
@@ -236,32 +240,33 @@ def _judged(
     rows: tuple[jax.Array, jax.Array],
     begin: int | jax.Array,
     end: int | jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """r̃ and r `[n]` of states and actions `[n, …]` from `begin` to before `end`.
+) -> oracle.Judgement:
+    """Judge states and actions `[n, …]` from `begin` to before `end`: `[n]` of each number.
 
     In blocks, so that a short part of a rollout costs little; outside them values are arbitrary.
     """
     n = len(rows[0])
     size = min(n, _JUDGED_AT_ONCE)
 
-    def body(i: jax.Array, judged: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def body(i: jax.Array, judged: oracle.Judgement) -> oracle.Judgement:
         first = jnp.minimum(i * size, n - size)
         s, a = (jax.lax.dynamic_slice_in_dim(x, first, size) for x in rows)
         block = oracle.judge(params, s, a)
-        both = zip(judged, block, strict=True)
-        similarity, reward = (jax.lax.dynamic_update_slice_in_dim(x, y, first, 0) for x, y in both)
-        return similarity, reward
+        new: oracle.Judgement = jax.tree.map(
+            lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, first, 0), judged, block
+        )
+        return new
 
     zeros = jnp.zeros(n, params.r_min.dtype)
-    judged: tuple[jax.Array, jax.Array] = jax.lax.fori_loop(
-        begin // size, -(-end // size), body, (zeros, zeros)
+    costs = (zeros, zeros) if params.form.safety else ()
+    judged: oracle.Judgement = jax.lax.fori_loop(
+        begin // size, -(-end // size), body, oracle.Judgement(zeros, zeros, *costs)
     )
     return judged
 
 
-def _at(states: EnvState, i: int | jax.Array) -> EnvState:
-    row: EnvState = jax.tree.map(lambda x: x[i], states)
-    return row
+def _at(rows: Any, i: int | jax.Array) -> Any:
+    return jax.tree.map(lambda x: x[i], rows)
 
 
 def rollout(
@@ -381,14 +386,14 @@ def _loss(settings: PPO, weights: Weights, batch: Rollout, mask: jax.Array) -> j
 def _latent(settings: PPO, weights: Weights, network: str, observation: jax.Array) -> jax.Array:
     """The last hidden layer of the policy's or the value's perceptron."""
     layers = len(settings.net_arch)
-    hidden = perceptron(weights, f"mlp_extractor.{network}", observation, layers, jnp.tanh)
-    return jnp.tanh(hidden)
+    return hidden_layers(weights, f"mlp_extractor.{network}", observation, layers, jnp.tanh)[-1]
 
 
 class PPOProgram(Program):
     """Lanes of PPO; see `Program`."""
 
     actor = ("mlp_extractor.policy_net.", "action_net.")
+    hidden = ("mlp_extractor.policy_net", jnp.tanh)
 
     def __init__(self, settings: PPO, *arguments: Any, **options: Any) -> None:
         self.rollout = settings.n_steps
@@ -425,11 +430,12 @@ class PPOProgram(Program):
     def advance(self, limit: int) -> StepLog:
         """Whole rollouts until `limit` is reached, and the updates between them."""
         none = np.zeros((0, self.lanes))
-        logs = [StepLog(none, none, none, none > 0, none > 0)]
+        costs = (none, none) if self.params.form.safety else ()
+        logs = [StepLog(none, none, none, none > 0, none > 0, *costs)]
         while self.steps < limit:
             self.finish()
             logs += self._collected()
-        return StepLog(*map(np.concatenate, zip(*logs, strict=True)))
+        return StepLog.joined(logs)
 
     def _collected(self) -> list[StepLog]:
         """Take the steps of a rollout: all at once, or in parts of which each is on its tasks."""
@@ -450,7 +456,7 @@ class PPOProgram(Program):
                 part.stop,
             )
             whole = part.stop - part.start == self.rollout
-            logs.append(log if whole else StepLog(*(np.asarray(x)[part] for x in log)))
+            logs.append(log if whole else log.rows(part))
         return logs
 
     def finish(self) -> None:
@@ -467,9 +473,9 @@ class PPOProgram(Program):
 def _begin(settings: PPO, params: TaskParams, weights: Weights, keys: jax.Array) -> State:
     def lane(params: TaskParams, weights: Weights, key: jax.Array) -> State:
         key, own = jax.random.split(key)
-        observation, episode = reset(own, params)
+        first, episode = reset(own, params)
         flag, number = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
-        none = Steps(observation, weights["log_std"], number, flag, flag, observation)
+        none = Steps(first, weights["log_std"], number, flag, flag, first)
         steps = jax.tree.map(lambda x: jnp.zeros((settings.n_steps, *x.shape), x.dtype), none)
         return State(weights, Adam.initial(weights), key, episode, steps)
 
@@ -497,10 +503,12 @@ def _collect(
         key, of_noise, of_starts = jax.random.split(state.key, 3)
         n, A = settings.n_steps, params.W.shape[0]
         noise = jax.random.normal(of_noise, (A, n), jnp.float32)
-        _, fresh = jax.vmap(reset, (0, None))(jax.random.split(of_starts, n), params)
+        starts = jax.random.split(of_starts, n)
+        _, fresh = jax.vmap(reset, (0, None))(starts, params)
+        numbers = jax.vmap(observing.drawn, (0, None))(starts, params)
         episode, steps, log = collect(
             settings, state.weights, params, state.episode, noise, fresh, begin, end,
-            symmetric=symmetric, separable=separable,
+            symmetric=symmetric, separable=separable, numbers=numbers,
         )  # fmt: skip
         last = steps.last_observation
         last = last.at[end - 1, last.shape[-1] - len(phase) :].set(phase)

@@ -1,9 +1,9 @@
 """`Program`: the lanes of one algorithm, which learn and are evaluated in compiled code.
 
 A lane is one run: a task or a stream of tasks, a seed, weights. All lanes of a program have the
-same algorithm, hyperparameters, budget and padded shapes, and take the same number of steps; their
-tasks, seeds and reward settings (k, T, r_min, D) differ. A lane's bits depend on the number of
-lanes and on no other lane, so results record that number.
+same algorithm, hyperparameters, budget, padded shapes and `Form`, and take the same number of
+steps; their tasks, seeds and reward settings (k, T, r_min, D) differ. A lane's bits depend on the
+number of lanes and on no other lane, so results record that number.
 
 A subclass has one algorithm's state, `initial_state`, `advance`, `finish`, and the pure functions
 `initial_weights` and `act`; all else is here.
@@ -23,14 +23,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import OptionError, ResourceLimitError
-from sme_registry.jax import oracle
+from sme_registry.jax import networks, observing, oracle
 from sme_registry.jax.device import find_device, memory_of
-from sme_registry.jax.env import EnvState, observe, start, step_env, to_unit
+from sme_registry.jax.env import EnvState, advance, moved, observe, start, to_unit
 from sme_registry.jax.lives import Lane, Lives
 from sme_registry.jax.networks import HostWeights, Weights
 from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.task import Shape, TaskParams
-from sme_registry.jax.transition import States, next_state
+from sme_registry.jax.transition import States
 
 Array = npt.NDArray[Any]
 
@@ -49,6 +49,8 @@ class StepLog(NamedTuple):
       similarity: r̃.
       terminated: whether the episode ended by D.
       truncated: whether it reached the horizon.
+      cost: None without `safety`.
+      safe_regret: r of the best safe action, minus r; None without `safety`.
     """
 
     reward: Array
@@ -56,6 +58,19 @@ class StepLog(NamedTuple):
     similarity: Array
     terminated: Array
     truncated: Array
+    cost: Array | None = None
+    safe_regret: Array | None = None
+
+    @classmethod
+    def joined(cls, logs: Sequence[StepLog]) -> StepLog:
+        """The steps of several logs, one after the other."""
+        log: StepLog = jax.tree.map(lambda *rows: np.concatenate(rows), *logs)
+        return log
+
+    def rows(self, part: slice) -> StepLog:
+        """Some of the steps."""
+        log: StepLog = jax.tree.map(lambda each: np.asarray(each)[part], self)
+        return log
 
 
 class Evaluation(NamedTuple):
@@ -103,6 +118,9 @@ class Program(ABC):
 
     actor: tuple[str, ...] = ("actor.",)
     """How the names of the weights begin that `act` reads."""
+
+    hidden: tuple[str, Callable[[jax.Array], jax.Array]]
+    """How the names of the actor's hidden layers begin, and their activation."""
 
     rollout = 1
     """Steps between two updates: an evaluation due in them has the weights before the second."""
@@ -153,7 +171,8 @@ class Program(ABC):
         self.separable = self.lives.separable
         A, S = self.params.W.shape[-2:]
         self._initial_weights = functools.partial(self.initial_weights, settings)
-        self._padding = Padding(self._initial_weights, Dimensions(S, A, self.lives.phases))
+        full = Dimensions(S, A, self.lives.phases, self.params.form.distractors)
+        self._padding = Padding(self._initial_weights, full)
         weights = [self._new_weights(*lane) for lane in zip(specs, seeds, strict=True)]
         stacked = {name: np.stack([lane[name] for lane in weights]) for name in weights[0]}
         keys = jax.vmap(jax.random.PRNGKey)(np.asarray(seeds, np.uint32))
@@ -203,6 +222,8 @@ class Program(ABC):
 
     def evaluate(self, states: Array, lifetime: int | None = None) -> Evaluation:
         """Run an episode from each of `states` `[lanes, episodes, S]` with the present weights.
+
+        Equal states give equal distractors, as in `evaluation.rollouts`.
 
         Args:
           states: initial states, padded.
@@ -274,7 +295,8 @@ class Program(ABC):
             )
 
     def _dimensions(self, lane: Lane) -> Dimensions:
-        return Dimensions(lane.state_dim, lane.action_dim, self.lives.phases)
+        m = self.params.form.distractors
+        return Dimensions(lane.state_dim, lane.action_dim, self.lives.phases, m)
 
     def _new_weights(self, lane: Lane, seed: int) -> HostWeights:
         own, rng = self._dimensions(lane), np.random.default_rng(seed)
@@ -328,6 +350,25 @@ def policy(
     return act
 
 
+def hidden_layers(
+    kind: type[Program], settings: Any, weights: Mapping[str, Any]
+) -> Callable[[Array], list[Array]]:
+    """The outputs `[B, H]` of each hidden layer of a lane's actor, of observations `[B, O]`."""
+
+    def hidden(observations: Array) -> list[Array]:
+        return [np.asarray(each) for each in _hidden(kind, settings, dict(weights), observations)]
+
+    return hidden
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "settings"))
+def _hidden(
+    kind: type[Program], settings: Any, weights: Weights, observations: jax.Array
+) -> list[jax.Array]:
+    prefix, activation = kind.hidden
+    return networks.hidden_layers(weights, prefix, observations, len(settings.net_arch), activation)
+
+
 @functools.partial(jax.jit, static_argnames=("act", "settings", "symmetric"))
 def _actions(
     act: Any, settings: Any, symmetric: bool, weights: Weights, observations: Array
@@ -354,6 +395,14 @@ def _episodes(
     states: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """`Program.evaluate`: loops outside, vmap inside; sums in float64."""
+    keys = jax.vmap(jax.vmap(_key_of))(states) if params.form.distractors else None
+
+    def drawn(state: EnvState) -> Any:
+        """The random numbers of the next step of each episode; None where it needs none."""
+        if keys is None:
+            return None
+        steps = jax.vmap(jax.vmap(jax.random.fold_in))(keys, state.t)
+        return _each(observing.drawn, steps, params=params)
 
     def chosen(state: EnvState) -> jax.Array:
         """Actions `[lanes, episodes, A]` of the unit range."""
@@ -362,9 +411,8 @@ def _episodes(
         return to_unit(actions, symmetric)
 
     def one_step(now: _Running) -> _Running:
-        key = jax.random.PRNGKey(0)  # a step is not random
         _, state, reward, done, info = _each(
-            functools.partial(step_env, key), now.state, chosen(now.state), params=params
+            advance, now.state, chosen(now.state), drawn(now.state), params=params
         )
         here = (reward, jnp.ones_like(reward), info["regret"], info["similarity"])
         sums = jax.tree.map(lambda sum, x: sum + jnp.where(now.running, x, 0.0), now.sums, here)
@@ -373,12 +421,11 @@ def _episodes(
     def one_piece(now: _Running) -> _Running:
         def move(state: EnvState, _: None) -> tuple[EnvState, tuple[States, jax.Array]]:
             a = chosen(state)
-            s = _each(lambda s, a, p: next_state(p, s, a), state.s, a, params=params)
-            return state._replace(s=s, t=state.t + 1), (state.s, a)
+            return _each(moved, state, a, drawn(state), params=params), (state.s, a)
 
         state, (s, a) = jax.lax.scan(move, now.state, length=_JUDGED_AT_ONCE)
-        judge = jax.vmap(oracle.judge, (0, 1, 1), (1, 1))
-        similarity, reward = judge(params, s, a)  # [piece, lanes, episodes]
+        judge = jax.vmap(oracle.judge, (0, 1, 1), 1)
+        similarity, reward, *_ = judge(params, s, a)  # [piece, lanes, episodes]
         horizon = params.horizon[:, None]
         counted = now.state.t + jnp.arange(_JUDGED_AT_ONCE)[:, None, None] < horizon
         here = (reward, jnp.ones_like(reward), 1.0 - reward, similarity)
@@ -387,11 +434,19 @@ def _episodes(
         )
         return _Running(state, sums, state.t < horizon)
 
-    _, begin = _each(start, states, params=params)
+    first = None if keys is None else _each(observing.first_distractors, keys, params=params)
+    _, begin = _each(lambda s, d, p: start(s, p, d), states, first, params=params)
     zeros = jnp.zeros_like(begin.accumulated_reward)
     now = _Running(begin, (zeros,) * 4, jnp.ones_like(zeros, bool))
     body = one_piece if separable else one_step
     return jax.lax.while_loop(lambda now: now.running.any(), body, now).sums
+
+
+def _key_of(s: jax.Array) -> jax.Array:
+    """The key of an episode that begins in state s `[S]`, float64."""
+    words = jax.lax.bitcast_convert_type(s, jnp.uint32)
+    word = jax.lax.reduce(words, jnp.uint32(0), jax.lax.bitwise_xor, (0, 1))
+    return jax.random.PRNGKey(word)
 
 
 class _Running(NamedTuple):

@@ -18,7 +18,15 @@ from sme_registry.errors import OptionError, UnknownNameError, did_you_mean
 from sme_registry.io import choice, integer_in
 from sme_registry.jax.lives import Lane
 from sme_registry.jax.ppo import PPO, PPOProgram
-from sme_registry.jax.program import PIECE, Array, Evaluation, Program, StepLog, policy
+from sme_registry.jax.program import (
+    PIECE,
+    Array,
+    Evaluation,
+    Program,
+    StepLog,
+    hidden_layers,
+    policy,
+)
 from sme_registry.jax.sac import SAC, SACProgram
 from sme_registry.jax.task import Shape
 from sme_registry.jax.td3 import TD3, TD3Program
@@ -157,6 +165,14 @@ def policy_of(
     _, program = _algorithm(uses)
     settings = settings_of(uses, hyperparameters or {})
     return policy(program, settings, weights, action_range == "symmetric")
+
+
+def hidden_of(
+    uses: str, weights: Mapping[str, Array], hyperparameters: Mapping[str, Any]
+) -> Callable[[Array], list[Array]]:
+    """The hidden layers of that policy; see `program.hidden_layers` and `settings_of`."""
+    _, program = _algorithm(uses)
+    return hidden_layers(program, settings_of(uses, hyperparameters), weights)
 
 
 def run(

@@ -109,6 +109,7 @@ class SACProgram(OffPolicyProgram):
     """Lanes of SAC."""
 
     draws = 2
+    hidden = ("actor.latent_pi", jax.nn.relu)
 
     @staticmethod
     def initial_weights(
@@ -212,7 +213,7 @@ def _sample(
 
     Args:
       weights: the actor's.
-      observation: `[..., S + 2]`.
+      observation: `[..., O]`.
       noise: `[..., A]` ε.
       mask: `[A]` which action channels exist; the others are padding.
 

@@ -5,13 +5,18 @@ draws. Padding is exact: padded columns of W and entries of b are 0, so padded s
 inner units have no weights into the next layer; padded inner layers are skipped; padded action
 channels have rows of zeros in W, and `action_mask` is False there.
 
-`S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width, each of the padded shape.
+The networks of `safety` and the mixing of an `observation` are padded alike. What these two fields
+change of the program itself is a `Form`, which all lanes share.
+
+`S` state_dim, `A` action_dim, `L` complexity, `H` hidden_width, each of the padded shape; `m`
+distractors, which are not padded.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -32,6 +37,7 @@ SUPPORTED_FIELDS = frozenset(
     (
         *("schema_version", "seed", "state_dim", "action_dim", "k", "r_min", "D"),
         *("complexity", "horizon", "hidden_width", "policy_init", "rotation"),
+        *("safety", "observation"),
     )
 )
 """Fields of a spec that these modules implement; any other must have its default."""
@@ -75,6 +81,34 @@ class Shape(NamedTuple):
         return covering
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Form:
+    """What `safety` and `observation` change of a program; all its lanes have the same.
+
+    Attributes:
+      safety: whether the actions have limits.
+      distractors: m.
+      dynamics: how they move, "noise", "autonomous" or "driven"; None without distractors.
+      mixing: "none", "orthogonal" or "nonlinear".
+      mixing_depth: layers of a nonlinear mixing; else None.
+    """
+
+    safety: bool = False
+    distractors: int = 0
+    dynamics: str | None = None
+    mixing: str = "none"
+    mixing_depth: int | None = None
+
+    @classmethod
+    def of(cls, spec: SMESpec) -> Form:
+        """The form of a spec's task."""
+        safety, seen = spec.safety is not None, spec.observation
+        if seen is None:
+            return cls(safety)
+        return cls(safety, seen.distractors, seen.dynamics, seen.mixing, seen.mixing_depth)
+
+
 class Layer(NamedTuple):
     """Uniform layers y = Φ(W x + b): `W [out, in]`, `b [out]`; stacked layers have an axis more."""
 
@@ -96,6 +130,36 @@ class InnerLayers(NamedTuple):
     active: jax.Array
 
 
+class Limits(NamedTuple):
+    """What limits the action channels of a task with `safety`.
+
+    Attributes:
+      tightness: τ.
+      inner: the inner layers of v; None where L = 1.
+      output: its last layer.
+    """
+
+    tightness: jax.Array
+    inner: InnerLayers | None
+    output: Layer
+
+
+class Observing(NamedTuple):
+    """What the agent of a task with `observation` sees in place of the state.
+
+    Attributes:
+      W: `[A, m]` of the distractors' transition, in the form of `TaskParams.W`; None where they
+        have none.
+      b: `[m]`, in the form of `TaskParams.b`.
+      mixing: the layers from state and distractors to what the agent sees, stacked:
+        `W [layers, S + m, S + m]`, 0 for padding; None without mixing.
+    """
+
+    W: jax.Array | None
+    b: jax.Array | Pair | None
+    mixing: Layer | None
+
+
 class TaskParams(NamedTuple):
     """A task; of several tasks, each array has a leading axis of lanes.
 
@@ -109,6 +173,9 @@ class TaskParams(NamedTuple):
       output: its last layer, of the dtype of the oracle.
       phase: `[P]` float32, the one-hot with which observations end in a stream that has
         `observes_phase`; elsewhere P = 0.
+      limits: None without `safety`.
+      observing: None without `observation`.
+      form: which of these there are, and of what kind; no array.
     """
 
     state_dim: jax.Array
@@ -122,6 +189,9 @@ class TaskParams(NamedTuple):
     inner: InnerLayers | None
     output: Layer
     phase: jax.Array
+    limits: Limits | None = None
+    observing: Observing | None = None
+    form: Form = Form()
 
     @property
     def max_steps_in_episode(self) -> jax.Array:
@@ -162,8 +232,8 @@ def task_params(
 
     Raises:
       SpecError: a field that only NumPy implements, such as `team`; or see `load_task`.
-      OptionError: no task, a task larger than `shape`, no shape, L = 1 beside L > 1, or another
-        dtype or kind of states.
+      OptionError: no task, a task larger than `shape`, no shape, L = 1 beside L > 1, tasks of
+        several forms, or another dtype or kind of states.
       UnknownNameError, ResourceLimitError, FingerprintMismatchError: see `load_task`.
     """
     single = isinstance(specs, SMESpec | dict | str | os.PathLike)
@@ -188,6 +258,7 @@ def _lanes(tasks: Sequence[Task], shape: Shape | None, dtype: Any, states: str) 
     smallest = Shape.covering(Shape.of(task.spec) for task in tasks)
     shape = smallest if shape is None else _checked_shape(shape)
     _check_covered(smallest, shape)
+    _check_forms([Form.of(task.spec) for task in tasks])
     return [_padded(task, shape, dtype, as_pairs) for task in tasks]
 
 
@@ -230,11 +301,21 @@ def _check_covered(shape: Shape, covering: Shape) -> None:
             )
 
 
+def _check_forms(forms: Sequence[Form]) -> None:
+    for index, form in enumerate(forms):
+        if form != forms[0]:
+            raise OptionError(
+                f"specs[{index}]: must have safety and observation like specs[0]: both with limits "
+                "or both without, and equal distractors, dynamics, mixing and mixing_depth. Make "
+                "two programs."
+            )
+
+
 def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> TaskParams:
     """A task with NumPy's arrays in place of JAX's."""
-    spec, (S, A, L, H) = task.spec, shape
-    W, b = _pad(task.W, (A, S)), _pad(task.b, (S,))
-    *inner, output = task.policies[0]
+    spec, (S, A, *_) = task.spec, shape
+    W, b = _transition(task.W, task.b, (A, S), as_pairs)
+    inner, output = _network(task.policies[0], shape, dtype)
     fields: dict[str, Any] = {
         "state_dim": np.int32(spec.state_dim),
         "action_dim": np.int32(spec.action_dim),
@@ -242,13 +323,53 @@ def _padded(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> T
         "horizon": np.int32(spec.horizon),
         "r_min": dtype.type(spec.r_min),
         "D": dtype.type(spec.D),
-        "W": (W * 2**GRID_BITS).astype(np.uint32) if as_pairs else W,
-        "b": pairs.from_float64(b) if as_pairs else b,
-        "inner": _inner_layers(inner, shape, dtype) if inner else None,
-        "output": _layer(output, (A, H if L > 1 else S), dtype),
+        "W": W,
+        "b": b,
+        "inner": inner,
+        "output": output,
         "phase": np.zeros(0, np.float32),
+        "form": Form.of(spec),
     }
+    if spec.safety is not None:
+        tightness: Any = dtype.type(spec.safety.tightness)
+        fields["limits"] = Limits(tightness, *_network(task.limiting, shape, dtype))
+    if spec.observation is not None:
+        fields["observing"] = _observing(task, shape, dtype, as_pairs)
     return TaskParams(**fields)
+
+
+def _transition(W: Host, b: Host, shape: tuple[int, int], as_pairs: bool) -> tuple[Any, Any]:
+    """W and b of a transition, padded to `shape` `[A, S]`."""
+    W, b = _pad(W, shape), _pad(b, shape[1:])
+    if as_pairs:
+        return (W * 2**GRID_BITS).astype(np.uint32), pairs.from_float64(b)
+    return W, b
+
+
+def _network(
+    layers: Sequence[Any], shape: Shape, dtype: np.dtype[Any]
+) -> tuple[InnerLayers | None, Layer]:
+    """The inner layers and the last one of a network from S to A."""
+    S, A, L, H = shape
+    *inner, output = layers
+    padded: Layer = _layer(output, (A, H if L > 1 else S), dtype)
+    return _inner_layers(inner, shape, dtype) if inner else None, padded
+
+
+def _observing(task: Task, shape: Shape, dtype: np.dtype[Any], as_pairs: bool) -> Observing:
+    S, A, *_ = shape
+    m = task.spec.distractors
+    W, b, mixing = None, None, None
+    if task.distractor_transition is not None:
+        W, b = _transition(*task.distractor_transition, (A, m), as_pairs)
+    if task.mixing:
+        kept = np.r_[: task.spec.state_dim, S : S + m]
+        mixing_W: Any = np.zeros((len(task.mixing), S + m, S + m), dtype)
+        mixing_b: Any = np.zeros((len(task.mixing), S + m), dtype)
+        for i, layer in enumerate(task.mixing):
+            mixing_W[i][np.ix_(kept, kept)], mixing_b[i, kept] = layer
+        mixing = Layer(mixing_W, mixing_b)
+    return Observing(W, b, mixing)
 
 
 def _inner_layers(layers: Sequence[Any], shape: Shape, dtype: np.dtype[Any]) -> InnerLayers:

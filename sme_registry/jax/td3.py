@@ -72,6 +72,7 @@ class TD3Program(OffPolicyProgram):
     """Lanes of TD3."""
 
     draws = 1
+    hidden = ("actor.mu", jax.nn.relu)
 
     @staticmethod
     def initial_weights(

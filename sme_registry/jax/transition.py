@@ -35,16 +35,33 @@ def next_state(params: TaskParams, s: States, a: jax.Array) -> States:
     Returns:
       `[..., S]` next states in [0, 1].
     """
+    return moved(params.W, params.b, s, a)
+
+
+def moved(W: jax.Array, b: jax.Array | Pair, s: States, a: jax.Array) -> States:
+    """The same for any transition, such as that of distractors `[..., m]`."""
     a = jnp.clip(a, 0.0, 1.0).astype(jnp.float32)
     y: Any
-    if isinstance(params.b, Pair):
+    if isinstance(b, Pair):
         assert isinstance(s, Pair)
-        y = pairs.add(s, params.b)
-        y = _sum_over_channels(lambda y, W, a: pairs.add(y, pairs.product(W, a)), y, params.W, a)
+        y = pairs.add(s, b)
+        y = _sum_over_channels(lambda y, W, a: pairs.add(y, pairs.product(W, a)), y, W, a)
         return pairs.fold(y)
     a = a.astype(jnp.float64)
-    y = _sum_over_channels(lambda y, W, a: y + W * a, jnp.asarray(s) + params.b, params.W, a)
+    y = _sum_over_channels(lambda y, W, a: y + W * a, jnp.asarray(s) + b, W, a)
     return 2.0 * jnp.abs(y - jnp.rint(y))
+
+
+def from_words(words: jax.Array, params: TaskParams) -> States:
+    """Random uint32 as uniform states on the grid 2⁻³², in [0, 1), as the task has states."""
+    if isinstance(params.b, Pair):
+        return pairs.from_fraction(words)
+    return words.astype(jnp.float64) * 2.0**-32
+
+
+def to_real(s: States, dtype: Any) -> jax.Array:
+    """States as real numbers of a dtype; pairs through float32."""
+    return (pairs.to_float32(s) if isinstance(s, Pair) else s).astype(dtype)
 
 
 def _sum_over_channels(add: Any, y: Any, W: jax.Array, a: jax.Array) -> Any:

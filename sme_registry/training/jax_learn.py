@@ -15,12 +15,14 @@ import numpy.typing as npt
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 
+from sme_registry.envs.episode_safety import EpisodeSafety, safety_of_step
 from sme_registry.errors import OptionError
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.io import is_installed, read_arrays, write_arrays, write_atomically
 from sme_registry.jax import run as jax_run
 from sme_registry.jax.program import Program, StepLog
 from sme_registry.sb3 import EpisodeRegret
+from sme_registry.spec import SMESpec
 from sme_registry.terminal.interrupts import defer_interrupts
 from sme_registry.training import checkpoint
 from sme_registry.training.episodes import Episode
@@ -81,7 +83,7 @@ def learn(
       OptionError: a file cannot be written.
     """
     program, model = agent
-    present = _PresentEpisode()
+    present = _PresentEpisode(record.spec)
     path = folder / checkpoint.FILE
     if record.sessions > 1 and path.exists():
         try:
@@ -151,12 +153,18 @@ def _check_finite(program: Program, folder: Path) -> None:
 class _PresentEpisode:
     """The episode that goes on from one piece of a run to the next.
 
+    Args:
+      spec: the task; of a stream, that of any phase.
+
     Attributes:
-      sums: `[4]` return, length, regret and similarity so far.
+      sums: `[4]` return, length, regret and similarity so far; with `safety` `[7]`, also the
+        summands of `EpisodeSafety`.
     """
 
-    def __init__(self) -> None:
-        self.sums: npt.NDArray[np.float64] = np.zeros(4)
+    def __init__(self, spec: SMESpec) -> None:
+        self._spec = spec
+        self._zeros = np.zeros(4 if spec.safety is None else 4 + len(EpisodeSafety._fields))
+        self.sums: npt.NDArray[np.float64] = self._zeros
 
     def add(self, last_step: int, log: StepLog) -> list[EpisodeRegret]:
         """The episodes that ended in a piece.
@@ -167,10 +175,15 @@ class _PresentEpisode:
         """
         lengths = np.ones_like(log.regret)
         values = np.stack([log.reward, lengths, log.regret, log.similarity])[:, :, 0]
+        if log.cost is not None and log.safe_regret is not None:
+            infos = {"cost": log.cost[:, 0], "safe_regret": log.safe_regret[:, 0]}
+            summands = safety_of_step(infos, lambda: self._spec)
+            assert summands is not None
+            values = np.concatenate([values, summands])
         ends = np.flatnonzero(np.logical_or(log.terminated, log.truncated)[:, 0]) + 1
         begin, finished = 0, []
         for end in ends.tolist():
-            returned, length, regret, similarity = self._added(values[:, begin:end])
+            returned, length, regret, similarity, *safety = self._added(values[:, begin:end])
             finished.append(
                 EpisodeRegret(
                     step=last_step - values.shape[1] + end,
@@ -179,14 +192,15 @@ class _PresentEpisode:
                     episode_return=returned,
                     length=int(length),
                     terminated=bool(log.terminated[end - 1, 0]),
+                    safety=EpisodeSafety(*(each / length for each in safety)) if safety else None,
                 )
             )
-            self.sums, begin = np.zeros(4), end
+            self.sums, begin = self._zeros, end
         self.sums = np.array(self._added(values[:, begin:]))
         return finished
 
     def _added(self, values: npt.NDArray[np.float64]) -> list[float]:
-        """The sums with those of `[4, n]` steps, in order: the same bits for any pieces."""
+        """The sums with those of `[4 or 7, n]` steps, in order: the same bits for any pieces."""
         sums: list[float] = np.cumsum(np.column_stack([self.sums, values]), axis=1)[:, -1].tolist()
         return sums
 
@@ -207,6 +221,8 @@ class _Board:
             self._logger.record_mean("rollout/ep_len_mean", episode.length)
             self._logger.record_mean("rollout/regret", episode.regret)
             self._logger.record_mean("rollout/similarity", episode.similarity)
+            for name, value in episode.safety._asdict().items() if episode.safety else ():
+                self._logger.record_mean(f"rollout/{name}", value)
         self._logger.dump(step)
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from sme_registry import SMESpec, make
 from sme_registry.errors import OptionError
 from sme_registry.jax import ppo
-from sme_registry.jax.env import EnvState, start
+from sme_registry.jax.env import start
 from sme_registry.jax.networks import Adam
 from sme_registry.jax.padding import Dimensions, Padding
 from sme_registry.jax.run import settings_of
@@ -200,8 +200,7 @@ def test_collected_steps_are_those_of_the_environment(
     noise = rng.standard_normal((4, n), np.float32)
     starts = rng.random((n + 1, 8))
     fresh = jax.vmap(lambda s: start(s, params)[1])(starts)
-    begin = EnvState(*(x[0] for x in fresh))
-    after = EnvState(*(x[1:] for x in fresh))
+    begin, after = (jax.tree.map(lambda x, at=at: x[at], fresh) for at in (0, slice(1, None)))
     symmetric = action_range == "symmetric"
     collect = jax.jit(
         functools.partial(ppo.collect, SETTINGS, symmetric=symmetric, separable=separable)
@@ -274,11 +273,11 @@ def test_a_program_collects_whole_rollouts_and_learns_between_them() -> None:
     log = lanes.advance(20)
     keys.append(lanes.state.key)
     assert lanes.steps == 32
-    assert {x.shape for x in log} == {(32, 2)}
+    assert {x.shape for x in jax.tree.leaves(log)} == {(32, 2)}
     assert largest_difference(lanes.weights(0), before) == 0.0  # stopped before the update
-    assert {x.shape for x in lanes.advance(32)} == {(0, 2)}
+    assert {x.shape for x in jax.tree.leaves(lanes.advance(32))} == {(0, 2)}
     log = lanes.advance(96)
-    assert {x.shape for x in log} == {(64, 2)}
+    assert {x.shape for x in jax.tree.leaves(log)} == {(64, 2)}
     assert log.terminated.dtype == log.truncated.dtype == bool
     assert lanes.state.optimiser.updates.tolist() == [8, 8]
     keys.append(lanes.state.key)

@@ -118,5 +118,5 @@ def test_fields_of_later_versions_are_refused_unless_they_have_their_default() -
 
 
 def test_every_field_is_supported_or_refused_on_purpose() -> None:
-    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team", "safety", "observation"}
+    assert SMESpec.model_fields.keys() - SUPPORTED_FIELDS == {"team"}
     assert SMESpec.model_fields.keys() >= SUPPORTED_FIELDS

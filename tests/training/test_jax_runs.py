@@ -323,3 +323,32 @@ def test_a_life_has_the_snapshots_of_sb3_and_its_resumption_the_same_bits(
     program.finish()
     for name, weight in models[1].policy.state_dict().items():
         assert np.array_equal(weight.numpy(), program.weights(0)[name])
+
+
+MIXED = TINY.derive(
+    safety={"tightness": 0.3},
+    observation={"distractors": 3, "dynamics": "autonomous", "mixing": "nonlinear"},
+)
+
+
+def test_a_run_on_a_task_with_limits_and_distractors_has_its_costs_and_resumes_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = jax_run(tmp_path / "run", MIXED)
+    assert "cost_curve.png" in {path.name for path in run.figures}
+    assert run.report.safety is not None
+    assert run.report.observation is not None
+    assert len(run.report.observation.probes) == 2  # of the observation and the hidden layer
+    assert load_sb3(run.model_path).observation_space.shape == (2 + 3 + 2,)
+    rows = read_episodes(run.folder / "episodes.csv")
+    program = new_program("jax:PPO", [MIXED], [0], hyperparameters=PPO, steps=120)
+    log = program.advance(120)
+    assert log.cost is not None
+    costs = log.cost[:120, 0].reshape(6, 20)
+    for row, cost in zip(rows, costs, strict=True):
+        assert row.safety is not None
+        assert row.safety.cost == pytest.approx(cost.mean(), abs=1e-8)
+        assert row.safety.violating_share == np.mean(cost > 1e-6)
+        assert -1.0 <= row.safety.safe_regret <= 1.0
+    interrupted(tmp_path / "again", monkeypatch, document=MIXED)
+    same_bits(jax_run(tmp_path / "again", MIXED, resume=True, hyperparameters={}), run)

@@ -1,9 +1,9 @@
 """`Job`: what an executor runs at once, a cell alone or the lanes of one program.
 
 Cells that use `jax:…` and differ in nothing but task, seed and protocol are lanes of a program, if
-their tasks have the same shape. The number of its lanes follows from the whole plan: whatever was
-run before, is left out by `only` or runs elsewhere, a cell's program has the same number of lanes,
-and so its result the same bits.
+their tasks have the same shape and form: limits, distractors and mixing. The number of its lanes
+follows from the whole plan: whatever was run before, is left out by `only` or runs elsewhere, a
+cell's program has the same number of lanes, and so its result the same bits.
 """
 
 from __future__ import annotations
@@ -194,6 +194,7 @@ class Programs:
             # Rewards that change no observation and end no episode are computed in another way.
             all(spec.k == 1 and spec.D == 0 for spec in cell.specs),
             tuple(_shape(spec) if self.platform == CPU else _bucket(spec) for spec in cell.specs),
+            tuple(map(_form, cell.specs)),
             cell.stream and cell.stream.switches,
         )
 
@@ -272,6 +273,12 @@ def _shape(spec: SMESpec) -> Shape:
     from sme_registry.jax.task import Shape
 
     return Shape.of(spec)
+
+
+def _form(spec: SMESpec) -> Hashable:
+    from sme_registry.jax.task import Form
+
+    return Form.of(spec)
 
 
 def _bucket(spec: SMESpec) -> Hashable:

@@ -16,13 +16,20 @@ import time
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sme_registry.errors import OptionError, PolicyError
-from sme_registry.evaluation import EvaluationReport, StreamReport, as_policy, evaluate_many
+from sme_registry.evaluation import (
+    EvaluationReport,
+    Policy,
+    StreamReport,
+    as_policy,
+    evaluate_many,
+)
 from sme_registry.evaluation.continual import DynamicRegret, RegretBlocks
 from sme_registry.evaluation.policies import saved_sb3
 from sme_registry.evaluation.rollouts import start_states
@@ -134,6 +141,8 @@ class _Run:
             "failed_at": np.full(lanes.count, -1),
             "seconds": np.zeros(2),
         }
+        if cell.spec.safety is not None:
+            self._records["cost"] = np.zeros(lanes.count)  # as the regret
         self._begin_lives()
         self._restore()
         self._last_state = time.monotonic()
@@ -182,7 +191,8 @@ class _Run:
             cell=cell,
             curve=self._curve(lane),
             **report_field(report),
-            online_regret=self._online_regret(lane),
+            online_regret=self._online("regret", lane),
+            online_cost=self._online("cost", lane),
             program=self._made,
             timing=self._timing(seconds),
             versions=versions_for(cell.uses),
@@ -234,6 +244,8 @@ class _Run:
 
     def _on_log(self, log: StepLog) -> None:
         self._records["regret"] += log.regret.sum(axis=0)
+        if log.cost is not None:
+            self._records["cost"] += log.cost.sum(axis=0)
         if self._blocks is not None:
             self._blocks.add(self._program.steps, log.regret)
         self._spend(_TRAINING)
@@ -303,9 +315,12 @@ class _Run:
             snapshots[path.name] = saved_sb3(model)
         return snapshots
 
-    def _online_regret(self, lane: int) -> float | None:
+    def _online(self, record: str, lane: int) -> float | None:
+        """The mean of a record over all steps of training; None without steps or record."""
         steps = self._program.steps
-        return float(self._records["regret"][lane]) / steps if steps else None
+        if not steps or record not in self._records:
+            return None
+        return float(self._records[record][lane]) / steps
 
     def _timing(self, at_the_end: float) -> Timing:
         """A cell's share of the program's time, and that of its evaluation at the end."""
@@ -419,7 +434,9 @@ def _evaluate_together(group: list[_Trained]) -> _Evaluated:
         policies = []
         for cell, (weights,), _ in group:
             range_, name, act = cell.action_range, cell.uses, _policy(cell, weights)
-            policies.append((as_policy(act, cell.spec, action_range=range_, name=name), cell.spec))
+            policy = as_policy(act, cell.spec, action_range=range_, name=name)
+            assert isinstance(policy, Policy)  # cells in JAX have no team
+            policies.append((replace(policy, hidden=_hidden_layers(cell, weights)), cell.spec))
         reports = evaluate_many(policies, first.cell.protocol)
     return reports, time.process_time() - start
 
@@ -443,6 +460,12 @@ def _policy(cell: Cell, weights: Arrays) -> Any:
         hyperparameters=cell.hyperparameters,
         action_range=cell.action_range,
     )
+
+
+def _hidden_layers(cell: Cell, weights: Arrays) -> Any:
+    from sme_registry.jax.run import hidden_of
+
+    return hidden_of(cell.uses, weights, cell.hyperparameters)
 
 
 def _begin_worker() -> None:

@@ -103,6 +103,8 @@ def test_cells_of_one_shape_and_kind_of_reward_share_a_program_and_others_do_not
         {"evaluation_episodes": 3},
         {"spec": small.spec.model_copy(update={"state_dim": 3})},
         {"spec": small.spec.model_copy(update={"complexity": 2})},
+        {"spec": small.spec.derive(safety={"tightness": 0.2})},
+        {"spec": small.spec.derive(observation={"mixing": "orthogonal"})},
     ):
         assert programs.group(small.model_copy(update=change)) != programs.group(small), change
     for change in ({"seed": 9}, {"spec": small.spec.model_copy(update={"horizon": 7})}):

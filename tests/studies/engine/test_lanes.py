@@ -355,9 +355,23 @@ def test_a_cell_by_itself_is_a_program_of_one_lane(tmp_path: Path) -> None:
     result = run_cell(cell, model_path=tmp_path / "model.zip")
     assert result.program is not None
     assert result.program.lanes == 1
-    assert (result.online_regret, result.curve.steps) == (None, ())
+    assert (result.online_regret, result.online_cost, result.curve.steps) == (None, None, ())
     report = evaluate(str(tmp_path / "model.zip"), cell.spec, cell.protocol)
     assert report.wd_regret == pytest.approx(result.report.wd_regret, abs=1e-6)
+
+
+def test_a_cell_with_limits_and_distractors_has_their_costs_and_reports() -> None:
+    observation = {"distractors": 3, "dynamics": "driven", "mixing": "nonlinear"}
+    setting = {"state_dim": 2, "action_dim": 2, "horizon": 20, "safety": {"tightness": 0.3}}
+    setting["observation"] = observation
+    file = plan_file(classes=[{"name": "mixed", "setting": setting, "seeds": [1]}], seeds=1)
+    result = run_cell(file.plan.cells[0].cell)
+    assert result.online_cost is not None
+    assert 0.0 < result.online_cost < 1.0
+    assert result.report.safety is not None
+    assert result.report.observation is not None
+    assert [region.name for region in result.report.observation.invariance] == ["WD", "OOD 1"]
+    assert [probe.units for probe in result.report.observation.probes] == [5, 8, 8]
 
 
 def test_processes_give_the_same_bits(

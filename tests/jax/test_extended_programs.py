@@ -1,0 +1,155 @@
+"""Programs of PPO, TD3 and SAC on tasks with limits, distractors and mixed observations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jax")
+
+from sme_registry import SMESpec, materialize
+from sme_registry.errors import UnknownNameError
+from sme_registry.evaluation.rollouts import rollouts, start_states
+from sme_registry.jax import replay
+from sme_registry.jax.program import Program, StepLog
+from sme_registry.jax.run import hidden_of, new_program, policy_of
+from sme_registry.jax.task import Shape
+
+STEPS, S, A, M, T = 48, 3, 2, 4, 7
+SMALL: dict[str, Any] = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "PPO": {**SMALL, "n_steps": 16, "n_epochs": 2},
+    "TD3": {**SMALL, "learning_starts": 6},
+    "SAC": {**SMALL, "learning_starts": 6},
+}
+MIXED = {"distractors": M, "dynamics": "driven", "mixing": "nonlinear"}
+
+
+def spec(observation: dict[str, Any], **fields: Any) -> SMESpec:
+    base = {"state_dim": S, "action_dim": A, "horizon": T, "safety": {"tightness": 0.3}}
+    return SMESpec.from_dict({**base, "observation": observation, **fields})
+
+
+def new(algorithm: str, observation: dict[str, Any], **options: Any) -> Program:
+    """Two lanes, of which the second is padded."""
+    specs = [spec(observation), spec(observation, seed=1, state_dim=S - 1)]
+    settings = SETTINGS[algorithm]
+    return new_program(
+        f"jax:{algorithm}", specs, [3, 4], hyperparameters=settings, steps=STEPS, **options
+    )
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def trained(request: pytest.FixtureRequest) -> tuple[str, Program, StepLog]:
+    program = new(request.param, MIXED)
+    log = program.advance(STEPS)
+    program.finish()
+    return request.param, program, log
+
+
+def seen_and_chosen(program: Program) -> tuple[Any, Any]:
+    """Observations `[steps, lanes, O]` and actions `[steps, lanes, A]` of the last steps."""
+    arrays = program.save()
+    if ".steps.observation" in arrays:
+        observed, action = arrays[".steps.observation"], arrays[".steps.action"]
+        return np.swapaxes(observed, 0, 1), np.swapaxes(action, 0, 1)
+    width = S + M + 2
+    stored = replay.Transitions(
+        *np.split(arrays[".buffer"], [width, width + A], axis=-1), *[None] * 2
+    )  # type: ignore[arg-type]
+    return stored.observation, stored.action
+
+
+def test_costs_in_the_log_are_those_of_the_states_behind_the_observations(
+    trained: tuple[str, Program, StepLog],
+) -> None:
+    _, program, log = trained
+    assert log.cost is not None
+    assert log.safe_regret is not None
+    assert log.cost.shape == log.safe_regret.shape == (STEPS, 2)
+    observed, actions = seen_and_chosen(program)
+    for lane, task in enumerate(map(materialize, program.specs)):
+        own = task.spec.state_dim
+        channels = [*range(own), *range(S, S + M)]
+        assert not observed[:, lane, own:S].any()
+        s = task.unmixed(observed[:, lane, channels])[:, :own]
+        a = (actions[:, lane] + 1.0) / 2.0
+        n = len(s)
+        np.testing.assert_allclose(log.cost[-n:, lane], task.cost(s, a), atol=1e-4)
+        np.testing.assert_allclose(log.similarity[-n:, lane], task.similarity(s, a), atol=1e-4)
+        safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
+        np.testing.assert_allclose(log.safe_regret[-n:, lane], safe, atol=1e-3)
+    assert log.cost.max() > 0.01
+
+
+def test_a_program_goes_on_from_saved_state_bit_for_bit(
+    trained: tuple[str, Program, StepLog],
+) -> None:
+    algorithm, whole, log = trained
+    first = new(algorithm, MIXED)
+    first.advance(STEPS // 2)
+    again = new(algorithm, MIXED)
+    again.restore(first.save())
+    rest = again.advance(STEPS)
+    again.finish()
+    for mine, theirs in zip(log, rest, strict=True):
+        np.testing.assert_array_equal(mine[-len(theirs) :], theirs)
+    for name, array in whole.save().items():
+        np.testing.assert_array_equal(again.save()[name], array, err_msg=name)
+
+
+def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(
+    trained: tuple[str, Program, StepLog],
+) -> None:
+    algorithm, program, _ = trained
+    uses, settings = f"jax:{algorithm}", SETTINGS[algorithm]
+    for lane, task in enumerate(program.specs):
+        weights = program.weights(lane)
+        assert isinstance(task, SMESpec)
+        observations = np.random.default_rng(0).random((5, task.observation_dim), np.float32)
+        actions = policy_of(uses, weights, hyperparameters=settings)(observations)
+        assert actions.shape == (5, A)
+        (hidden,) = hidden_of(uses, weights, settings)(observations)
+        assert hidden.shape == (5, 8)
+        mean = {"PPO": "action_net", "TD3": "actor.mu.2", "SAC": "actor.mu"}[algorithm]
+        expected = hidden @ weights[f"{mean}.weight"].T + weights[f"{mean}.bias"]
+        squashed = expected if algorithm == "PPO" else np.tanh(expected)
+        np.testing.assert_allclose(actions, squashed, atol=1e-6)
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_evaluations_of_a_policy_that_ignores_distractors_are_those_of_numpy(k: int) -> None:
+    """Whatever the random numbers of its distractors."""
+    tasks = [spec({"distractors": M, "dynamics": "autonomous"}, seed=i, k=k) for i in range(2)]
+    program = new_program("jax:PPO", tasks, [3, 4], hyperparameters=SETTINGS["PPO"], steps=1)
+    weights = dict(program.state.weights)
+    name = "mlp_extractor.policy_net.0.weight"
+    weights["action_net.weight"] *= 30.0
+    weights[name] = weights[name].at[:, :, S : S + M].set(0.0)
+    program.state = program.state._replace(weights=weights)
+    states = np.stack([start_states(i, 0, 3, S) for i in range(2)])
+    evaluation = program.evaluate(states)
+    for lane, task in enumerate(tasks):
+        act = policy_of("jax:PPO", program.weights(lane), hyperparameters=SETTINGS["PPO"])
+        done = rollouts(lambda o, act=act: (act(o) + 1) / 2, materialize(task), states[lane])
+        np.testing.assert_allclose(evaluation.episode_return[lane], done.episode_return, atol=1e-2)
+        np.testing.assert_allclose(evaluation.regret[lane] / T, done.regret, atol=1e-3)
+
+
+def test_padding_changes_no_random_number_of_distractors() -> None:
+    noise = {"distractors": M, "dynamics": "noise"}
+    own, padded = (new("PPO", noise, shape=shape) for shape in (None, Shape(S + 2, A + 1, 1, 0)))
+    for program in (own, padded):
+        program.advance(1)
+    few = slice(5)  # later on, states are chaotic in the last bits of actions
+    ours, theirs = (seen_and_chosen(program)[0][few] for program in (own, padded))
+    np.testing.assert_allclose(theirs[..., S + 2 :], ours[..., S:], atol=1e-4)
+    assert np.unique(ours[:, 0, S : S + M]).size == 5 * M
+
+
+def test_algorithms_for_limits_are_not_in_jax() -> None:
+    for name in ("PPOLagrangian", "PPOProjection"):
+        with pytest.raises(UnknownNameError, match=rf"'jax:{name}': must be one of jax:PPO, "):
+            new_program(f"jax:{name}", [spec(MIXED)], [0], steps=1)

@@ -1,0 +1,192 @@
+"""Distractors, what agents see of them, and costs, against the NumPy definition step by step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sme_registry import SMESpec, materialize
+from sme_registry.errors import OptionError, SpecError, StateError
+from sme_registry.jax import env, observing, oracle, pairs
+from sme_registry.jax.gymnax import Environment
+from sme_registry.jax.task import Form, task_params
+
+STEPS, M = 9, 4
+MIXINGS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "orthogonal": {"mixing": "orthogonal"},
+    "nonlinear": {"mixing": "nonlinear", "mixing_depth": 2},
+}
+
+
+def lanes(observation: dict[str, Any]) -> list[SMESpec]:
+    """Two tasks of unequal sizes; the second is padded."""
+    base = {"horizon": 4, "k": 2, "safety": {"tightness": 0.3}, "observation": observation}
+    sizes = {"state_dim": 3, "action_dim": 2}, {"state_dim": 2, "action_dim": 1}
+    return [SMESpec.from_dict({**base, **size, "seed": i}) for i, size in enumerate(sizes)]
+
+
+@jax.jit
+def rollout(params: Any, keys: Any, actions: Any) -> Any:
+    """All steps of all lanes: states before, the random numbers, and what `step` returns."""
+
+    def advance(state: Any, inputs: Any) -> Any:
+        keys, actions = inputs
+        numbers = jax.vmap(observing.drawn)(keys, params)
+        observation, after, *others = jax.vmap(env.step)(keys, state, actions, params)
+        return after, (state, numbers, observation, after, *others)
+
+    _, state = jax.vmap(env.reset)(keys[0], params)
+    return jax.lax.scan(advance, state, (keys[1:], actions))[1]
+
+
+def inputs(specs: list[SMESpec]) -> tuple[Any, Any]:
+    actions = np.random.default_rng(0).uniform(-0.2, 1.2, (STEPS, len(specs), 2))
+    return jax.random.split(jax.random.key(0), (STEPS + 1, len(specs))), actions.astype(np.float32)
+
+
+def float64(s: Any) -> Any:
+    return pairs.to_float64(s) if isinstance(s, pairs.Pair) else np.asarray(s)
+
+
+@pytest.mark.parametrize("mixing", MIXINGS)
+@pytest.mark.parametrize("dynamics", ["noise", "autonomous", "driven", None])
+def test_lanes_step_as_in_numpy(dynamics: str | None, mixing: str) -> None:
+    if dynamics is None and mixing == "none":
+        return
+    m = 0 if dynamics is None else M
+    specs = lanes({"distractors": m, "dynamics": dynamics, **MIXINGS[mixing]})
+    check_steps(specs, task_params(specs), 1e-12)
+
+
+def test_lanes_step_as_in_numpy_without_float64() -> None:
+    specs = lanes({"distractors": M, "dynamics": "autonomous", **MIXINGS["nonlinear"]})
+    params = task_params(specs, dtype=jnp.float32, states="pairs")
+    assert "f64[" not in rollout.lower(params, *inputs(specs)).compile().as_text()
+    check_steps(specs, params, 1e-5)
+
+
+def check_steps(specs: list[SMESpec], params: Any, tolerance: float) -> None:
+    keys, a = inputs(specs)
+    run = jax.tree.map(np.asarray, rollout(params, keys, a))
+    before, numbers, observed, after, reward, done, info = run
+    plain = task_params([spec.derive(safety=None, observation=None) for spec in specs])
+    same = rollout(plain, keys, a)
+    assert done.sum() == 2 * len(specs)
+    for lane, spec in enumerate(specs):
+        task, S, m, dynamics = materialize(spec), spec.state_dim, spec.distractors, Form.of(spec)
+        channels = [*range(S), *range(3, 3 + m)]
+        for i in range(STEPS):
+            s, t = float64(before.s)[i, lane, :S], int(before.t[i, lane])
+            u = a[i, lane, : spec.action_dim].astype(float)
+            np.testing.assert_allclose(info["cost"][i, lane], task.cost(s, u), atol=tolerance)
+            safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, u)
+            np.testing.assert_allclose(info["safe_regret"][i, lane], safe, atol=4 * tolerance)
+            d = None
+            if m:
+                moved = float64(before.distractors)[i, lane]
+                if dynamics.dynamics == "noise":
+                    d = float64(numbers)[i, lane]
+                else:
+                    driven = dynamics.dynamics == "driven"
+                    d = task.distractor_step(moved, u if driven else numbers[i, lane, : len(u)])
+                if not done[i, lane]:
+                    assert (float64(after.distractors)[i, lane] == d).all()
+            seen = task.seen(task.transition(s, u), d)
+            final = info["final_observation"][i, lane]
+            np.testing.assert_allclose(final[channels], seen, rtol=6e-8, atol=2 * tolerance)
+            assert not np.delete(final[: 3 + m], channels).any()  # padded
+            assert final[-2] == np.float32((t + 1) / 4)
+            d = float64(after.distractors)[i, lane] if m else None
+            seen = task.seen(float64(after.s)[i, lane, :S], d)
+            np.testing.assert_allclose(
+                observed[i, lane, channels], seen, rtol=6e-8, atol=2 * tolerance
+            )
+    if not isinstance(params.b, pairs.Pair):  # the task without both has the same episodes
+        assert (np.asarray(same[3].s) == after.s).all()
+        assert (np.asarray(same[4]) == reward).all()
+        for name in ("similarity", "step_reward", "terminated", "truncated"):
+            assert (np.asarray(same[6][name]) == info[name]).all()
+
+
+@pytest.mark.parametrize("complexity", [1, 3])
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_limits_and_costs_equal_numpys(complexity: int, dtype: Any) -> None:
+    tolerance = 1e-5 if dtype == jnp.float32 else 1e-12
+    spec = SMESpec.from_dict(
+        {"complexity": complexity, "hidden_width": 5, "safety": {"tightness": 0.2}, "r_min": 0.1}
+    )
+    shape = (9, 6, complexity, 7 if complexity > 1 else 0)
+    params, task = task_params(spec, shape=shape, dtype=dtype), materialize(spec)
+    rng = np.random.default_rng(0)
+    s, a = rng.uniform(-0.5, 1.5, (64, 8)), rng.uniform(-0.2, 1.2, (64, 4))
+    wide_s, wide_a = np.pad(s, [(0, 0), (0, 1)]), np.pad(a, [(0, 0), (0, 2)], constant_values=1.0)
+    limit = jax.jit(oracle.limit)(params, wide_s)
+    np.testing.assert_allclose(limit[:, :4], task.limit(s), rtol=0, atol=tolerance)
+    judged = jax.jit(oracle.judge)(params, wide_s, wide_a)
+    np.testing.assert_allclose(judged.cost, task.cost(s, a), rtol=0, atol=tolerance)
+    assert np.asarray(judged.cost).max() > 0.1
+    safe = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
+    np.testing.assert_allclose(judged.safe_regret, safe, rtol=0, atol=4 * tolerance)
+    with pytest.raises(SpecError, match=r"^limit: this task has no safety"):
+        oracle.limit(task_params(SMESpec()), s)
+    with pytest.raises(SpecError, match=r"^cost: this task has no safety"):
+        oracle.cost(task_params(SMESpec()), a, a)
+
+
+def test_distractors_of_starts_and_noise_are_uniform_and_new() -> None:
+    spec = SMESpec.from_dict({"observation": {"distractors": 2}})
+    keys, params = jax.random.split(jax.random.key(0), 4096), task_params(spec)
+    drawn = [jax.vmap(each, (0, None))(keys, params) for each in DRAWS]
+    columns = np.concatenate([jax.vmap(env.reset, (0, None))(keys, params)[1].s, *drawn], axis=1)
+    quarters = np.stack([np.histogram(column, 4, (0, 1))[0] for column in columns.T])
+    assert abs(quarters - 1024).max() < 5 * np.sqrt(4096 * 3 / 16)
+    assert abs(np.corrcoef(columns.T) - np.eye(12)).max() < 5 / np.sqrt(4096)
+
+
+DRAWS = (observing.first_distractors, observing.drawn)
+
+
+def test_a_task_without_both_carries_nothing_of_them() -> None:
+    params = task_params(SMESpec())
+    _, state = env.reset(jax.random.key(0), params)
+    assert len(jax.tree.leaves(state)) == 3
+    assert len(jax.tree.leaves(params)) == 11
+    assert observing.drawn(jax.random.key(0), params) is None
+
+
+def test_an_episode_begins_with_any_distractors() -> None:
+    params = task_params(lanes({"distractors": M})[0])
+    s, d = jnp.full(3, 0.25), jnp.full(M, 0.75)
+    assert env.start(s, params, d)[0].tolist() == [0.25] * 3 + [0.75] * M + [0.0, 0.0]
+    for wrong in (None, jnp.zeros(3), pairs.from_float64(np.zeros(M))):
+        with pytest.raises(StateError, match=r"^distractors .*: must be of shape \(4,\), float64"):
+            env.start(s, params, wrong)  # type: ignore[arg-type]
+    _, state = env.start(s, params, d)
+    with pytest.raises(StateError, match=r"^distractors left out: must be of shape \(4,\)"):
+        env.step(jax.random.key(0), state._replace(distractors=None), jnp.zeros(2), params)
+    with pytest.raises(StateError, match=r"^distractors of shape \(3,\): must be left out"):
+        env.start(jnp.zeros(8), task_params(SMESpec()), s)
+
+
+def test_tasks_of_other_forms_share_no_program() -> None:
+    specs = lanes({"distractors": M})
+    for other in (specs[0].derive(safety=None), lanes({"distractors": M + 1})[0], SMESpec()):
+        with pytest.raises(OptionError, match=r"^specs\[1\]: must have safety and observation"):
+            task_params([specs[0], other])
+    params = task_params([specs[0], specs[0].derive(safety={"tightness": 0.1})])
+    assert params.limits is not None
+    assert params.limits.tightness.tolist() == [0.3, 0.1]
+
+
+def test_gymnaxs_environment_has_the_agents_observation() -> None:
+    environment = Environment(lanes({"distractors": M, **MIXINGS["orthogonal"]})[0])
+    observation, state = environment.reset(jax.random.key(0))
+    space = environment.observation_space()
+    assert observation.shape == space.shape == (3 + M + 2,)
+    _, _, _, _, _, info = environment.step(jax.random.key(1), state, jnp.ones(2))
+    assert 0.0 <= info["cost"] <= 1.0
