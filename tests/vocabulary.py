@@ -68,6 +68,8 @@ QUANTITIES = {
     "length": "mean steps of an episode",
     "mean_length": "the same in a diagnosis",
     "online_regret": "mean regret over training",
+    "normalised_online_regret": "Σ of regret over a budget / that of the constant ½ in its states",
+    "learning_curve": "normalised online regret in each part of a budget",
     "online_cost": "mean cost over training",
     "agents_online_regret": "online regret of each agent of a team",
     "first_regret": "regret at the start of training",

@@ -31,6 +31,7 @@ from leaderboard.documents.submission import (
     MAX_BYTES,
     MAX_RUNS,
     Artefact,
+    Manifest,
     Method,
     Run,
     SignedSubmission,
@@ -77,7 +78,7 @@ def check_submission(board: BoardDocument, submission: Submission, at: datetime.
             f"suite={submission.suite.name}, {submission.suite.digest}: must be "
             f"{expected.name}, {expected.digest}. Create a bundle for this board's suite.",
         )
-    _check_time(submission.created, at, board.limits.age_days)
+    check_time(submission.created, at, board.limits.age_days)
     check_runs(board.suite, submission)
     for index, run in enumerate(submission.runs):
         if run.artefact is not None and run.artefact.size > board.limits.artefact_bytes:
@@ -111,22 +112,22 @@ def check_board(board: BoardDocument, signed_for: str | None) -> None:
         )
 
 
-def check_names(submission: Submission, board_key: str | None = None) -> None:
+def check_names(manifest: Manifest, board_key: str | None = None) -> None:
     """Reject what is unsafe to show: markup, formulas, control characters, the board's own names.
 
     Args:
-      submission: the submission.
+      manifest: a submission, an entry or a request for a ticket.
       board_key: the key that may use the board's names; None if the board is not known yet.
 
     Raises:
       Rejection: `unsafe_name`.
     """
-    method, training = submission.method, submission.training
+    method, training = manifest.method, manifest.training
     for field, name in (
         ("method.name", method.name),
         ("method.version", method.version),
         ("method.family", method.family),
-        ("submitter.name", submission.submitter.name),
+        ("submitter.name", manifest.submitter.name),
     ):
         if not _NAME.fullmatch(name):
             raise Rejection(
@@ -135,25 +136,25 @@ def check_names(submission: Submission, board_key: str | None = None) -> None:
                 "letters a–z, digits, single spaces and '._+-()'. Rename it.",
             )
     for field, name, reserved in (
-        ("submitter.name", submission.submitter.name, THE_BOARD),
+        ("submitter.name", manifest.submitter.name, THE_BOARD),
         ("method.family", method.family, REFERENCE_FAMILY),
     ):
-        if skeleton(name) == skeleton(reserved) and submission.submitter.key != board_key:
+        if skeleton(name) == skeleton(reserved) and manifest.submitter.key != board_key:
             raise Rejection(
                 "unsafe_name",
                 f"{field}={name!a}: reserved for the board's own reference rows. Rename it.",
             )
-    if submission.code is not None and not _LINK.fullmatch(submission.code):
+    if manifest.code is not None and not _LINK.fullmatch(manifest.code):
         raise Rejection(
             "unsafe_name",
-            f"code={submission.code!a}: must contain only the characters of a URL. "
+            f"code={manifest.code!a}: must contain only the characters of a URL. "
             "Write others as %XX.",
         )
     for field, text in (
         ("training.library", training.library),
         ("training.hyperparameters", training.hyperparameters),
         ("training.hardware", training.hardware),
-        ("statement", submission.statement),
+        ("statement", manifest.statement),
     ):
         check_text(field, text)
 
@@ -266,7 +267,14 @@ def most_runs(board: BoardDocument) -> int:
     return 1 + (MAX_BYTES - one) // (two - one)
 
 
-def _check_time(created: str, at: datetime.datetime, age_days: int) -> None:
+def check_time(created: str, at: datetime.datetime, age_days: int) -> None:
+    """Reject a time of signing that does not exist (`schema`), or is not near `at` (`stale_time`).
+
+    Args:
+      created: as documents write it.
+      at: the board's time.
+      age_days: the age of the oldest accepted signature.
+    """
     try:
         moment = datetime.datetime.fromisoformat(created)
     except ValueError:

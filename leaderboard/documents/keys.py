@@ -26,7 +26,7 @@ from sme_registry.io import require_packages
 if TYPE_CHECKING:
     from nacl import signing
 
-Purpose = Literal["submission", "withdrawal", "log", "upload"]
+Purpose = Literal["submission", "entry", "ticket", "withdrawal", "log", "upload"]
 PublicKey = Annotated[
     str, Field(pattern=r"^[0-9a-f]{64}$", description="an ed25519 public key, 64 hex digits")
 ]

@@ -12,7 +12,7 @@ import datetime
 import hashlib
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import rfc8785
 from pydantic import BeforeValidator, Field, SerializerFunctionWrapHandler, model_serializer
@@ -138,89 +138,126 @@ class Training(StrictModel):
     hardware: Annotated[str, Field(max_length=200)] = ""
 
 
-class Submission(PlainDocument):
-    """The signed content.
+class Manifest(PlainDocument):
+    """What every track asks of an entrant.
+
+    Attributes:
+      code: a link to the method's code, or null.
+      created: time of signing.
+      statement: notes for readers.
+    """
+
+    schema_version: SchemaVersion = 1
+    method: Method
+    code: _Link | None = None
+    submitter: Submitter
+    created: UtcTime
+    training: Training = Training()
+    statement: _Text = ""
+
+
+class Submission(Manifest):
+    """The signed content of the open track.
 
     Attributes:
       runs: at least one on each instance of the suite.
       runs_started: all runs ever started with this method, by class. Runs that are not listed in
         `runs` score 1 in every metric, so omitting a run helps only if it was worse than that.
-      created: time of signing.
-      code: a link to the method's code, or null.
-      statement: notes for readers.
     """
 
-    schema_version: SchemaVersion = 1
     track: Track = "open"
     suite: SuiteReference
-    method: Method
-    code: _Link | None = None
-    submitter: Submitter
-    created: UtcTime
     runs: Annotated[
         tuple[Run, ...],
         Field(min_length=1, max_length=MAX_ENTRIES, strict=False),
         BeforeValidator(_at_most_entries),
     ]
     runs_started: Annotated[dict[Name, _Count], BeforeValidator(_at_most_entries)]
-    training: Training = Training()
-    statement: _Text = ""
+
+    @model_serializer(mode="wrap")
+    def _in_the_order_of_released_files(
+        self, handler: SerializerFunctionWrapHandler
+    ) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        return {name: plain[name] for name in _ORDER}
 
     def signed(self, key: SigningKey, board: str | None = None) -> SignedSubmission:
-        """This submission, signed with the submitter's key.
+        """This submission, signed as `SignedManifest.sign` says."""
+        return SignedSubmission.sign(self, key, board)
 
-        Args:
-          key: the submitter's.
-          board: the public key of the only board that accepts it; None if it is not known yet.
-        """
-        signature = key.sign("submission", self.digest, board)
-        return SignedSubmission(submission=self, signature=signature, board=board)
+
+_ORDER = (
+    *("schema_version", "track", "suite", "method", "code", "submitter", "created"),
+    *("runs", "runs_started", "training", "statement"),
+)
 
 
 class _Signed(StrictModel):
     """A document with the signature of the submitter's key, for one board or for none.
 
-    `board` is left out of the JSON where it is None, as in boards of rules 1.
-    """
-
-    @model_serializer(mode="wrap")
-    def _omit_no_board(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        if plain["board"] is None:
-            del plain["board"]
-        return plain
-
-
-class SignedSubmission(_Signed):
-    """`submission.json`.
-
     Attributes:
-      submission: the content.
-      signature: of the submitter's key, for this submission and board.
-      board: the public key of the only board that accepts it; None if it is not known yet.
+      signature: of the submitter's key, for this document and board.
+      board: the public key of the only board that accepts it; None if it is not known yet. It is
+        left out of the JSON where it is None, as in boards of rules 1.
     """
 
-    submission: Submission
     signature: Signature
     board: PublicKey | None = None
 
+    @model_serializer(mode="wrap")
+    def _content_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        plain: dict[str, Any] = handler(self)
+        signature, board = plain.pop("signature"), plain.pop("board")
+        return {**plain, "signature": signature, **({} if board is None else {"board": board})}
+
+
+class SignedManifest(_Signed):
+    """A manifest, in the field `KIND`, with its signature.
+
+    Attributes:
+      KIND: the field, and the purpose of the signature.
+      COMMAND: of `sme-leaderboard`, which writes the file.
+    """
+
+    KIND: ClassVar[Literal["submission", "entry", "ticket"]]
+    COMMAND: ClassVar[str]
+
     @classmethod
-    def read(cls, text: bytes) -> SignedSubmission:
-        """Read a submission from the bytes of a file and verify its signature.
+    def sign(cls, content: Manifest, key: SigningKey, board: str | None = None) -> Self:
+        """A manifest, signed with the submitter's key.
+
+        Args:
+          content: of the type that the field has.
+          key: the submitter's.
+          board: the public key of the only board that accepts it; None if it is not known yet.
+        """
+        signature = key.sign(cls.KIND, content.digest, board)
+        fields: dict[str, Any] = {cls.KIND: content, "signature": signature, "board": board}
+        return cls(**fields)
+
+    @classmethod
+    def read(cls, text: bytes) -> Self:
+        """Read a document from the bytes of a file and verify its signature.
 
         Raises:
           Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
         """
-        return Envelope.read(text).open()
+        return Envelope.read(text, cls).open()
+
+    @property
+    def content(self) -> Manifest:
+        """What is signed."""
+        content: Manifest = getattr(self, self.KIND)
+        return content
 
     @property
     def is_valid(self) -> bool:
-        """Whether the submitter's key made the signature, for this submission and board."""
-        key = self.submission.submitter.key
-        return verifies(key, self.signature, "submission", self.id, self.board)
+        """Whether the submitter's key made the signature, for this content and board."""
+        key = self.content.submitter.key
+        return verifies(key, self.signature, self.KIND, self.id, self.board)
 
-    def for_board(self, board: str, key: SigningKey) -> SignedSubmission:
-        """The same submission, signed for a board if it is signed for none.
+    def for_board(self, board: str, key: SigningKey) -> Self:
+        """The same content, signed for a board if it is signed for none.
 
         Args:
           board: the board's public key.
@@ -231,98 +268,114 @@ class SignedSubmission(_Signed):
         """
         if self.board is not None:
             return self
-        if key.public != self.submission.submitter.key:
+        own = self.content.submitter.key
+        if key.public != own:
             raise Rejection(
                 "bad_signature",
-                f"key={key.public[:16]}…: must be the submission's, "
-                f"{self.submission.submitter.key[:16]}…, to sign it for this board. Give that "
-                "key's file (option --key).",
+                f"key={key.public[:16]}…: must be the {self.KIND}'s, {own[:16]}…, to sign it for "
+                "this board. Give that key's file (option --key).",
             )
-        return self.submission.signed(key, board)
+        return self.sign(self.content, key, board)
 
     @property
     def id(self) -> str:
-        """The id of the submission: its digest."""
-        return self.submission.digest
+        """The id of the document: the digest of its content."""
+        return self.content.digest
 
     def to_bytes(self) -> bytes:
         """The bytes of the file."""
         return to_json(self.to_dict()).encode()
 
 
+_SignedKind = TypeVar("_SignedKind", bound=SignedManifest)
+
+
+class SignedSubmission(SignedManifest):
+    """`submission.json`."""
+
+    KIND = "submission"
+    COMMAND = "new"
+
+    submission: Submission
+
+
 @dataclass(frozen=True)
-class Envelope:
-    """A submission whose signature is verified, and whose content is not validated yet.
+class Envelope(Generic[_SignedKind]):
+    """A signed manifest whose signature is verified, and whose content is not validated yet.
 
     Anyone can send a document, so what costs time, and answers at length, follows the signature.
 
     Attributes:
-      id: of the submission: the digest of the content's canonical JSON.
+      id: the digest of the content's canonical JSON.
       key: the submitter's public key, which made the signature.
       board: the public key of the board that the signature is for; None if it is for none.
       plain: the whole document.
+      kind: its type.
     """
 
     id: str
     key: str
     board: str | None
     plain: dict[str, Any]
+    kind: type[_SignedKind]
 
     @classmethod
-    def read(cls, text: bytes) -> Envelope:
+    def read(cls, text: bytes, kind: type[_SignedKind]) -> Envelope[_SignedKind]:
         """Parse the bytes of a file and verify the signature.
 
         Raises:
           Rejection: `too_large`, `not_json`, `schema` or `bad_signature`.
         """
-        plain = _parse(text, FILE, "List fewer runs, or shorten the texts.")
+        plain = _parse(text, f"{kind.KIND}.json", "List fewer runs, or shorten the texts.")
         if isinstance(plain, dict) and "signature" not in plain:
             raise Rejection(
-                "bad_signature", "signature: missing. Sign it with `sme-leaderboard new --key`."
+                "bad_signature",
+                f"signature: missing. Sign it with `sme-leaderboard {kind.COMMAND} --key`.",
             )
-        content, key, signature, board = _parts(plain)
-        id = _raw_digest(content)
-        if not verifies(key, signature, "submission", id, board):
+        content, key, signature, board = _parts(plain, kind)
+        id = _raw_digest(content, f"{kind.KIND}.json")
+        if not verifies(key, signature, kind.KIND, id, board):
             raise Rejection(
                 "bad_signature",
-                f"signature={signature[:16]}…: invalid for this submission, its board and the key "
+                f"signature={signature[:16]}…: invalid for this {kind.KIND}, its board and the key "
                 f"{key[:16]}…. Sign it again after the last change.",
             )
-        return cls(id, key, board, plain)
+        return cls(id, key, board, plain, kind)
 
-    def open(self) -> SignedSubmission:
+    def open(self) -> _SignedKind:
         """The validated document.
 
         Raises:
           Rejection: `schema`.
         """
-        signed = _validate(SignedSubmission, self.plain, FILE)
+        name = self.kind.KIND
+        signed = _validate(self.kind, self.plain, f"{name}.json")
         if signed.id != self.id:
             raise Rejection(
                 "schema",
-                f"{FILE}: the signature must cover every field of the submission, those at their "
-                "defaults included. Create it with `sme-leaderboard new`.",
+                f"{name}.json: the signature must cover every field of the {name}, those at their "
+                f"defaults included. Create it with `sme-leaderboard {self.kind.COMMAND}`.",
             )
         return signed
 
 
-def _parts(plain: Any) -> tuple[dict[str, Any], str, str, str | None]:
+def _parts(plain: Any, kind: type[SignedManifest]) -> tuple[dict[str, Any], str, str, str | None]:
     """Content, public key, signature and board of a document that nothing has validated."""
     match plain:
-        case {
-            "submission": {"submitter": {"key": str(key)}} as content,
-            "signature": str(signature),
-            **others,
-        }:
+        case {"signature": str(signature), **others}:
+            content: Any = others.pop(kind.KIND, None)
             board: Any = others.pop("board", None)
-            keys = [key] if board is None else [key, board]
-            if not others and _is_hex(signature, 128) and all(_is_hex(each, 64) for each in keys):
-                return content, key, signature, board
+            match content:
+                case {"submitter": {"key": str(key)}}:
+                    keys = [key] if board is None else [key, board]
+                    digits = _is_hex(signature, 128) and all(_is_hex(each, 64) for each in keys)
+                    if digits and not others:
+                        return content, key, signature, board
     raise Rejection(
         "schema",
-        f"{FILE}: must have the fields submission, with the key of its submitter, signature, and "
-        "board unless it is signed for none: keys of 64 and a signature of 128 hex digits. Create "
-        "it with `sme-leaderboard new`.",
+        f"{kind.KIND}.json: must have the fields {kind.KIND}, with the key of its submitter, "
+        "signature, and board unless it is signed for none: keys of 64 and a signature of 128 hex "
+        f"digits. Create it with `sme-leaderboard {kind.COMMAND}`.",
     )
 
 
@@ -330,18 +383,18 @@ def _is_hex(value: Any, digits: int) -> bool:
     return isinstance(value, str) and re.fullmatch(rf"[0-9a-f]{{{digits}}}", value) is not None
 
 
-def _raw_digest(content: dict[str, Any]) -> str:
+def _raw_digest(content: dict[str, Any], file: str) -> str:
     """The digest of a document's content as it arrived."""
     try:
         return "sha256:" + hashlib.sha256(rfc8785.dumps(content)).hexdigest()
     except RecursionError:
         raise Rejection(
-            "not_json", f"{FILE}: nested too deeply. Valid documents have at most ten levels."
+            "not_json", f"{file}: nested too deeply. Valid documents have at most ten levels."
         ) from None
     except ValueError:  # rfc8785's errors, and those of lone surrogates
         raise Rejection(
             "schema",
-            f"{FILE}: contains a number or a character that JSON cannot exchange (RFC 8785): "
+            f"{file}: contains a number or a character that JSON cannot exchange (RFC 8785): "
             "integers must be in [-(2^53 - 1), 2^53 - 1], and other numbers finite. Correct it.",
         ) from None
 
@@ -356,17 +409,9 @@ class Withdrawal(Document):
 
 
 class SignedWithdrawal(_Signed):
-    """A withdrawal, signed with the key of the submission.
-
-    Attributes:
-      withdrawal: the content.
-      signature: of the key that signed the submission, for this withdrawal and board.
-      board: the public key of the only board that accepts it.
-    """
+    """A withdrawal, signed with the key of the submission."""
 
     withdrawal: Withdrawal
-    signature: Signature
-    board: PublicKey | None = None
 
     @classmethod
     def create(

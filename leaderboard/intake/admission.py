@@ -40,7 +40,7 @@ _verdicts: dict[tuple[str, int, int], tuple[str, str] | None] = {}
 
 def receive(
     store: Store,
-    envelope: Envelope,
+    envelope: Envelope[SignedSubmission],
     refusals: Refusals,
     at: datetime.datetime | None = None,
 ) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import threading
 from collections import Counter
+from typing import Any
 
 from leaderboard.documents.submission import Envelope, utc
 from leaderboard.errors import Rejection
@@ -34,7 +35,7 @@ class Refusals:
         self._counts: Counter[str] = Counter()
         self._final: dict[str, Rejection] = {}
 
-    def add(self, envelope: Envelope, rejection: Rejection, at: datetime.datetime) -> None:
+    def add(self, envelope: Envelope[Any], rejection: Rejection, at: datetime.datetime) -> None:
         """Remember the refusal of a submission at a time."""
         if rejection.code in _UNCOUNTED:
             return

@@ -81,21 +81,25 @@ def result_of(
     """
     counted = [*runs, *unlisted]
     groups = groups_of(board, counted)
-    scores = _scores(board, groups, submission)
+    if board.rules == 1:
+        scores = method_scores(groups, board.draws, submission, arrange=np.array)
+    else:
+        seed = f"{board.suite.digest}\n{board.protocol.digest}"
+        scores = method_scores(groups, board.draws, seed)
     return Result(
         submission=submission,
         suite=board.suite.digest,
         protocol=board.protocol.digest,
         status="scored",
         scores=scores,
-        classes=tuple(_class_score(name, members) for name, members in groups.items()),
+        classes=tuple(class_score(name, members) for name, members in groups.items()),
         runs=tuple(counted if board.rules == 1 else runs),
         enough_runs=all(
             len(group) >= board.runs_on_each(len(members))
             for members in groups.values()
             for group in members.values()
         ),
-        oracle_like=_oracle_like(scores, board.rules, runs),
+        oracle_like=is_oracle_like(scores, board.rules, runs),
         versions=versions,
         isolation=isolation,
     )
@@ -118,7 +122,9 @@ def never_listed(board: BoardDocument, submission: Submission) -> list[RunScore]
         for _ in range(submission.runs_started[member.name] - sum(counts.values())):
             fewest = min(counts, key=lambda digest: counts[digest])
             counts[fewest] += 1
-            runs.append(failed_run(board, member.name, None if board.rules == 1 else fewest))
+            runs.append(
+                failed_run(board.protocol, member.name, None if board.rules == 1 else fewest)
+            )
     return runs
 
 
@@ -154,7 +160,8 @@ def class_mean(
     return mean([iqm([values(run) for run in group]) for group in members.values()])
 
 
-def _class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
+def class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
+    """The scores of a class from its runs by group."""
     runs = [run for group in members.values() for run in group]
     wd, ood = class_mean(members, lambda run: (run.wd_regret, run.ood_regret)).tolist()
     return ClassScore(
@@ -167,8 +174,25 @@ def _class_score(name: str, members: dict[str, list[RunScore]]) -> ClassScore:
     )
 
 
-def _scores(board: BoardDocument, groups: Groups, submission: str) -> Scores:
-    """θ of each metric and each region, with intervals."""
+def _sorted(columns: list[list[float]]) -> Array:
+    return np.sort(columns, axis=0)
+
+
+def method_scores(
+    groups: Groups,
+    draws: int,
+    seed: str,
+    *,
+    arrange: Callable[[list[list[float]]], Array] = _sorted,
+) -> Scores:
+    """θ of each metric and each region, with intervals.
+
+    Args:
+      groups: the runs by class, and in each class by group.
+      draws: number of bootstrap resamples.
+      seed: of the bootstrap.
+      arrange: makes an array of the runs' columns; by rules 1 they are not sorted.
+    """
     strata: dict[str, Array] = {}
     statistics: dict[str, Statistic] = {}
     weights: dict[str, float] = {}
@@ -176,11 +200,10 @@ def _scores(board: BoardDocument, groups: Groups, submission: str) -> Scores:
         columns = [
             [*(getattr(run, metric) for metric in METRICS), *run.normalised_regret] for run in runs
         ]
-        strata[name] = np.array(columns) if board.rules == 1 else np.sort(columns, axis=0)
+        strata[name] = arrange(columns)
         statistics[name], weights[name] = statistic, weight
-    seed = submission if board.rules == 1 else f"{board.suite.digest}\n{board.protocol.digest}"
     value = aggregate(strata, statistics, weights)
-    low, high = stratified_bootstrap(strata, board.draws, seed, statistics, weights)
+    low, high = stratified_bootstrap(strata, draws, seed, statistics, weights)
     # Regret is never negative, so a lower end below 0 carries no information.
     signed = [name in _SIGNED for name in METRICS] + [False] * (len(value) - len(METRICS))
     low = np.where(signed, low, np.maximum(low, 0.0))
@@ -208,7 +231,7 @@ def _strata(groups: Groups) -> Iterator[tuple[str, list[RunScore], Statistic, fl
             yield name, singles, mean, len(singles) / len(members)
 
 
-def _oracle_like(scores: Scores, rules: int, runs: Sequence[RunScore] = ()) -> bool:
+def is_oracle_like(scores: Scores, rules: int, runs: Sequence[RunScore] = ()) -> bool:
     """Whether the method, or by rules 2 any of its runs, acts nearly as π* does.
 
     A method that is π* on some instances only need have no small mean.

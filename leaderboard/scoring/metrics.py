@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS, RunScore
+from sme_registry.spec import EvaluationProtocol
 
 
 def run_metrics(
@@ -43,18 +43,18 @@ def run_metrics(
     }
 
 
-def levels_of(board: BoardDocument) -> tuple[float, ...]:
+def levels_of(protocol: EvaluationProtocol) -> tuple[float, ...]:
     """ε_m of each region's outer face; 0 for WD."""
-    return tuple(high for _, high in board.protocol.edges)
+    return tuple(high for _, high in protocol.edges)
 
 
-def failed_run(board: BoardDocument, class_name: str, spec: str | None) -> RunScore:
+def failed_run(protocol: EvaluationProtocol, class_name: str, spec: str | None) -> RunScore:
     """A run without a policy: 1 in every region and every metric.
 
     `spec` is the digest of the instance, None if the run is not listed.
     """
-    regrets = (1.0,) * len(board.protocol.edges)
-    metrics: dict[str, Any] = {**run_metrics(regrets, None, levels_of(board))}
+    regrets = (1.0,) * len(protocol.edges)
+    metrics: dict[str, Any] = {**run_metrics(regrets, None, levels_of(protocol))}
     return RunScore(
         spec=spec,
         class_name=class_name,

@@ -134,7 +134,7 @@ def _score_runs(
     for index, run in enumerate(submission.runs):
         class_name, spec = instances[run.spec]
         if run.artefact is None:
-            runs.append(failed_run(board, class_name, run.spec))
+            runs.append(failed_run(board.protocol, class_name, run.spec))
             continue
 
         def advanced(done: int, _: int, before: int = states * evaluated) -> None:
@@ -299,7 +299,7 @@ def _run_score(
 ) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
-    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(board))}
+    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(board.protocol))}
     return RunScore(
         spec=report.spec_digest,
         class_name=class_name,

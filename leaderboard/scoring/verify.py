@@ -375,7 +375,7 @@ def _check_runs(store: Store, result: Result) -> None:
         if score is None:
             matches = False
         elif run.artefact is None:
-            matches = score == failed_run(document, instances[run.spec][0], run.spec)
+            matches = score == failed_run(document.protocol, instances[run.spec][0], run.spec)
         else:
             class_name, spec = instances[run.spec]
             digest = run.artefact.sha256
@@ -400,7 +400,7 @@ def _check_scores(store: Store, result: Result) -> None:
     submission = store.submission(result.submission).submission
     for number, run in enumerate(result.runs):
         for name, value in run_metrics(
-            run.normalised_regret, run.similarity, levels_of(document)
+            run.normalised_regret, run.similarity, levels_of(document.protocol)
         ).items():
             if not _close(value, getattr(run, name), EXACT):
                 _refuse_result(

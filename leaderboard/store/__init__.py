@@ -7,11 +7,13 @@ next one continues from the state it leaves.
 
 from leaderboard.store.files import digest_of, read_document
 from leaderboard.store.garbage import Garbage, collect_garbage, make_room
-from leaderboard.store.index import EntryRow, Index, IndexUnusable
+from leaderboard.store.index import Index, IndexUnusable
 from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
+from leaderboard.store.rows import EntryRow
+from leaderboard.store.seasons import SealedRow, SeasonRow
 from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [
@@ -28,6 +30,8 @@ __all__ = [
     "LogEntry",
     "Objects",
     "Queue",
+    "SealedRow",
+    "SeasonRow",
     "Store",
     "collect_garbage",
     "digest_of",

@@ -145,16 +145,11 @@ class Database:
                 self._refresh()
             yield self._connected
 
-    def record(self, event: Event, subject: str, document: StrictModel) -> None:
+    def record(self, event: Event, subject: str, document: StrictModel, path: Path) -> None:
         """Write a document's file, its log entry and its rows; call it in a transaction."""
         key = self.signing_key()
         index = self._connected
-        paths = {
-            "received": self.folder.submission,
-            "result": self.folder.result,
-            "withdrawn": self.folder.withdrawal,
-        }
-        write_document(paths[event](subject), document)
+        write_document(path, document)
         index.apply(self._log.append(key, index.head, event, subject, digest_of(document)))
 
     def signing_key(self) -> SigningKey:

@@ -1,16 +1,15 @@
 """`index.sqlite`: the tables behind pages, ranking and queue, derived from log and documents.
 
-The tables `head`, `entry`, `run`, `object` and `artefact` are a function of the log alone, so a
-rebuilt index equals one that grew. `lease`, `turn` and `upload` are temporary state: the claims of
-scorers and the faults that ended them, the scoring time of each key, and artefacts that no
-submission names yet.
+The tables `head`, `entry`, `run`, `object` and `artefact`, and those of `seasons`, are a function
+of the log alone, so a rebuilt index equals one that grew. `lease`, `turn` and `upload` are
+temporary state: the claims of scorers and the faults that ended them, the scoring time of each
+key, and artefacts that no submission names yet.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import os
 import shutil
 import sqlite3
@@ -19,20 +18,19 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from leaderboard.documents.board import BoardDocument, Folder
-from leaderboard.documents.result import METRICS, Estimate, Result, Scores
+from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal
 from leaderboard.errors import TamperedError
-from leaderboard.store import likeness
+from leaderboard.store import likeness, seasons
 from leaderboard.store.files import BUSY_SECONDS, digest_of, read_document
 from leaderboard.store.likeness import Likeness
 from leaderboard.store.log import EMPTY, Head, LogEntry
-
-Status = Literal["waiting", "scored", "rejected", "withdrawn"]
+from leaderboard.store.rows import EntryRow, Status, name_object, scores_of, scores_text
 
 DERIVED = {  # tables and their keys
     "head": "zero",
@@ -40,6 +38,7 @@ DERIVED = {  # tables and their keys
     "run": "position",
     "object": "digest",
     "artefact": "digest || submission",
+    **seasons.DERIVED,
 }
 
 SCHEMA = f"""
@@ -60,7 +59,8 @@ CREATE TABLE entry (
 CREATE INDEX entry_waiting ON entry (sequence) WHERE status = 'waiting';
 CREATE INDEX entry_of_key ON entry (key, received);
 CREATE INDEX entry_bytes ON entry (bytes);
-CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{likeness.SCHEMA}CREATE TABLE object (
+CREATE UNIQUE INDEX entry_sequence ON entry (sequence);{likeness.SCHEMA}{seasons.SCHEMA}
+CREATE TABLE object (
   digest TEXT PRIMARY KEY, size INTEGER NOT NULL, key TEXT NOT NULL, received TEXT NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX object_of_key ON object (key, received);
@@ -90,79 +90,6 @@ class IndexUnusable(Exception):
     """The index is missing, broken, or of another schema or log: rebuild it."""
 
 
-@dataclass(frozen=True)
-class EntryRow:
-    """One submission, as pages and ranking need it.
-
-    Attributes:
-      id: the submission's digest.
-      sequence: number of the log entry that received it, and so the order of submission.
-      received: time of that entry.
-      status: a "withdrawn" one may have scores.
-      code: of its rejection; empty if it was not rejected.
-      runs: number of runs listed in the submission, failed ones included.
-      steps: environment steps of all runs.
-      reference: whether it is one of the board's own rows, "optimal" and "constant".
-      scores: None if it was not scored.
-      policies: number of runs with a policy.
-      alike: earlier submissions with policies like this one's, the board's own rows excluded; empty
-        before scoring and on boards of rules 1.
-      faults: how often a fault has ended its scoring while it waits, for example a killed scorer
-        or a full disk; 0 in a read-only store, which does not know.
-      fault: the last of them; empty if there is none.
-    """
-
-    id: str
-    sequence: int
-    received: str
-    status: Status
-    code: str
-    method: str
-    version: str
-    family: str
-    knowledge: str
-    submitter: str
-    key: str
-    code_link: str | None
-    runs: int
-    steps: int
-    enough_runs: bool
-    oracle_like: bool
-    reference: bool
-    scores: Scores | None
-    policies: int = 0
-    alike: tuple[Likeness, ...] = ()
-    faults: int = 0
-    fault: str = ""
-
-    @property
-    def copy_of(self) -> tuple[Likeness, ...]:
-        """Earlier submissions of other keys, the one with the most runs first."""
-        others = (each for each in self.alike if each.key != self.key)
-        return tuple(sorted(others, key=lambda each: -each.runs))
-
-    @property
-    def copied_runs(self) -> int:
-        """Number of runs that behave like runs of earlier submissions of other keys."""
-        return sum(each.runs for each in self.copy_of)
-
-    @property
-    def is_copy(self) -> bool:
-        """Whether at least half of its policies are copied, and so it has no rank."""
-        return self.copied_runs > 0 and 2 * self.copied_runs >= self.policies
-
-    @property
-    def origin(self) -> str:
-        """The id of the submission that first had at least half of its policies; mostly its own."""
-        first = max(self.alike, key=lambda each: each.runs, default=None)
-        return self.id if first is None or 2 * first.runs < self.policies else first.id
-
-    @property
-    def steps_per_run(self) -> int:
-        """Mean environment steps of the listed runs, rounded."""
-        return round(self.steps / max(1, self.runs))
-
-
 _COLUMNS = tuple(field.name for field in fields(EntryRow) if field.name != "alike")
 _OF_LEASE = {"faults": "coalesce(faults, 0)", "fault": "coalesce(fault, '')"}
 _ROW = ", ".join(_OF_LEASE.get(name, f"entry.{name}") for name in _COLUMNS)
@@ -180,6 +107,7 @@ class Index:
         self.document = document
         self._board = document.digest
         self._runs = likeness.Runs(connection)
+        self.seasons = seasons.Seasons(connection, folder)
 
     @classmethod
     def open(
@@ -270,6 +198,8 @@ class Index:
                 self._result(entry)
             case "withdrawn":
                 self._withdrawn(entry)
+            case _:
+                self.seasons.apply(entry)
         self.connection.execute(
             "REPLACE INTO head VALUES (0, ?, ?, ?, ?)",
             (self._board, entry.sequence, entry.digest, entry.time),
@@ -277,10 +207,10 @@ class Index:
 
     def _received(self, entry: LogEntry) -> None:
         if self.one("SELECT 1 FROM entry WHERE id = ?", entry.subject) is not None:
-            raise _contradiction(entry, "receives a submission twice")
+            raise entry.contradiction("receives a submission twice")
         path = self.folder.submission(entry.subject)
         submission = read_document(self.folder, path, SignedSubmission, entry.document).submission
-        _check_subject(entry, submission.digest)
+        entry.check_subject(submission.digest)
         method, submitter = submission.method, submission.submitter
         values = {
             "id": entry.subject,
@@ -305,32 +235,26 @@ class Index:
         )
         for run in submission.runs:
             if run.artefact is not None:
-                self.connection.execute(
-                    "INSERT OR IGNORE INTO object VALUES (?, ?, ?, ?)",
-                    (run.artefact.sha256, run.artefact.size, submitter.key, entry.time),
-                )
-                self.connection.execute(
-                    "DELETE FROM upload WHERE digest = ? AND key IN (?, '')",
-                    (run.artefact.sha256, submitter.key),
-                )
+                digest, size = run.artefact.sha256, run.artefact.size
+                name_object(self.connection, digest, size, submitter.key, entry.time)
                 self.connection.execute(
                     "INSERT OR IGNORE INTO artefact VALUES (?, ?)",
-                    (run.artefact.sha256, entry.subject),
+                    (digest, entry.subject),
                 )
 
     def _result(self, entry: LogEntry) -> None:
         if self.status(entry.subject) != "waiting":
-            raise _contradiction(entry, "the submission was not waiting for a result")
+            raise entry.contradiction("the submission was not waiting for a result")
         path = self.folder.result(entry.subject)
         result = read_document(self.folder, path, Result, entry.document)
-        _check_subject(entry, result.submission)
+        entry.check_subject(result.submission)
         self.connection.execute(
             "UPDATE entry SET result = ?, status = ?, code = ?, enough_runs = ?, oracle_like = ?, "
             "scores = ?, bytes = bytes + ? WHERE id = ?",
             (
                 *(entry.document, result.status, result.code),
                 *(result.enough_runs, result.oracle_like),
-                None if result.scores is None else _scores_text(result.scores),
+                None if result.scores is None else scores_text(result.scores),
                 path.stat().st_size,
                 entry.subject,
             ),
@@ -344,10 +268,10 @@ class Index:
 
     def _withdrawn(self, entry: LogEntry) -> None:
         if self.status(entry.subject) in (None, "withdrawn"):
-            raise _contradiction(entry, "the submission is unknown or already withdrawn")
+            raise entry.contradiction("the submission is unknown or already withdrawn")
         path = self.folder.withdrawal(entry.subject)
         signed = read_document(self.folder, path, SignedWithdrawal, entry.document)
-        _check_subject(entry, signed.withdrawal.submission)
+        entry.check_subject(signed.withdrawal.submission)
         self.connection.execute(
             "UPDATE entry SET status = 'withdrawn', withdrawal = ?, bytes = bytes + ? WHERE id = ?",
             (entry.document, path.stat().st_size, entry.subject),
@@ -472,38 +396,11 @@ def _schema() -> list[tuple[Any, ...]]:
         return _schema_of(connection)
 
 
-def _contradiction(entry: LogEntry, message: str) -> TamperedError:
-    return TamperedError(f"log/{entry.sequence:08d}.json", f"event={entry.event}: {message}")
-
-
-def _check_subject(entry: LogEntry, submission: str) -> None:
-    if submission != entry.subject:
-        raise _contradiction(entry, "names a document of another submission")
-
-
-def _scores_text(scores: Scores) -> str:
-    """Scores as lists of numbers without names, because rankings read thousands of them."""
-    estimates = [getattr(scores, metric) for metric in METRICS] + list(scores.normalised_regret)
-    return json.dumps([[each.value, each.low, each.high] for each in estimates])
-
-
-@functools.lru_cache(maxsize=4096)  # frozen, and read again whenever the log grows
-def _scores(text: str) -> Scores:
-    """The inverse of `_scores_text`; not validated, because a valid `Result` was written."""
-    estimates = [
-        Estimate.model_construct(value=value, low=low, high=high)
-        for value, low, high in json.loads(text)
-    ]
-    count = len(METRICS)
-    named = dict(zip(METRICS, estimates[:count], strict=True))
-    return Scores.model_construct(None, **named, normalised_regret=tuple(estimates[count:]))
-
-
 def _entry_row(row: tuple[Any, ...], alike: dict[str, tuple[Likeness, ...]]) -> EntryRow:
     values = dict(zip(_COLUMNS, row, strict=True))
     values["alike"] = alike.get(values["id"], ())
     for name in ("enough_runs", "oracle_like", "reference"):
         values[name] = bool(values[name])
     if values["scores"] is not None:
-        values["scores"] = _scores(values["scores"])
+        values["scores"] = scores_of(values["scores"])
     return EntryRow(**values)

@@ -24,7 +24,10 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.store.files import MAX_LOG_ENTRY_BYTES, read_document, write_document
 from sme_registry.spec import Digest, Integer, SchemaVersion
 
-Event = Literal["opened", "received", "result", "withdrawn"]
+SealedEvent = Literal["season", "entry", "ticket", "ended", "ranked", "revealed"]
+"""Of a season: announced, an entry, a ticket started, their results, the master published."""
+
+Event = Literal["opened", "received", "result", "withdrawn"] | SealedEvent
 NOTHING = "sha256:" + "0" * 64
 LONGEST_PAUSE = datetime.timedelta(days=3653)
 """Between two entries: ten years; a clock that shows more is wrong."""
@@ -52,10 +55,12 @@ class LogEntry(PlainDocument):
       sequence: its number, 0 for the first.
       previous: digest of the entry before; 64 zeros for the first.
       time: of the event by the board's clock, which may have been set back since the entry before.
-      event: "opened" (once, the first), "received", "result" or "withdrawn".
-      subject: the submission's id; for "opened" the board document's digest.
-      document: SHA-256 of the file written: the signed submission, the result, the signed
-        withdrawal, or board.json.
+      event: "opened" (once, the first), "received", "result" or "withdrawn"; or of a season, see
+        `SealedEvent`.
+      subject: the submission's id, or that of a sealed entry or ticket; for "opened" the board
+        document's digest, for "season" and "revealed" the season's.
+      document: SHA-256 of the file written: the signed submission, entry or request for a ticket,
+        a result, the signed withdrawal, board.json, season.json or reveal.json.
       signature: by the board's key.
     """
 
@@ -85,6 +90,15 @@ class LogEntry(PlainDocument):
     def head(self) -> Head:
         """This entry as the one that the next entry must follow."""
         return Head(self.sequence, self.digest, self.time)
+
+    def contradiction(self, message: str) -> TamperedError:
+        """The error to raise where this entry contradicts those before it."""
+        return TamperedError(f"log/{self.sequence:08d}.json", f"event={self.event}: {message}")
+
+    def check_subject(self, id: str) -> None:
+        """Raise `TamperedError` if its document is of another subject."""
+        if id != self.subject:
+            raise self.contradiction("names a document of another subject")
 
 
 class Log:

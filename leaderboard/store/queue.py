@@ -193,7 +193,8 @@ class Queue:
             if not _is_current(index, claim):
                 return False
             _end(index, claim.id, _uptime())
-            self._database.record("result", claim.id, result)
+            path = self._database.folder.result(claim.id)
+            self._database.record("result", claim.id, result, path)
         return True
 
     def waiting(self) -> int:

@@ -13,11 +13,11 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Result
 from leaderboard.documents.submission import SignedSubmission, SignedWithdrawal, now
 from leaderboard.errors import BoardError, Rejection
-from leaderboard.store.database import Database
 from leaderboard.store.files import digest_of, read_document, write_document
-from leaderboard.store.index import EntryRow
 from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.queue import Queue
+from leaderboard.store.rows import EntryRow
+from leaderboard.store.sealed import SealedStore
 from sme_registry.io import build_folder
 from sme_registry.spec import EvaluationProtocol, StrictModel, Suite
 
@@ -25,7 +25,7 @@ LAST_TIME = "9999-12-31T23:59:59Z"
 _Model = TypeVar("_Model", bound=StrictModel)
 
 
-class Store(Database):
+class Store(SealedStore):
     """A board's folder, opened by `create` or `open`; a context manager.
 
     Attributes:
@@ -173,6 +173,8 @@ class Store(Database):
                 index.one(
                     "SELECT 1 FROM upload WHERE digest = ?1 AND key = ?2 UNION "
                     "SELECT 1 FROM artefact JOIN entry ON id = submission "
+                    "WHERE digest = ?1 AND key = ?2 UNION "
+                    "SELECT 1 FROM answer JOIN sealed ON id = entry "
                     "WHERE digest = ?1 AND key = ?2",
                     *(digest, key),
                 )
@@ -182,12 +184,14 @@ class Store(Database):
     def holder_of_name(self, name: str) -> str | None:
         """The key that was first to use a submitter's name, or one that looks like it.
 
-        A name is used by an entry that waits or has had scores: otherwise, policies that are
-        rejected would be enough to occupy names.
+        A name is used by an entry that waits or has had scores, and by every entrant of a season:
+        otherwise, policies that are rejected would be enough to occupy names.
         """
         with self.reading() as index:
             rows = index.connection.execute(
-                "SELECT submitter, key FROM entry WHERE status = 'waiting' OR scores IS NOT NULL "
+                "SELECT submitter, key FROM (SELECT submitter, key, sequence FROM entry "
+                "WHERE status = 'waiting' OR scores IS NOT NULL "
+                "UNION ALL SELECT submitter, key, sequence FROM sealed) "
                 "GROUP BY submitter, key ORDER BY min(sequence)"
             )
             alike = skeleton(name)
@@ -205,7 +209,7 @@ class Store(Database):
         with self.transaction() as index:
             if index.status(signed.id) is not None:
                 return False
-            self.record("received", signed.id, signed)
+            self.record("received", signed.id, signed, self.folder.submission(signed.id))
         return True
 
     def withdraw(self, signed: SignedWithdrawal) -> bool:
@@ -234,7 +238,8 @@ class Store(Database):
                 )
             if index.status(withdrawal.submission) == "withdrawn":
                 return False
-            self.record("withdrawn", withdrawal.submission, signed)
+            path = self.folder.withdrawal(withdrawal.submission)
+            self.record("withdrawn", withdrawal.submission, signed, path)
         return True
 
     def submission(self, id: str) -> SignedSubmission:
@@ -305,6 +310,8 @@ class Store(Database):
                 "(SELECT coalesce(sum(size), 0) FROM upload "
                 "WHERE key = ?1 AND time > ?2 AND time <= ?3) + "
                 "(SELECT coalesce(sum(bytes), 0) FROM entry "
+                "WHERE key = ?1 AND received > ?2 AND received <= ?3) + "
+                "(SELECT coalesce(sum(bytes), 0) FROM sealed "
                 "WHERE key = ?1 AND received > ?2 AND received <= ?3)",
                 *(key, since, until),
             )
@@ -316,6 +323,7 @@ class Store(Database):
                 "SELECT (SELECT coalesce(sum(size), 0) FROM "
                 "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload))"
                 " + (SELECT coalesce(sum(bytes), 0) FROM entry)"
+                " + (SELECT coalesce(sum(bytes), 0) FROM sealed)"
             )
 
     def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:
@@ -332,12 +340,14 @@ class Store(Database):
         """Whether an artefact belongs to a reference row, or to a submission that was scored.
 
         Others are not published: who could download a policy that waits to be scored could submit
-        it under another key, as if it were the first.
+        it under another key, as if it were the first. Answers are public once they are scored, too.
         """
         with self.reading() as index:
             row = index.one(
                 "SELECT 1 FROM artefact JOIN entry ON id = submission "
-                "WHERE digest = ? AND (reference OR scores IS NOT NULL) LIMIT 1",
+                "WHERE digest = ?1 AND (reference OR scores IS NOT NULL) UNION "
+                "SELECT 1 FROM answer JOIN sealed ON id = entry "
+                "WHERE digest = ?1 AND scores IS NOT NULL LIMIT 1",
                 digest,
             )
         return row is not None

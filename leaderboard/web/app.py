@@ -34,7 +34,7 @@ from leaderboard import exports, intake
 from leaderboard.artefact.isolation import Isolation, available_isolation
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.result import Metric
-from leaderboard.documents.submission import Envelope, SignedWithdrawal
+from leaderboard.documents.submission import Envelope, SignedSubmission, SignedWithdrawal
 from leaderboard.errors import BoardError, Rejection, ScoringFault
 from leaderboard.public_view import public_view
 from leaderboard.scoring import ranking
@@ -202,7 +202,7 @@ class _Routes:
         text = await limits.read_document(request, "submission")
 
         # Garbage without a valid signature never waits with submissions, whose check is longer.
-        envelope = await self._documents.run(lambda: Envelope.read(text))
+        envelope = await self._documents.run(lambda: Envelope.read(text, SignedSubmission))
         id = envelope.id
         new = await self._admissions.run(
             lambda: intake.receive(self._store, envelope, self._refusals), envelope.key

@@ -207,8 +207,8 @@ def test_two_keys_that_send_a_name_at_once_do_not_share_it(
 # Refusals.
 
 
-def envelope(signed: SignedSubmission) -> Envelope:
-    return Envelope.read(signed.to_bytes())
+def envelope(signed: SignedSubmission) -> Envelope[SignedSubmission]:
+    return Envelope.read(signed.to_bytes(), SignedSubmission)
 
 
 def test_refused_submissions_count_for_their_key(tmp_path: Path, key: SigningKey) -> None:

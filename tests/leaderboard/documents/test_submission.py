@@ -128,7 +128,7 @@ def test_a_content_nested_as_deeply_as_the_parser_allows_is_refused() -> None:
 
 
 def test_the_id_is_known_before_the_content_is_validated() -> None:
-    envelope = Envelope.read(text(PLAIN))
+    envelope = Envelope.read(text(PLAIN), SignedSubmission)
     assert (envelope.key, envelope.board) == (KEY.public, BOARD)
     assert envelope.open().id == envelope.id
     assert envelope.open().to_bytes() == SignedSubmission.read(text(PLAIN)).to_bytes()

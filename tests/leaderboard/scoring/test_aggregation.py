@@ -49,7 +49,7 @@ Regrets = dict[str, list[float | None]]
 
 def run(spec: str, regret: float | Sequence[float] | None) -> RunScore:
     if regret is None:
-        return failed_run(BOARD, CLASS_OF[spec], spec)
+        return failed_run(BOARD.protocol, CLASS_OF[spec], spec)
     if isinstance(regret, float):
         regret = [regret + 0.1 * level for level in LEVELS]
     similarity = tuple(1.0 - 0.25 * N for N in regret)
@@ -212,7 +212,7 @@ def test_giving_up_an_instance_costs_what_was_learned_there(
 ) -> None:
     board = BOARD.model_copy(update={"draws": 100})
     rest = flat({other: values for other, values in regrets.items() if other != spec})
-    failed = [failed_run(board, CLASS_OF[spec], spec)] * failures
+    failed = [failed_run(board.protocol, CLASS_OF[spec], spec)] * failures
     honest, gave_up = (
         result_of(board, ID, [*rest, *own], {}) for own in (flat({spec: regrets[spec]}), failed)
     )
@@ -250,7 +250,7 @@ def test_omitting_the_runs_with_the_largest_decay_improves_no_metric() -> None:
         run(spec, [0.2 + slope * level for level in LEVELS]) for spec in SPECS for slope in slopes
     ]
     withheld = [
-        each if each.regret_slope < 0.45 else failed_run(BOARD, each.class_name, each.spec)
+        each if each.regret_slope < 0.45 else failed_run(BOARD.protocol, each.class_name, each.spec)
         for each in runs
     ]
     honest, chosen = (result_of(BOARD, ID, each, {}) for each in (runs, withheld))
@@ -376,7 +376,7 @@ def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside
 def test_one_oracle_like_run_marks_a_method() -> None:
     level = Estimate(value=0.4, low=0.4, high=0.4)
     scores = Scores(**dict.fromkeys(METRICS, level), normalised_regret=(level, level))
-    run = failed_run(BOARD, "two", None)
+    run = failed_run(BOARD.protocol, "two", None)
     near = run.model_copy(update={"wd_regret": 0.005})
 
     assert not _oracle_like(scores, 2, [run])

@@ -91,7 +91,7 @@ def moved(board: Path, by: float) -> Callable[[Result], Result]:
     def change(result: Result) -> Result:
         run = result.runs[0]
         regret = tuple(each + by for each in run.normalised_regret)
-        metrics: dict[str, Any] = run_metrics(regret, run.similarity, levels_of(document))
+        metrics: dict[str, Any] = run_metrics(regret, run.similarity, levels_of(document.protocol))
         run = run.model_copy(update={"normalised_regret": regret, **metrics})
         return result_of(
             document, result.submission, [run], result.versions, isolation=result.isolation

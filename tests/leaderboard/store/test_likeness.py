@@ -71,7 +71,7 @@ class Board:
 def finish(store: Store, result: Result) -> None:
     """Record a result as a scorer does, whatever waits before it."""
     with store.transaction():
-        store.record("result", result.submission, result)
+        store.record("result", result.submission, result, store.folder.result(result.submission))
 
 
 @pytest.fixture

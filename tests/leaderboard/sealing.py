@@ -1,0 +1,99 @@
+"""Seasons so small that scoring takes a moment."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+from typing import Any
+
+from leaderboard.documents.entry import (
+    Entry,
+    SignedEntry,
+    SignedTicketRequest,
+    TicketRequest,
+)
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.documents.season import Season, Terms
+from leaderboard.documents.submission import now, shifted, utc
+from leaderboard.store import Store
+from sme_registry import EvaluationProtocol
+
+MASTER = Master(bytes(range(32)))
+AFTERWARDS = utc(shifted(datetime.datetime.now(datetime.UTC), datetime.timedelta(days=3)))
+"""When tiny seasons, and the deadlines of their tickets, are over."""
+
+SETTING = {"state_dim": 2, "action_dim": 1, "complexity": 5, "hidden_width": 8}
+
+
+def moment(days: float) -> str:
+    """The time so many days from now."""
+    return utc(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days))
+
+
+@functools.cache
+def _open_times() -> tuple[str, str]:
+    return moment(-1), moment(1)
+
+
+def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any) -> Terms:
+    """The terms of an open season of one class, with digests of nothing offline."""
+    online = track == "sealed-online"
+    member: dict[str, Any] = {"name": "deep", "setting": SETTING, "instances": instances}
+    member |= {"budget": 64} if online else {"data": {"nu": 0.5, "transitions": 300}}
+    published = [
+        {"class_name": "deep", "instance": i, "data": NOTHING, "challenge": NOTHING}
+        for i in range(instances)
+    ]
+    opens, closes = _open_times()
+    return Terms.from_dict(
+        {
+            "id": track,
+            "title": "Tiny",
+            "track": track,
+            "classes": [member],
+            "opens": opens,
+            "closes": closes,
+            "protocol_name": "quick-v1",
+            "protocol": EvaluationProtocol(states_per_region=50).to_dict(),
+            "ticket_hours": 24 if online else None,
+            "tickets_per_key": 2 if online else None,
+            "published": [] if online else published,
+            **fields,
+        }
+    )
+
+
+NOTHING = "sha256:" + "0" * 64
+
+
+def tiny_season(track: str = "sealed-offline", **fields: Any) -> Season:
+    """`tiny_terms`, committed to `MASTER`."""
+    return tiny_terms(track, **fields).commit(MASTER)
+
+
+def manifest(season: Season, key: SigningKey, **fields: Any) -> dict[str, Any]:
+    """What entries and requests have in common."""
+    return {
+        "season": season.digest,
+        "method": {"name": "Test", "version": "1", "family": "test", "knowledge": "generic"},
+        "submitter": {"name": f"Tester {key.public[:8]}", "key": key.public},
+        "created": now(),
+        **fields,
+    }
+
+
+def signed_entry(
+    store: Store, season: Season, key: SigningKey, answers: list[Any], **fields: Any
+) -> SignedEntry:
+    """An entry for a board, of answers that need not be on it."""
+    plain = manifest(season, key, answers=answers, **fields)
+    return Entry.from_dict(plain).signed(key, store.document.key)
+
+
+def signed_request(
+    store: Store, season: Season, key: SigningKey, nonce: int = 0, **fields: Any
+) -> SignedTicketRequest:
+    """A request for a ticket of a board."""
+    plain = manifest(season, key, nonce=f"{nonce:064x}", **fields)
+    return TicketRequest.from_dict(plain).signed(key, store.document.key)

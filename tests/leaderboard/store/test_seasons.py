@@ -1,0 +1,257 @@
+"""Seasons on a board: the order of things, what the clock forbids, and an index that follows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.documents.result import SealedResult, Stepping
+from leaderboard.documents.season import Reveal, Season
+from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.sealed import sealed_result
+from leaderboard.store import Store
+from tests.leaderboard.conftest import put_submission, tiny_board
+from tests.leaderboard.sealing import (
+    AFTERWARDS,
+    MASTER,
+    moment,
+    signed_entry,
+    signed_request,
+    tiny_season,
+)
+from tests.leaderboard.store.crashing import crashes_before
+
+ONLINE, OFFLINE = "sealed-online", "sealed-offline"
+ANSWER = {"sha256": "sha256:" + "a" * 64, "size": 512}
+
+
+@pytest.fixture
+def later(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Moves the clock behind the close of tiny seasons."""
+
+    def move() -> None:
+        for module in ("sealed", "log"):
+            monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+
+    return move
+
+
+def failed(season: Season, subject: str) -> SealedResult:
+    """A result of which every run failed."""
+    hidden = list(season.hidden)
+    runs = [failed_run(season.protocol, each.member.name, None) for each in hidden]
+    online = season.track == ONLINE
+    steps = [
+        Stepping(steps=0, normalised_online_regret=1.0, learning_curve=(1.0,))
+        for _ in hidden
+        if online
+    ]
+    return sealed_result(season, subject, runs, {"synthetic": "1"}, 100, steps)
+
+
+def reveal(season: Season, master: Master = MASTER) -> Reveal:
+    return Reveal(season=season.digest, master=master.raw.hex())
+
+
+def play(store: Store, key: SigningKey, move: Any) -> tuple[Season, Season]:
+    """Both kinds of season, from their announcement to their results."""
+    offline, online = tiny_season(OFFLINE), tiny_season(ONLINE)
+    entry = signed_entry(store, offline, key, [ANSWER, None])
+    request = signed_request(store, online, key)
+    put_submission(store, key)
+    assert store.announce(offline)
+    assert store.announce(online)
+    assert store.enter(entry)
+    assert store.start_ticket(request) == 1
+    assert store.end_ticket(online.digest, 1, failed(online, request.id))
+    move()
+    for season in (offline, online):
+        assert store.reveal(reveal(season))
+    assert store.rank(failed(offline, entry.id))
+    return offline, online
+
+
+def derived(store: Store) -> list[object]:
+    with store.reading() as index:
+        return list(index.derived_rows())
+
+
+def test_a_season_is_played_from_its_announcement_to_its_results(store, key, later):
+    offline, online = play(store, key, later)
+    assert [row.id for row in store.seasons()] == [OFFLINE, ONLINE]
+    assert store.season(OFFLINE) == store.season(offline.digest) == offline
+    events = [entry.event for entry in store.log()]
+    assert events == [
+        *("opened", "received", "season", "season", "entry", "ticket", "ended"),
+        *("revealed", "revealed", "ranked"),
+    ]
+    for season in (offline, online):
+        [row] = store.entrants(season.digest)
+        assert row.number == 1
+        assert row.entrant.status == "scored"
+        assert row.entrant.scores is not None
+        assert row.entrant.scores.wd_regret.value == 1.0
+        assert store.sealed_result(row) == failed(season, row.entrant.id)
+        assert store.revealed_master(season.id) == MASTER
+    assert store.entry_of(store.entrants(offline.digest)[0]).is_valid
+    assert store.request_of(store.ticket(online.digest, 1)).is_valid
+
+
+def test_a_rebuilt_index_equals_the_one_that_grew(store, key, later):
+    play(store, key, later)
+    grown = derived(store)
+    assert {row[0] for row in grown} >= {"season", "sealed", "answer"}
+    store.reindex()
+    assert derived(store) == grown
+    with Store.open(store.folder.path, read_only=True) as reader:
+        assert derived(reader) == grown
+
+
+def test_nothing_in_the_index_or_the_log_is_secret_before_the_reveal(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    store.start_ticket(signed_request(store, season, key))
+    secrets = {MASTER.raw.hex(), repr(MASTER.raw)}
+    with store.reading() as index:
+        text = "\n".join(index.connection.iterdump())
+    files = [path.read_text() for path in store.folder.path.rglob("*.json")]
+    for content in (text, *files):
+        assert not any(secret in content for secret in secrets)
+
+
+def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    first = signed_request(store, season, key, 1)
+    assert [store.start_ticket(first) for _ in range(2)] == [1, 1]
+    assert store.start_ticket(signed_request(store, season, key, 2)) == 2
+    with pytest.raises(Rejection, match="ticket_limit"):
+        store.start_ticket(signed_request(store, season, key, 3))
+    other = SigningKey.generate()
+    assert store.start_ticket(signed_request(store, season, other, 3)) == 3
+    result = failed(season, first.id)
+    assert store.end_ticket(season.digest, 1, result)
+    assert not store.end_ticket(season.digest, 1, result)
+    with pytest.raises(ValueError, match="does not match"):
+        store.end_ticket(season.digest, 2, result)
+    with pytest.raises(Rejection, match="ticket_unknown"):
+        store.end_ticket(season.digest, 4, result)
+
+
+@pytest.mark.parametrize("track", [OFFLINE, ONLINE])
+def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monkeypatch):
+    def attempt(season: Season) -> object:
+        if track == OFFLINE:
+            return store.enter(signed_entry(store, season, key, [None, None]))
+        return store.start_ticket(signed_request(store, season, key))
+
+    with pytest.raises(Rejection, match="season_unknown"):
+        attempt(tiny_season(track))
+    coming = tiny_season(track, id="coming", opens=moment(0.5))
+    other = tiny_season(ONLINE if track == OFFLINE else OFFLINE)
+    season = tiny_season(track)
+    for each in (coming, other, season):
+        store.announce(each)
+    with pytest.raises(Rejection, match="season_not_open"):
+        attempt(coming)
+    with pytest.raises(Rejection, match="season_track"):
+        attempt(other)
+    for module in ("sealed", "log"):
+        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    with pytest.raises(Rejection, match="season_closed"):
+        attempt(season)
+    store.announce(tiny_season(track, id="later", opens=AFTERWARDS, closes=moment(9)))
+    monkeypatch.undo()
+    with pytest.raises(Rejection, match="season_closed"):
+        attempt(season)
+
+
+def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, later):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    request = signed_request(store, season, key)
+    store.start_ticket(request)
+    with pytest.raises(Rejection, match="reveal_mismatch"):
+        store.reveal(reveal(season, Master(bytes(32))))
+    with pytest.raises(Rejection, match="season_not_closed: season=sealed-online: closes at"):
+        store.reveal(reveal(season))
+    with pytest.raises(Rejection, match="season_not_closed"):
+        store.revealed_master(season.id)
+    later()
+    with pytest.raises(Rejection, match="1 tickets run, the first of them number 1"):
+        store.reveal(reveal(season))
+    store.end_ticket(season.digest, 1, failed(season, request.id))
+    assert store.reveal(reveal(season))
+    assert not store.reveal(reveal(season))
+    with pytest.raises(Rejection, match="season_revealed"):
+        store.start_ticket(signed_request(store, season, key, 2))
+
+
+def test_offline_nothing_is_ranked_before_the_reveal(store, key):
+    season = tiny_season()
+    store.announce(season)
+    entry = signed_entry(store, season, key, [None, None])
+    store.enter(entry)
+    before = store.head
+    with pytest.raises(Rejection, match="season_not_closed"):
+        store.rank(failed(season, entry.id))
+    assert store.head == before
+
+
+def test_an_id_is_one_seasons_and_a_season_ahead(store):
+    season = tiny_season()
+    assert store.announce(season)
+    assert not store.announce(season)
+    with pytest.raises(BoardError, match="another season of this board has it"):
+        store.announce(tiny_season(title="Another"))
+    with pytest.raises(BoardError, match="must be after the board's time"):
+        store.announce(tiny_season(id="past", opens=moment(-3), closes=moment(-2)))
+
+
+@pytest.mark.parametrize(
+    "name", ["season.json", "reveal.json", "entries/*", "tickets/*/*", "results/*"]
+)
+def test_an_altered_file_of_a_season_is_named(store, key, later, name):
+    play(store, key, later)
+    path = next(iter(sorted(store.folder.seasons.glob(f"*/{name}"))))
+    path.write_text(path.read_text().replace(": ", ":  ", 1))
+    with pytest.raises(TamperedError) as error:
+        Store.open(store.folder.path, read_only=True)
+    assert error.value.where == path.relative_to(store.folder.path).as_posix()
+
+
+def test_an_entrants_name_is_nobody_elses(store, key):
+    season = tiny_season()
+    store.announce(season)
+    store.enter(
+        signed_entry(store, season, key, [None, None], submitter={"name": "Ada", "key": key.public})
+    )
+    assert store.holder_of_name("ADA") == key.public
+
+
+def test_a_ticket_started_by_a_process_that_dies_is_started_or_not(tmp_path: Path, key):
+    season = tiny_season(ONLINE)
+    with tiny_board(tmp_path / "board") as store:
+        store.announce(season)
+        request = signed_request(store, season, key)
+        other = signed_request(store, season, key, 1)
+
+    def start() -> object:
+        with Store.open(tmp_path / "board") as opened:
+            return opened.start_ticket(request)
+
+    call = 0
+    while crashes_before(call, start):
+        call += 1
+        with Store.open(tmp_path / "board", read_only=True) as reader:
+            assert len(reader.entrants(season.digest)) <= 1
+    assert call > 3
+    with Store.open(tmp_path / "board") as store:
+        assert store.start_ticket(other) == 2
+        assert store.start_ticket(request) == 1
+        assert [row.number for row in store.entrants(season.digest)] == [1, 2]
