@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("jax")
-
 from sme_registry import SMESpec, materialize
 from sme_registry.errors import UnknownNameError
-from sme_registry.evaluation.rollouts import rollouts, start_states
-from sme_registry.jax import replay
-from sme_registry.jax.program import Program, StepLog
+from sme_registry.evaluation.rollouts import start_states
+from sme_registry.jax import observing, replay
+from sme_registry.jax.program import Program, StepLog, _key_of
 from sme_registry.jax.run import hidden_of, new_program, policy_of
-from sme_registry.jax.task import Shape
+from sme_registry.jax.task import Shape, task_params
 
 STEPS, S, A, M, T = 48, 3, 2, 4, 7
 SMALL: dict[str, Any] = {"batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
@@ -119,23 +119,35 @@ def test_weights_and_hidden_layers_have_the_widths_of_the_agents_observation(
         np.testing.assert_allclose(actions, squashed, atol=1e-6)
 
 
-@pytest.mark.parametrize("k", [1, 2])
-def test_evaluations_of_a_policy_that_ignores_distractors_are_those_of_numpy(k: int) -> None:
-    """Whatever the random numbers of its distractors."""
-    tasks = [spec({"distractors": M, "dynamics": "autonomous"}, seed=i, k=k) for i in range(2)]
-    program = new_program("jax:PPO", tasks, [3, 4], hyperparameters=SETTINGS["PPO"], steps=1)
+@pytest.mark.parametrize(("dynamics", "k"), [("autonomous", 1), ("driven", 2)])
+def test_evaluations_are_episodes_of_numpys_task(dynamics: str, k: int) -> None:
+    """From the distractors and with the random numbers that follow from their initial states."""
+    observation = {"distractors": M, "dynamics": dynamics, "mixing": "orthogonal"}
+    task = spec(observation, k=k)
+    program = new_program("jax:PPO", [task], [3], hyperparameters=SETTINGS["PPO"], steps=1)
     weights = dict(program.state.weights)
-    name = "mlp_extractor.policy_net.0.weight"
-    weights["action_net.weight"] *= 30.0
-    weights[name] = weights[name].at[:, :, S : S + M].set(0.0)
+    weights["action_net.weight"] *= 100.0  # so that actions depend on the observation
     program.state = program.state._replace(weights=weights)
-    states = np.stack([start_states(i, 0, 3, S) for i in range(2)])
-    evaluation = program.evaluate(states)
-    for lane, task in enumerate(tasks):
-        act = policy_of("jax:PPO", program.weights(lane), hyperparameters=SETTINGS["PPO"])
-        done = rollouts(lambda o, act=act: (act(o) + 1) / 2, materialize(task), states[lane])
-        np.testing.assert_allclose(evaluation.episode_return[lane], done.episode_return, atol=1e-2)
-        np.testing.assert_allclose(evaluation.regret[lane] / T, done.regret, atol=1e-3)
+    act = policy_of("jax:PPO", program.weights(0), hyperparameters=SETTINGS["PPO"])
+    states = start_states(0, 0, 3, S)
+    evaluation = program.evaluate(states[None])
+    assert np.unique(np.round(evaluation.similarity, 6)).size == 3
+    for episode, s in enumerate(states):
+        params, numpy_task = task_params(task), materialize(task)
+        key = _key_of(jnp.asarray(s))
+        d: Any = np.asarray(observing.first_distractors(key, params))
+        similarity, regret, accumulated = 0.0, 0.0, 0.0
+        for t in range(T):
+            seen = [*numpy_task.seen(s, d), t / T, accumulated / k]
+            a = (act(np.array([seen], np.float32))[0] + 1.0) / 2.0
+            similarity += numpy_task.similarity(s, a)
+            regret += numpy_task.regret(s, a)
+            accumulated = 0.0 if (t + 1) % k == 0 else accumulated + numpy_task.step_reward(s, a)
+            u: Any = observing.drawn(jax.random.fold_in(key, t), params)
+            d = numpy_task.distractor_step(d, a if dynamics == "driven" else np.asarray(u))
+            s = numpy_task.transition(s, a)
+        assert evaluation.similarity[0, episode] == pytest.approx(similarity, abs=1e-3)
+        assert evaluation.regret[0, episode] == pytest.approx(regret, abs=1e-3)
 
 
 def test_padding_changes_no_random_number_of_distractors() -> None:

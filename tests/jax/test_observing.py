@@ -113,10 +113,11 @@ def check_steps(specs: list[SMESpec], params: Any, tolerance: float) -> None:
             assert (np.asarray(same[6][name]) == info[name]).all()
 
 
-@pytest.mark.parametrize("complexity", [1, 3])
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_limits_and_costs_equal_numpys(complexity: int, dtype: Any) -> None:
-    tolerance = 1e-5 if dtype == jnp.float32 else 1e-12
+@pytest.mark.parametrize(
+    ("complexity", "dtype", "tolerance"),
+    [(1, jnp.float64, 1e-12), (3, jnp.float64, 1e-12), (3, jnp.float32, 1e-5)],
+)
+def test_limits_and_costs_equal_numpys(complexity: int, dtype: Any, tolerance: float) -> None:
     spec = SMESpec.from_dict(
         {"complexity": complexity, "hidden_width": 5, "safety": {"tightness": 0.2}, "r_min": 0.1}
     )
