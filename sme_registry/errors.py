@@ -17,6 +17,8 @@
     ├── PolicyError               a policy that cannot be loaded, or whose actions cannot be used
     ├── OptionError               an argument or option outside its range (also a ValueError)
     ├── WireError                 a malformed message of a sealed season (also a ValueError)
+    ├── SealedError               a sealed season's server refused a request, or gives no answer
+    │   └── BudgetSpentError          no steps are left on the instance
     └── MissingDependencyError    an optional package is not installed (also an ImportError)
 
 A message gives the field, its value, the allowed range and the fix:
@@ -98,6 +100,27 @@ class OptionError(SMEError, ValueError):
 
 class WireError(SMEError, ValueError):
     """A message between a sealed season's server and a client has a wrong size or form."""
+
+
+class SealedError(SMEError):
+    """A sealed season's server refused a request, or gives no answer.
+
+    Args:
+      code: the board's, or "unreachable", "http" or "wire" where it sent none.
+      message: what is wrong, and what to do.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+    def __reduce__(self) -> tuple[type[SealedError], tuple[str, str]]:
+        return type(self), (self.code, self.message)
+
+
+class BudgetSpentError(SealedError):
+    """A ticket has no steps left on this instance."""
 
 
 class MissingDependencyError(SMEError, ImportError):

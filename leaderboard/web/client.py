@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import ipaddress
 import json
 import os
 import time
@@ -22,7 +21,7 @@ from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
-from sme_registry.io import parse_json, require_packages
+from sme_registry.io import parse_json, printable, require_packages, server_address
 
 if TYPE_CHECKING:
     import httpx
@@ -139,8 +138,11 @@ class _Client:
         import httpx
 
         self._httpx = httpx
-        self._url, is_local = _checked(httpx.URL, url, insecure=insecure)
-        self._client = httpx.Client(timeout=httpx.Timeout(30.0, read=120.0), trust_env=not is_local)
+        address = server_address(url, insecure=insecure)
+        self._url = address.url
+        self._client = httpx.Client(
+            timeout=httpx.Timeout(30.0, read=120.0), trust_env=not address.is_local
+        )
 
     def __enter__(self) -> _Client:
         return self
@@ -155,7 +157,7 @@ class _Client:
             return BoardDocument.from_dict(answer)
         except SpecError as error:
             raise BoardError(
-                f"{self._url}: its definition is invalid: {_printable(error)}"
+                f"{self._url}: its definition is invalid: {printable(error)}"
             ) from None
 
     def request(
@@ -188,7 +190,7 @@ class _Client:
         if 200 <= code < 300:
             return code, answer
         fields = answer if isinstance(answer, dict) else {}
-        message = _printable(fields.get("message") or f"answered with HTTP status {code}")
+        message = printable(fields.get("message") or f"answered with HTTP status {code}")
         if (rejection := str(fields.get("code"))) in CODES:
             raise Rejection(rejection, message)
         raise BoardError(f"{self._url}: {message}")
@@ -213,35 +215,6 @@ def _answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
     return answer
 
 
-def _checked(parse: Callable[[str], httpx.URL], url: str, *, insecure: bool) -> tuple[str, bool]:
-    """The URL without its final slash, and whether it is on this machine.
-
-    A board on this machine is reached without a proxy, and needs no encryption.
-    """
-    try:
-        parts = parse(url)
-    except Exception:  # httpx.InvalidURL is not a ValueError
-        parts = parse("")
-    if parts.scheme not in ("http", "https") or not parts.host or parts.query or parts.userinfo:
-        raise OptionError(
-            f"url={url!r:.80}: must be http(s)://host[:port][/path]. Copy it from the board's page."
-        )
-    is_local = _is_loopback(parts.host)
-    if parts.scheme == "http" and not (is_local or insecure):
-        raise OptionError(
-            f"url={url!r:.80}: must be https for another machine. "
-            "Use https, or a tunnel to the board."
-        )
-    return str(parts).rstrip("/"), is_local
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _digits(id: str) -> str:
     try:
         return hex_of(id)
@@ -250,8 +223,3 @@ def _digits(id: str) -> str:
             f"id={id!r:.90}: must be 'sha256:' and 64 hex digits; a served board needs all of "
             "them. Copy the id from the board."
         ) from None
-
-
-def _printable(text: object) -> str:
-    """A server's text for a terminal: shortened, and without control characters."""
-    return "".join(c if c.isprintable() else " " for c in str(text)[:2000])

@@ -1,4 +1,4 @@
-"""Files, folders, locks, strict JSON, arrays, spare memory, packages, argument checks."""
+"""Files, folders, locks, strict JSON, arrays, servers, spare memory, packages, argument checks."""
 
 from sme_registry.io.arrays import Arrays, read_arrays, write_arrays
 from sme_registry.io.checks import choice, integer_in, number_in
@@ -24,10 +24,12 @@ from sme_registry.io.packages import (
     require_packages,
     versions,
 )
+from sme_registry.io.servers import Address, printable, server_address
 
 __all__ = [
     "MAX_DOCUMENT_BYTES",
     "TEMPORARY",
+    "Address",
     "Arrays",
     "Lock",
     "atomic_file",
@@ -44,11 +46,13 @@ __all__ = [
     "missing_dependency",
     "number_in",
     "parse_json",
+    "printable",
     "read_arrays",
     "read_json",
     "refuse_existing",
     "refuse_unwritable",
     "require_packages",
+    "server_address",
     "sync_folder",
     "temporary_beside",
     "to_json",

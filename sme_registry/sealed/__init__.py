@@ -1,8 +1,18 @@
-"""Sealed-online seasons: hidden tasks that a board's server steps.
+"""Sealed-online seasons: learn in hidden tasks that a board's server steps, and answer for them.
 
-`wire` says what server and client send each other.
+    import sme_registry
+    from sme_registry import sealed
+
+    env = sealed.make("https://board.example", "ticket.json", instance=0)
+    ...                                               # train as in any environment of Gymnasium
+    sealed.answer("https://board.example", "ticket.json", policy, instance=0)
+
+`sealed.sb3.SealedVecEnv` is for Stable-Baselines3. `wire` says what server and client send.
 """
 
+from sme_registry.sealed.connection import PATIENCE
+from sme_registry.sealed.envs import SealedEnv, SealedVectorEnv, make, make_vec
+from sme_registry.sealed.instance import Instance, actions_in, answer
 from sme_registry.sealed.ticket import (
     InstanceStatus,
     Place,
@@ -24,16 +34,24 @@ from sme_registry.sealed.wire import (
 )
 
 __all__ = [
+    "PATIENCE",
     "Begun",
+    "Instance",
     "InstanceStatus",
     "Place",
+    "SealedEnv",
+    "SealedVectorEnv",
     "StepFormat",
     "Steps",
     "Ticket",
     "TicketClass",
     "TicketStatus",
+    "actions_in",
+    "answer",
     "bearer",
     "instance_path",
+    "make",
+    "make_vec",
     "pack_table",
     "table_bytes",
     "ticket_path",

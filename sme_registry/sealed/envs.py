@@ -1,0 +1,277 @@
+"""`SealedEnv` and `SealedVectorEnv`: a hidden task as Gymnasium's environments."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from sme_registry.envs import arguments
+from sme_registry.envs.types import Action, Array, Mask, Observation
+from sme_registry.errors import EpisodeError, OptionError
+from sme_registry.sealed.connection import PATIENCE
+from sme_registry.sealed.instance import Instance, TicketLike
+from sme_registry.sealed.wire import Float32, Steps
+from sme_registry.spec import ActionRange
+
+
+class Lanes:
+    """The lanes of an instance: actions of an environment's range in, what the server shows out.
+
+    Args:
+      instance: the hidden task.
+      action_range: "unit" or "symmetric".
+
+    Attributes:
+      instance: the hidden task.
+      action_space, observation_space: of one lane.
+    """
+
+    def __init__(self, instance: Instance, action_range: ActionRange) -> None:
+        self.instance = instance
+        setting = instance.setting
+        self.action_space, self._rescaled = arguments.action_space(action_range, setting.action_dim)
+        width = setting.state_dim + 2
+        self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
+        self._shape = instance.lanes, setting.action_dim
+        self._has_begun = False
+
+    def begin(self, seed: Any, options: dict[str, Any] | None) -> Float32:
+        """The present observations `[L, S + 2]`; no episode is cut short.
+
+        Raises:
+          OptionError: there are options, or the seed is no integer of at least 0.
+        """
+        arguments.checked_seed(seed)
+        if options:
+            raise OptionError(
+                f"options={options!r:.60}: must be None: the server draws the states at which "
+                "episodes begin. Leave it out."
+            )
+        observation = self.instance.begin()
+        self._has_begun = True
+        return observation
+
+    def step(self, actions: Any) -> Steps:
+        """One step of every lane.
+
+        Raises:
+          EpisodeError: before the first reset.
+          ActionError: not numbers, not `[L, A]`, or not finite; nothing is sent then.
+        """
+        if not self._has_begun:
+            raise EpisodeError("step: the episodes have not begun. Call reset() first.")
+        unit = arguments.to_unit(actions, self._shape, self._rescaled)
+        if not np.isfinite(unit).all():
+            raise arguments.not_finite_error()
+        return self.instance.step(unit)
+
+
+class SealedEnv(gymnasium.Env[Observation, Action]):
+    """A hidden task of a ticket, stepped by the season's server.
+
+    Spaces, rewards and ends of episodes are those of `SMEEnv`; infos are empty. The server draws
+    the initial states: `seed` has no effect on them. `reset` within an episode does not end it: it
+    returns the present observation, also in a new process that goes on where another one stopped.
+
+    Args:
+      instance: the hidden task, with one lane.
+      action_range: "unit" or "symmetric".
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
+        self._lanes = Lanes(instance, action_range)
+        self.action_space = cast("gymnasium.Space[Action]", self._lanes.action_space)
+        self.observation_space = self._lanes.observation_space
+        self._next: Observation | None = None  # the first of the next episode
+
+    @property
+    def instance(self) -> Instance:
+        """The hidden task: its setting, budget, challenge and answers."""
+        return self._lanes.instance
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin the next episode, or go on with the present one.
+
+        Args:
+          seed: seeds `np_random` only.
+          options: there are none.
+
+        Returns:
+          The observation `[S + 2]`, and an empty info.
+
+        Raises:
+          OptionError: an option, or a seed that is no integer of at least 0.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        if self._next is None or options or seed is not None:
+            [self._next] = self._lanes.begin(seed, options)
+        super().reset(seed=seed)
+        observation, self._next = self._next, None
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step.
+
+        Args:
+          action: `[A]`, finite; clipped to the action range.
+
+        Returns:
+          Observation `[S + 2]`, reward, terminated, truncated, and an empty info.
+
+        Raises:
+          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
+          EpisodeError: before the first reset, or after the end of an episode.
+          BudgetSpentError: the budget is spent.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        if self._next is not None:
+            raise EpisodeError("step: the episode has ended. Call reset() first.")
+        steps = self._lanes.step([action])
+        terminated, truncated = bool(steps.terminated[0]), bool(steps.truncated[0])
+        observation = steps.observation[0]
+        if terminated or truncated:
+            self._next, observation = observation, steps.last_observation[0]
+        return observation, float(steps.reward[0]), terminated, truncated, {}
+
+    def close(self) -> None:
+        """Close the connection. The ticket stays valid."""
+        self.instance.close()
+
+
+class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
+    """The lanes of a hidden task, stepped together by the season's server.
+
+    Spaces, rewards and ends of episodes are those of `SMEVectorEnv`, whose autoreset mode is
+    "SameStep": an ended lane's observation is the first of its next episode, and the last of the
+    ended one is in `infos["final_obs"]`. Seeds and resets are as in `SealedEnv`.
+
+    Args:
+      instance: the hidden task.
+      action_range: "unit" or "symmetric".
+    """
+
+    def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
+        self._lanes = Lanes(instance, action_range)
+        self.num_envs = instance.lanes
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_action_space = self._lanes.action_space
+        self.single_observation_space = self._lanes.observation_space
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def instance(self) -> Instance:
+        """The hidden task: its setting, budget, challenge and answers."""
+        return self._lanes.instance
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin, or go on with the present episodes.
+
+        Args:
+          seed: seeds `np_random` only.
+          options: there are none.
+
+        Returns:
+          The observations `[L, S + 2]`, and an empty info.
+
+        Raises:
+          OptionError: an option, or a seed that is no integer of at least 0.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        first = seed[0] if isinstance(seed, list) else seed
+        observation = self._lanes.begin(first, options)
+        super().reset(seed=first)
+        return observation, {}
+
+    def step(  # type: ignore[override]  # Gymnasium types all three arrays alike; ends are bool
+        self, actions: Any
+    ) -> tuple[Observation, Float32, Mask, Mask, dict[str, Any]]:
+        """One step of every lane.
+
+        Args:
+          actions: `[L, A]`, finite; clipped to the action range.
+
+        Returns:
+          Observations `[L, S + 2]`, rewards `[L]`, terminated `[L]`, truncated `[L]`, infos.
+
+        Raises:
+          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
+          EpisodeError: before the first reset.
+          BudgetSpentError: the budget does not suffice for a step of every lane.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        steps = self._lanes.step(actions)
+        ended: Mask = steps.terminated | steps.truncated
+        infos: dict[str, Any] = {}
+        if ended.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            for lane in np.flatnonzero(ended):
+                final[lane] = steps.last_observation[lane]
+            infos = {"final_obs": final, "_final_obs": ended.copy()}
+            infos |= {"final_info": {}, "_final_info": ended.copy()}
+        return steps.observation, steps.reward, steps.terminated, steps.truncated, infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the connection. The ticket stays valid."""
+        self.instance.close()
+
+
+def make(
+    url: str,
+    ticket: TicketLike,
+    instance: int = 0,
+    *,
+    action_range: ActionRange = "unit",
+    insecure: bool = False,
+    patience: float = PATIENCE,
+) -> SealedEnv:
+    """An environment of a hidden task.
+
+    Args:
+      url: the board's.
+      ticket: a ticket, or the path of its file.
+      instance: its number in the ticket, from 0.
+      action_range: "unit" for actions in [0, 1] or "symmetric" for [−1, 1].
+      insecure: allow plain http to other machines, in a network that you trust.
+      patience: seconds for which a request is repeated while the server gives no answer.
+
+    Raises:
+      OptionError: the URL is invalid, or an argument is out of range.
+      SpecError: the ticket's file is missing, or is no ticket.
+    """
+    hidden = Instance(url, ticket, instance, insecure=insecure, patience=patience)
+    return SealedEnv(hidden, action_range)
+
+
+def make_vec(
+    url: str,
+    ticket: TicketLike,
+    instance: int = 0,
+    num_envs: int = 1,
+    *,
+    action_range: ActionRange = "unit",
+    insecure: bool = False,
+    patience: float = PATIENCE,
+) -> SealedVectorEnv:
+    """A vector environment of a hidden task: `num_envs` lanes in one request.
+
+    Args:
+      num_envs: L, copies of the task, at most the ticket's `lanes`; it cannot be changed after the
+        first step.
+      url, ticket, instance, action_range, insecure, patience: see `make`.
+
+    Raises:
+      OptionError, SpecError: see `make`.
+    """
+    hidden = Instance(url, ticket, instance, num_envs, insecure=insecure, patience=patience)
+    return SealedVectorEnv(hidden, action_range)

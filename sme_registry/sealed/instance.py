@@ -1,0 +1,252 @@
+"""`Instance`: one hidden task of a ticket, stepped and answered over the network."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from sme_registry.errors import MalformedDocumentError, PolicyError, SealedError, SpecError
+from sme_registry.evaluation import as_policy
+from sme_registry.evaluation.references import POLICIES
+from sme_registry.evaluation.regions import batch_rows
+from sme_registry.io import integer_in, parse_json
+from sme_registry.sealed.connection import PATIENCE, Connection
+from sme_registry.sealed.ticket import Ticket, TicketStatus
+from sme_registry.sealed.wire import (
+    Float32,
+    StepFormat,
+    Steps,
+    instance_path,
+    pack_table,
+    ticket_path,
+    unpack_table,
+)
+from sme_registry.spec import Setting, SMESpec, StrictModel
+
+TicketLike = Ticket | str | os.PathLike[str]
+_Document = TypeVar("_Document", bound=StrictModel)
+_MAX_CHALLENGE = 2**31
+_MAX_STATUS = 2**22
+_WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
+
+
+def as_ticket(ticket: TicketLike) -> Ticket:
+    """A ticket from itself or the path of its file.
+
+    Raises:
+      SpecError: the file is missing, or is no ticket.
+    """
+    return ticket if isinstance(ticket, Ticket) else Ticket.read(ticket)
+
+
+class Instance:
+    """A hidden task of a ticket, as its server shows it: observations, rewards and ends.
+
+    Whoever holds the ticket may stop at any time and go on elsewhere: the server knows the present
+    states. But only one process at a time can step an instance.
+
+    Args:
+      url: the board's.
+      ticket: a ticket, or the path of its file.
+      instance: its number in the ticket, from 0.
+      lanes: copies that are stepped together, at most the ticket's; it cannot be changed after the
+        first step.
+      insecure, patience: see `Connection`.
+
+    Attributes:
+      setting: all of the task's spec but its seed.
+      budget: steps over all lanes.
+      number: of the last steps that were taken; 0 before the first.
+
+    Raises:
+      OptionError: the URL is invalid, or a number is out of range.
+      SpecError: the ticket's file is missing, or is no ticket.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        ticket: TicketLike,
+        instance: int = 0,
+        lanes: int = 1,
+        *,
+        insecure: bool = False,
+        patience: float = PATIENCE,
+    ) -> None:
+        ticket = as_ticket(ticket)
+        member = ticket.place(instance).member
+        self.setting: Setting = member.setting
+        self.budget = member.budget
+        self.number = 0
+        S, A = self.setting.state_dim, self.setting.action_dim
+        self._format = StepFormat(integer_in("lanes", lanes, 1, ticket.lanes), S, A)
+        self._ticket, self._instance = ticket, instance
+        self._connection = Connection(url, ticket.token, insecure=insecure, patience=patience)
+
+    @property
+    def lanes(self) -> int:
+        """L, copies that are stepped together."""
+        return self._format.lanes
+
+    @property
+    def steps_left(self) -> int:
+        """Steps of the budget that are left, over all lanes."""
+        return self.budget - self.number * self.lanes
+
+    def begin(self) -> Float32:
+        """Begin, or go on: the present observations `[L, S + 2]`.
+
+        They are those of the first episodes, or those after the last steps that the server took for
+        this instance, whichever process asked for them.
+
+        Raises:
+          SealedError: the server refuses it, such as other lanes than those of the first steps.
+        """
+        data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
+        self.number, observation = self._format.unpack_begun(data)
+        return observation
+
+    def step(self, actions: npt.NDArray[np.floating]) -> Steps:
+        """One step of every lane; call `begin` first.
+
+        Args:
+          actions: `[L, A]` of the unit range, finite; clipped.
+
+        Raises:
+          BudgetSpentError: the budget does not suffice for a step of every lane.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        body = self._format.pack_request(self.number + 1, actions)
+        data = self._request("POST", "steps", body, most=self._format.answer_bytes)
+        self.number += 1
+        return self._format.unpack_steps(data)
+
+    def challenge(self) -> Float32:
+        """End the stepping, and return the challenge states: observations `[rows, S + 2]`.
+
+        Raises:
+          SealedError: the server refuses it, or gives no answer.
+        """
+        self._request("POST", "finish")
+        data = self._request("GET", "challenge", most=_MAX_CHALLENGE)
+        return unpack_table(data, self.setting.state_dim + 2)
+
+    def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
+        """Answer the challenge; the last instance's answers end the ticket.
+
+        Args:
+          actions: `[rows, A]` of the unit range, finite; clipped.
+
+        Raises:
+          SealedError: the server refuses them, such as others than those it has.
+        """
+        self._request("PUT", "answers", pack_table(actions))
+
+    def status(self) -> TicketStatus:
+        """The status of the whole ticket.
+
+        Raises:
+          SealedError: the server gives no answer, or one that is no status.
+        """
+        path = ticket_path(self._ticket.season, self._ticket.ticket)
+        data = self._connection.request("GET", path, most=_MAX_STATUS)
+        return parse_answer(TicketStatus, data)
+
+    def close(self) -> None:
+        """Close the connection; the next request opens another one."""
+        self._connection.close()
+
+    def _request(self, method: str, action: str, body: bytes = b"", *, most: int = 0) -> bytes:
+        ticket = self._ticket
+        path = instance_path(ticket.season, ticket.ticket, self._instance, action)
+        return self._connection.request(method, path, body, most=most)
+
+
+def answer(
+    url: str,
+    ticket: TicketLike,
+    policy: Any,
+    instance: int = 0,
+    *,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+    insecure: bool = False,
+    patience: float = PATIENCE,
+) -> None:
+    """End an instance's stepping, and send a policy's actions in its challenge states.
+
+    Args:
+      url: the board's.
+      ticket: a ticket, or the path of its file.
+      policy, action_range, algorithm: see `actions_in`.
+      instance: its number in the ticket, from 0.
+      insecure, patience: see `Connection`.
+
+    Raises:
+      SealedError: the server refuses it, or gives no answer.
+      PolicyError, OptionError, SpecError: see `actions_in` and `Instance`.
+    """
+    hidden = Instance(url, ticket, instance, insecure=insecure, patience=patience)
+    try:
+        states = hidden.challenge()
+        hidden.send_answers(
+            actions_in(
+                states, policy, hidden.setting, action_range=action_range, algorithm=algorithm
+            )
+        )
+    finally:
+        hidden.close()
+
+
+def actions_in(
+    states: Float32,
+    policy: Any,
+    setting: Setting,
+    *,
+    action_range: str | None = None,
+    algorithm: str | None = None,
+) -> Float32:
+    """A policy's actions in challenge states.
+
+    Args:
+      states: `[rows, S + 2]` observations.
+      policy: as `evaluate` accepts it.
+      setting: of the task.
+      action_range: of the policy's actions, "unit" or "symmetric"; None as in `evaluate`.
+      algorithm: the class of a model's .zip that does not tell it.
+
+    Returns:
+      `[rows, A]` of the unit range, finite; not clipped.
+
+    Raises:
+      PolicyError: the policy cannot be loaded, its actions are invalid, or it is a reference that
+        depends on the hidden task.
+      UnknownNameError, OptionError, MissingDependencyError: see `as_policy`.
+    """
+    if isinstance(policy, str) and policy in POLICIES and policy not in _WITHOUT_TASK:
+        raise PolicyError(
+            f"policy={policy!r}: follows from the task, which is hidden. Give a policy of your "
+            "own, constant_half or uniform_random."
+        )
+    spec = SMESpec.from_dict({**setting.to_dict(), "seed": 0})  # for its widths: the seed is hidden
+    prepared = as_policy(policy, spec, action_range=action_range, algorithm=algorithm)
+    rows = batch_rows(spec)
+    batches = [prepared(states[at : at + rows].copy()) for at in range(0, len(states), rows)]
+    return np.concatenate([np.empty((0, setting.action_dim)), *batches]).astype(np.float32)
+
+
+def parse_answer(kind: type[_Document], data: bytes) -> _Document:
+    """A document in a server's answer.
+
+    Raises:
+      SealedError: it is none of this kind.
+    """
+    try:
+        return kind.from_dict(parse_json(data, "answer"))
+    except (MalformedDocumentError, SpecError) as error:
+        raise SealedError(
+            "wire", f"the server's answer is invalid: {error} Check its version."
+        ) from None

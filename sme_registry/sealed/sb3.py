@@ -1,0 +1,99 @@
+"""`SealedVecEnv`: a hidden task for Stable-Baselines3's algorithms.
+
+from stable_baselines3 import PPO
+from sme_registry.sealed.sb3 import SealedVecEnv
+env = SealedVecEnv("https://board.example", "ticket.json", instance=0, num_envs=8)
+PPO("MlpPolicy", env).learn(env.instance.steps_left)
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from sme_registry.envs.types import Observation
+from sme_registry.sb3 import LanesVecEnv
+from sme_registry.sb3.vec_env import StepResult
+from sme_registry.sealed.connection import PATIENCE
+from sme_registry.sealed.envs import Lanes
+from sme_registry.sealed.instance import Instance, TicketLike
+from sme_registry.spec import ActionRange
+
+
+class SealedVecEnv(LanesVecEnv):
+    """The lanes of a hidden task, as SB3's `VecEnv`.
+
+    As in `SMEVecEnv`, a finished lane begins its next episode at once. The server draws the initial
+    states: seeds have no effect on them. `reset` within an episode does not end it.
+
+    Args:
+      url, ticket, instance, num_envs, insecure, patience: see `sealed.make_vec`.
+      action_range: "symmetric", [−1, 1], which suits SB3's Gaussian policies; or "unit".
+
+    Raises:
+      OptionError, SpecError: see `sealed.make`.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        ticket: TicketLike,
+        instance: int = 0,
+        num_envs: int = 1,
+        *,
+        action_range: ActionRange = "symmetric",
+        insecure: bool = False,
+        patience: float = PATIENCE,
+    ) -> None:
+        self.instance = Instance(
+            url, ticket, instance, num_envs, insecure=insecure, patience=patience
+        )
+        self._stepped = Lanes(self.instance, action_range)
+        shared = {
+            "render_mode": None, "spec": None,
+            "action_space": self._stepped.action_space,
+            "observation_space": self._stepped.observation_space,
+        }  # fmt: skip
+        super().__init__([SimpleNamespace(**shared) for _ in range(num_envs)])
+
+    def reset(self) -> Observation:
+        """Begin, or go on with the present episodes.
+
+        Returns:
+          Observations, a row for each lane, float32.
+
+        Raises:
+          OptionError: options were set.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        options = next(filter(None, self._options), None)
+        observation = self._stepped.begin(None, options)
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._clear_reset_arguments()
+        return observation
+
+    def step_wait(self) -> StepResult:
+        """One step of every lane.
+
+        Returns:
+          Observations and rewards, float32, and dones, each with a row for each lane; infos.
+
+        Raises:
+          ActionError: wrong shape, not numbers, or not finite; nothing is sent then.
+          EpisodeError: before the first reset.
+          BudgetSpentError: the budget does not suffice for a step of every lane.
+          SealedError: the server refuses it, or gives no answer.
+        """
+        steps = self._stepped.step(self._take_actions())
+        dones = steps.terminated | steps.truncated
+        cut = steps.truncated & ~steps.terminated
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(each)} for each in cut]
+        for lane in np.flatnonzero(dones).tolist():
+            infos[lane]["terminal_observation"] = steps.last_observation[lane]
+        return steps.observation, steps.reward, dones, infos
+
+    def close(self) -> None:
+        """Close the connection. The ticket stays valid."""
+        self.instance.close()

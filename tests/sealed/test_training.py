@@ -1,0 +1,88 @@
+"""Trainers work in hidden tasks as they do in others: SB3's, this project's, a loop of one file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+
+from examples import cleanrl_style_ppo as cleanrl
+from sme_registry import sealed
+from sme_registry.errors import BudgetSpentError, OptionError
+from sme_registry.sb3 import SMEVecEnv
+from sme_registry.sealed.sb3 import SealedVecEnv
+from sme_registry.training.learners import new_learner
+from tests.sealed.server import TICKET, Server, serving, spec_of
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with serving() as server:
+        yield server
+
+
+def test_an_sb3_batch_is_stepped_as_the_same_task_is_here(server):
+    here, hidden = SMEVecEnv(spec_of(0), 3), SealedVecEnv(server.url, TICKET, 0, 3)
+    here.seed(0)
+    assert hidden.action_space == here.action_space
+    assert hidden.observation_space == here.observation_space
+    assert np.array_equal(here.reset(), hidden.reset())
+    assert hidden.reset_infos == [{}] * 3
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 3, 2))
+    for unit in (0.5 * (actions + 1)).astype(np.float32).astype(float):
+        local, remote = here.step(2 * unit - 1), hidden.step(2 * unit - 1)
+        for ours, theirs in zip(local[:3], remote[:3], strict=True):
+            assert np.array_equal(ours, theirs)
+            assert ours.dtype == theirs.dtype
+        for ours, theirs in zip(local[3], remote[3], strict=True):
+            assert theirs["TimeLimit.truncated"] == ours["TimeLimit.truncated"]
+            assert ("terminal_observation" in theirs) == ("terminal_observation" in ours)
+            assert theirs.keys() <= {"TimeLimit.truncated", "terminal_observation"}
+            if "terminal_observation" in theirs:
+                assert np.array_equal(theirs["terminal_observation"], ours["terminal_observation"])
+    hidden.set_options({"state": [0, 0, 0]})
+    with pytest.raises(OptionError, match="the server draws"):
+        hidden.reset()
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm):
+    env = SealedVecEnv(server.url, TICKET, 0, 4)
+    settings = {"n_steps": 32, "batch_size": 64} if algorithm == "PPO" else {}
+    model = new_learner(algorithm, env, seed=0, steps=256, hyperparameters=settings)
+    model.learn(256)
+    assert env.instance.number == 64
+    sealed.answer(server.url, TICKET, model, 0)
+    assert server.hidden[0].answers.shape == (40, 2)
+    with pytest.raises(BudgetSpentError):  # once answers are asked for, no more steps are taken
+        model.learn(256)
+
+
+def test_sb3_takes_the_single_environment(server):
+    env = Monitor(sealed.make(server.url, TICKET, 1, action_range="symmetric"))
+    PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu").learn(64)
+    assert server.hidden[1].number == 64
+
+
+def test_a_loop_of_one_file_learns(server, monkeypatch):
+    monkeypatch.setattr(cleanrl, "ENVS", 4)
+    monkeypatch.setattr(cleanrl, "ROLLOUT", 16)
+    torch.manual_seed(0)
+    env = sealed.make_vec(server.url, TICKET, 0, cleanrl.ENVS, action_range="symmetric")
+    agent = cleanrl.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
+    optimiser = torch.optim.Adam(agent.parameters(), lr=1e-3)
+    before = agent.mean_actions(env.reset(seed=0)[0])
+    observations, rollout = env.reset()[0], []
+    for _ in range(cleanrl.ROLLOUT):
+        with torch.no_grad():
+            actions = agent.distribution(torch.as_tensor(observations)).sample().numpy()
+        following, rewards, terminated, truncated, _ = env.step(actions.clip(-1, 1))
+        rollout.append((observations, actions, rewards, terminated | truncated))
+        observations = following
+    cleanrl.learn(agent, optimiser, rollout, observations)
+    assert not np.array_equal(agent.mean_actions(env.reset()[0]), before)
+    sealed.answer(server.url, TICKET, agent.mean_actions, 0, action_range="symmetric")
