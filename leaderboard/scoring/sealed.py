@@ -1,4 +1,4 @@
-"""`sealed_result`: from the runs of a sealed entry or ticket to its scores.
+"""From the answers in challenge states to the result of a sealed entry or ticket.
 
     challenge states  the observations that `sme_registry.evaluate` shows to a policy under the
                       season's protocol, with the seed of the instance's secret
@@ -9,12 +9,166 @@ So scores are those of the open board, and there is no second scorer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from leaderboard.documents.board import RULES
+from leaderboard.documents.master import Master, Place
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
-from leaderboard.documents.season import Season
+from leaderboard.documents.season import Hidden, Season, Terms
+from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import Groups, class_score, is_oracle_like, method_scores
+from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
+from sme_registry import EvaluationProtocol, SMESpec, evaluate
+from sme_registry.errors import ActionError, WireError
+from sme_registry.sealed import unpack_table
+
+Float32 = npt.NDArray[np.float32]
+
+# May be loaded in the same process, but no number of a result depends on them.
+_UNUSED = ("stable_baselines3", "torch", "onnxruntime")
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One hidden instance, as far as the master determines it.
+
+    Attributes:
+      hidden: its class and number.
+      place: of its secrets.
+      spec: the task; `repr` shows neither it nor the protocol, whose seed is secret, too.
+      protocol: of its challenge states.
+    """
+
+    hidden: Hidden
+    place: Place
+    spec: SMESpec
+    protocol: EvaluationProtocol
+
+    def __repr__(self) -> str:
+        return f"Instance({self.hidden.member.name}, {self.hidden.instance})"
+
+    @property
+    def rows(self) -> int:
+        """The number of challenge states: of each region as many, region after region."""
+        return rows_of(self.protocol)
+
+
+def rows_of(protocol: EvaluationProtocol) -> int:
+    """The number of challenge states of an instance."""
+    return protocol.states_per_region * len(protocol.edges)
+
+
+def instances(
+    terms: Terms, master: Master, ticket: str = "", nonce: str = ""
+) -> Iterator[Instance]:
+    """Every hidden instance of a season, or of one of its tickets, in order.
+
+    Args:
+      terms: the season.
+      master: its secret.
+      ticket, nonce: the ticket's number, and the nonce in its request; empty offline.
+    """
+    for hidden in terms.hidden:
+        member = hidden.member
+        place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
+        spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
+        seed = master.number("states", place)
+        yield Instance(hidden, place, spec, terms.protocol.model_copy(update={"seed": seed}))
+
+
+def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
+    """The challenge states of an instance.
+
+    Args:
+      spec: the task.
+      protocol: the regions, and the seed of the states.
+
+    Returns:
+      `[regions · n, S + 2]` observations, region after region; those of WD in [0, 1].
+    """
+    shown: list[Float32] = []
+
+    def record(observations: Float32) -> Float32:
+        shown.append(observations)
+        return np.zeros((len(observations), spec.action_dim), np.float32)
+
+    evaluate(record, spec, protocol, action_range="unit", name="challenge")
+    return np.concatenate(shown)
+
+
+def read_answers(data: bytes, spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
+    """The answers in the bytes of an .npy file, whose reading runs no code.
+
+    Returns:
+      `[regions · n, A]` finite actions, which are not clipped yet.
+
+    Raises:
+      Rejection: `answer_shape` or `answer_not_finite`.
+    """
+    try:
+        return unpack_table(data, spec.action_dim, rows_of(protocol))
+    except WireError as error:
+        raise Rejection("answer_shape", str(error)) from None
+    except ActionError as error:
+        raise Rejection("answer_not_finite", str(error)) from None
+
+
+def score_run(
+    instance: Instance, answers: Float32 | None, digest: str | None
+) -> tuple[RunScore, dict[str, str]]:
+    """The score of the answers on an instance, and the versions of packages behind it.
+
+    Args:
+      instance: the hidden instance.
+      answers: `[regions · n, A]` actions in its challenge states; None where there are none, which
+        scores 1 in every metric.
+      digest: of the answers' file; None likewise.
+    """
+    member = instance.hidden.member
+    if answers is None:
+        return failed_run(instance.protocol, member.name, None), {}
+    replies = _Replies(answers)
+    report = evaluate(
+        replies, instance.spec, instance.protocol, action_range="unit", name="answers"
+    )
+    replies.refuse_unused()
+    regrets = tuple(region.normalised_regret for region in report.regions)
+    similarity = tuple(region.similarity for region in report.regions)
+    metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(instance.protocol))}
+    score = RunScore(
+        spec=None,
+        class_name=member.name,
+        artefact=digest,
+        evaluation_seed=None,
+        normalised_regret=regrets,
+        similarity=similarity,
+        **metrics,
+    )
+    return score, {
+        name: version for name, version in report.versions.items() if name not in _UNUSED
+    }
+
+
+class _Replies:
+    """A policy that returns rows of actions `[N, A]` in order, as many as it is shown states."""
+
+    def __init__(self, answers: Float32) -> None:
+        self._answers = answers
+        self._next = 0
+
+    def __call__(self, observations: Float32) -> Float32:
+        first, self._next = self._next, self._next + len(observations)
+        return self._answers[first : self._next]
+
+    def refuse_unused(self) -> None:
+        """Raise ValueError unless each row was returned once."""
+        if self._next != len(self._answers):
+            raise ValueError(f"{len(self._answers)} answers to {self._next} challenge states")
 
 
 def sealed_result(

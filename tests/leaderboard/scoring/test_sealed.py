@@ -1,0 +1,102 @@
+"""Answers in challenge states score what the policy behind them scores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from leaderboard.documents.master import Place
+from leaderboard.errors import Rejection
+from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.sealed import (
+    Instance,
+    challenge,
+    instances,
+    read_answers,
+    score_run,
+    sealed_result,
+)
+from sme_registry import evaluate
+from sme_registry.sealed import pack_table
+from tests.leaderboard.sealing import MASTER, tiny_season
+
+SEASON = tiny_season("sealed-online")
+FIRST, SECOND = instances(SEASON, MASTER, "1", "a" * 64)
+
+
+def policy(observations: np.ndarray) -> np.ndarray:
+    """A policy whose actions depend on the state and leave the cube."""
+    return 1.5 * observations[:, :1] - 0.2
+
+
+def score(instance: Instance) -> object:
+    shown = challenge(instance.spec, instance.protocol)
+    return score_run(instance, policy(shown), "sha256:" + "1" * 64)[0]
+
+
+def test_answers_score_what_their_policy_scores() -> None:
+    shown = challenge(FIRST.spec, FIRST.protocol)
+    assert shown.shape == (FIRST.rows, 4) == (300, 4)
+    assert shown.dtype == np.float32
+    run, versions = score_run(FIRST, policy(shown), "sha256:" + "1" * 64)
+    report = evaluate(policy, FIRST.spec, FIRST.protocol)
+    assert run.normalised_regret == tuple(region.normalised_regret for region in report.regions)
+    assert run.similarity == tuple(region.similarity for region in report.regions)
+    assert run.spec is None
+    assert run.evaluation_seed is None
+    assert "numpy" in versions
+
+
+def test_the_order_of_answers_matters_and_each_is_used_once() -> None:
+    shown = challenge(FIRST.spec, FIRST.protocol)
+    right, _ = score_run(FIRST, policy(shown), None)
+    wrong, _ = score_run(FIRST, policy(shown)[::-1], None)
+    assert wrong.wd_regret != right.wd_regret
+    with pytest.raises(ValueError, match="301 answers to 300 challenge states"):
+        score_run(FIRST, np.zeros((301, 1), np.float32), None)
+
+
+def test_tasks_and_states_are_an_instances_own_and_a_tickets() -> None:
+    others = instances(SEASON, MASTER, "2", "a" * 64)
+    everyone = [FIRST, SECOND, *others, *instances(SEASON, MASTER, "1", "b" * 64)]
+    assert len({each.spec.digest for each in everyone}) == 6
+    assert len({each.protocol.seed for each in everyone}) == 6
+    assert FIRST.place == Place(SEASON.id, "deep", 0, "1", "a" * 64)
+    [again, _] = instances(SEASON, MASTER, "1", "a" * 64)
+    np.testing.assert_array_equal(
+        challenge(again.spec, again.protocol), challenge(FIRST.spec, FIRST.protocol)
+    )
+
+
+def test_an_instance_shows_no_secret() -> None:
+    text = repr([FIRST, SECOND])
+    assert str(FIRST.spec.seed)[2:] not in text
+    assert str(FIRST.protocol.seed) not in text
+
+
+@pytest.mark.parametrize(
+    ("answers", "code"),
+    [
+        (np.zeros((299, 1)), "answer_shape"),
+        (np.zeros((300, 2)), "answer_shape"),
+        (np.full((300, 1), np.nan), "answer_not_finite"),
+        (np.full((300, 1), np.inf), "answer_not_finite"),
+    ],
+)
+def test_wrong_answers_are_refused(answers: np.ndarray, code: str) -> None:
+    with pytest.raises(Rejection) as error:
+        read_answers(pack_table(answers), FIRST.spec, FIRST.protocol)
+    assert error.value.code == code
+    with pytest.raises(Rejection, match="answer_shape"):
+        read_answers(b"\x93NUMPY garbage", FIRST.spec, FIRST.protocol)
+
+
+def test_a_result_averages_instances_and_an_unanswered_one_scores_1() -> None:
+    run, versions = score_run(FIRST, policy(challenge(FIRST.spec, FIRST.protocol)), None)
+    failed, _ = score_run(SECOND, None, None)
+    assert failed == failed_run(SEASON.protocol, "deep", None)
+    result = sealed_result(SEASON, "sha256:" + "2" * 64, [run, failed], versions, 100)
+    assert result.scores.wd_regret.value == pytest.approx((run.wd_regret + 1) / 2)
+    low, high = result.scores.wd_regret.ends
+    assert low < result.scores.wd_regret.value < high
+    assert [member.runs for member in result.classes] == [2]
