@@ -45,6 +45,7 @@ class Analysis:
     learning_curves: pd.DataFrame
     regions: pd.DataFrame
     levels: pd.DataFrame
+    layers: pd.DataFrame
     agents: pd.DataFrame
     contrasts: pd.DataFrame
     aggregates: pd.DataFrame
@@ -81,6 +82,11 @@ class Analysis:
     def state_dims(self) -> list[int]:
         """The different state dimensions of the runs, in rising order."""
         return sorted(set(self.results.state_dim))
+
+    @property
+    def metrics(self) -> tuple[tables.Metric, ...]:
+        """The metrics of runs on single tasks."""
+        return tables.metrics_of(self.runs)
 
     @property
     def has_teams(self) -> bool:
@@ -135,6 +141,7 @@ def analyse(
         learning_curves=tables.learning_curves(curves, runs),
         regions=tables.regions(results),
         levels=tables.levels(results, bootstrap),
+        layers=tables.layers(frames.probes(plan, finished)),
         agents=tables.agents(runs, bootstrap),
         contrasts=tables.contrasts(runs, {n: c.axis for n, c in classes.items()}, bootstrap),
         aggregates=tables.aggregates(runs, compared, names, bootstrap),

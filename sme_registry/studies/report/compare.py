@@ -19,7 +19,13 @@ from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.exports import difference_table
 from sme_registry.studies.report.frames import StudyFrames, load, plan_file, runs
-from sme_registry.studies.report.tables import METRICS, Metric, differences
+from sme_registry.studies.report.tables import (
+    EXTENSION_METRICS,
+    METRICS,
+    Metric,
+    differences,
+    metrics_of,
+)
 from sme_registry.studies.report.text import TextTable
 
 __all__ = ["compare", "comparison_tables", "implementation_caveats", "write_comparison"]
@@ -39,7 +45,9 @@ def compare(
       study: the frames of `load`, or the study's folder.
       first: an algorithm's name in the plan.
       second: another one.
-      metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret".
+      metrics: of "wd_regret", "ood_regret", "ood_decay", "final_return", "online_regret"; where
+        tasks have safety "wd_cost", "wd_safe_regret", "online_cost"; where they have distractors
+        "distractor_regret", "wd_invariance".
 
     Returns:
       One row for each metric and class, and one for "all classes": first_level and second_level,
@@ -59,7 +67,7 @@ def compare(
         study = load(study)
     finished = runs(study.results)
     _check_names(first, second, list(dict.fromkeys(finished.algorithm)))
-    chosen = [_metric(name) for name in metrics]
+    chosen = [_metric(name, metrics_of(finished)) for name in metrics]
     table = differences(finished, [(first, second)], chosen)
     if table.empty:
         raise OptionError(
@@ -164,8 +172,8 @@ def _check_names(first: str, second: str, known: Sequence[str]) -> None:
         raise OptionError(f"{first!r}: is given twice. Give two different algorithms.")
 
 
-def _metric(name: str) -> Metric:
-    known = {metric.key: metric for metric in METRICS}
+def _metric(name: str, metrics: Sequence[Metric] = (*METRICS, *EXTENSION_METRICS)) -> Metric:
+    known = {metric.key: metric for metric in metrics}
     if name not in known:
         raise UnknownNameError(
             f"metric={name!r}: must be one of {', '.join(known)}.{did_you_mean(name, known)}"

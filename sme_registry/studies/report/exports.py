@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -12,7 +13,7 @@ import pandas as pd
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.offline_tables import OFFLINE_INTERVAL
 from sme_registry.studies.report.streams.texts import stream_csv, stream_tables
-from sme_registry.studies.report.tables import AGENT_METRICS, ENOUGH_RUNS, METRICS, Metric
+from sme_registry.studies.report.tables import AGENT_METRICS, ENOUGH_RUNS, Metric
 from sme_registry.studies.report.text import (
     TextTable,
     change_text,
@@ -33,7 +34,11 @@ _REGIONS = {"wd_regret": "WD", "ood_regret": "OOD"}
 
 def csv_tables(analysis: Analysis) -> dict[str, str]:
     """Every frame of the study as CSV, by name; floats read back as they are."""
-    optional = {"offline": analysis.has_offline_runs, "agents": analysis.has_teams}
+    optional = {
+        "offline": analysis.has_offline_runs,
+        "agents": analysis.has_teams,
+        "layers": not analysis.layers.empty,
+    }
     names = [*CSV_TABLES, *(name for name, present in optional.items() if present)]
     frames = {name: getattr(analysis, name) for name in names if analysis.classes}
     if analysis.streams is not None:
@@ -53,10 +58,11 @@ def text_tables(analysis: Analysis) -> list[TextTable]:
 def _task_tables(analysis: Analysis) -> list[TextTable]:
     return [
         *(offline_tables(analysis) if analysis.has_offline_runs else ()),
-        *(_levels(analysis, metric) for metric in METRICS),
+        *(_levels(analysis, metric) for metric in analysis.metrics),
+        _layers(analysis),
         *(_agents(analysis, metric) for metric in AGENT_METRICS),
-        *(_differences(analysis, metric) for metric in METRICS),
-        *(_contrasts(analysis, metric) for metric in METRICS),
+        *(_differences(analysis, metric) for metric in analysis.metrics),
+        *(_contrasts(analysis, metric) for metric in analysis.metrics),
         *(_regions(analysis, name) for name in analysis.algorithms),
         _aggregates(analysis),
         _improvements(analysis),
@@ -113,6 +119,26 @@ def _levels(analysis: Analysis, metric: Metric) -> TextTable:
             analysis.algorithms,
         ),
     )  # fmt: skip
+
+
+def _layers(analysis: Analysis) -> TextTable:
+    layer = analysis.layers.layer.map(str).replace("0", "observation")
+    return TextTable(
+        "layers",
+        "What the layers keep",
+        "Held-out R² of a linear map from a layer's outputs to the state and, after the comma, to "
+        "the distractors where there are any; IQM over runs, in the training cube.",
+        wide(
+            analysis.layers.assign(layer=layer), {"class_name": "class", "layer": "layer"},
+            "algorithm", _kept, analysis.algorithms,
+        ),
+        names=2,
+    )  # fmt: skip
+
+
+def _kept(row: Any) -> str:
+    kept = row.state_r2, row.distractor_r2
+    return ", ".join(fixed(value) for value in kept if not math.isnan(value))
 
 
 def _agents(analysis: Analysis, metric: Metric) -> TextTable:

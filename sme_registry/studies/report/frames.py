@@ -54,9 +54,11 @@ or NA for the other tasks:
 
     tightness                                             of the task's limits, τ
     online_cost                                           of the run: mean cost over training
+    wd_cost, wd_safe_regret                               of the run: those of the cube
     cost, violating_share, safe_regret, price_of_safety   of the region
     distractors, dynamics, mixing, mixing_depth           fields of the task's observation
     distractor_regret                                     of the run: mean over the shells of d
+    wd_invariance                                         of the run: that of the cube
     invariance                                            of the region
 """
 
@@ -88,13 +90,18 @@ _RUN = """wd_regret ood_regret ood_decay final_return online_regret uses:str act
     offline_similarity offline_similarity_sd improvement seconds steps_per_second key:str"""
 # Columns of a run, and of its regions, where the plan has tasks with these fields.
 _EXTENSIONS = {
-    "safety": ("tightness online_cost", "cost violating_share safe_regret price_of_safety"),
+    "safety": (
+        "tightness online_cost wd_cost wd_safe_regret",
+        "cost violating_share safe_regret price_of_safety",
+    ),
     "observation": (
-        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 distractor_regret",
+        "distractors:Int64 dynamics:string mixing:string mixing_depth:Int64 distractor_regret "
+        "wd_invariance",
         "invariance",
     ),
 }
 CURVES = RUN_COLUMNS + "step:int64 episode_return regret similarity length"
+_PROBES = RUN_COLUMNS + "layer:int64 units:int64 state_r2 distractor_r2"
 # Columns of each agent of a team, as in `wd_regret/agent_0`.
 AGENT_COLUMNS = ("normalised_regret", "wd_regret", "ood_regret", "online_regret")
 _RUN_OF_AGENT = tuple(f"{column}/" for column in AGENT_COLUMNS[1:])
@@ -177,6 +184,19 @@ def study_frames(plan: StudyPlan, results: Mapping[str, CellResult]) -> StudyFra
         frame(rows, RUN_COLUMNS + _REGION + _RUN + extensions + by_agent),
         frame(evaluations, CURVES + regrets),
     )
+
+
+def probes(plan: StudyPlan, results: Mapping[str, CellResult]) -> pd.DataFrame:
+    """One row per run and probed layer; see `evaluation.LayerProbe`. Empty without any."""
+    rows = [
+        place(planned) | probe.model_dump()
+        for planned in ordered(plan)
+        if (result := results.get(planned.cell.digest)) is not None
+        and (report := result.report) is not None
+        and report.observation is not None
+        for probe in report.observation.probes
+    ]
+    return frame(rows, _PROBES)
 
 
 def runs(results: pd.DataFrame) -> pd.DataFrame:
@@ -276,8 +296,13 @@ def _run_columns(result: CellResult, report: EvaluationReport) -> dict[str, Any]
         columns |= {} if block is None else block.to_dict()
     if cell.spec.safety is not None:
         columns["online_cost"] = math.nan if result.online_cost is None else result.online_cost
+    if report.safety is not None:
+        inside = report.safety.regions[0]
+        columns |= {"wd_cost": inside.cost, "wd_safe_regret": inside.safe_regret}
     if report.observation is not None:
         columns["distractor_regret"] = report.distractor_regret
+    if report.observation is not None and report.observation.invariance:
+        columns["wd_invariance"] = report.observation.invariance[0].invariance
     for name, agent in report.agents.items():
         wd, *shells = (region.normalised_regret for region in agent.regions)
         columns |= {

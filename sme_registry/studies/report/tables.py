@@ -16,6 +16,8 @@ Columns of each table, those that name the row first; class_name and algorithm a
                       linear_normalised_regret
     levels            metric: runs, iqm, low, high; linear: the linear policy's median on the same
                       tasks, NaN for metrics of training
+    layers            layer: runs; IQM over runs of state_r2 and distractor_r2, the held-out
+                      R² of a linear map from the layer to the state and to the distractors
     agents            agent, metric: runs, iqm, low, high; of each agent of a team
     contrasts         metric: axis; base, level: IQM on the first class and on this one; change,
                       low, high; pairs; enough_pairs; verdict: worse, better or open
@@ -82,8 +84,21 @@ METRICS = (
     Metric("final_return", "final return, % of optimum", -1, 1),
     Metric("online_regret", "online regret", 1),
 )
+# Of tasks with safety, or with distractors: columns that `runs` has where the plan has such tasks.
+EXTENSION_METRICS = (
+    Metric("wd_cost", "WD cost", 1, 3),
+    Metric("wd_safe_regret", "WD safe regret", 1),
+    Metric("online_cost", "online cost", 1, 3),
+    Metric("distractor_regret", "regret with distractors outside their cube", 1),
+    Metric("wd_invariance", "WD invariance", 1),
+)
 REGRET_METRICS = METRICS[:2]
 AGENT_METRICS = (*REGRET_METRICS, METRICS[4])
+
+
+def metrics_of(runs: pd.DataFrame) -> tuple[Metric, ...]:
+    """The metrics that a study's runs have."""
+    return (*METRICS, *(metric for metric in EXTENSION_METRICS if metric.key in runs.columns))
 
 
 @dataclass(frozen=True)
@@ -162,14 +177,26 @@ def levels(results: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
     """The IQM of every metric."""
     linear = {place: _linear_medians(rows) for place, rows in by_place(results).items()}
     rows = []
-    for place, group in by_place(runs(results)).items():
-        for metric in METRICS:
+    finished = runs(results)
+    for place, group in by_place(finished).items():
+        for metric in metrics_of(finished):
             values = group[metric.key].dropna().to_numpy()
             if len(values):
                 ends = bootstrap.interval(values, "level", *reversed(place), metric.key)
                 reference = linear[place].get(metric.key, math.nan)
                 rows.append((*place, metric.key, len(values), _iqm(values), *ends, reference))
     return frame(rows, f"{_PLACE} metric:str runs:int64 iqm low high linear")
+
+
+def layers(probes: pd.DataFrame) -> pd.DataFrame:
+    """What a linear map recovers from each layer, over runs; of what `frames.probes` has."""
+    by = probes.groupby([*PLACE, "layer"], sort=False)
+    kept = by.agg(
+        runs=("run", "size"),
+        state_r2=("state_r2", _iqm),
+        distractor_r2=("distractor_r2", _iqm),
+    )
+    return kept.reset_index()
 
 
 def agents(runs: pd.DataFrame, bootstrap: Bootstrap) -> pd.DataFrame:
@@ -190,12 +217,13 @@ def contrasts(
     runs: pd.DataFrame,
     axes: Mapping[str, str],
     bootstrap: Bootstrap,
-    metrics: Sequence[Metric] = METRICS,
+    metrics: Sequence[Metric] | None = None,
 ) -> pd.DataFrame:
     """What each class changes compared with the plan's first one, between runs of equal number.
 
-    `axes` has the axis of every class, by name.
+    `axes` has the axis of every class, by name; None for all metrics of the runs.
     """
+    metrics = metrics_of(runs) if metrics is None else metrics
     first = next(iter(axes), "")
     keys = [metric.key for metric in metrics]
     base = runs.loc[runs.class_name == first, ["algorithm", "run", *keys]]
@@ -222,7 +250,7 @@ def contrasts(
 def differences(
     runs: pd.DataFrame,
     pairs: Iterable[tuple[str, str]],
-    metrics: Sequence[Metric] = METRICS,
+    metrics: Sequence[Metric] | None = None,
     draws: int = statistics.DRAWS,
     instance: str = "spec_digest",
 ) -> pd.DataFrame:
@@ -230,8 +258,9 @@ def differences(
 
     Two runs of equal number on a class have the same instance and seed, and form a pair. The
     intervals depend only on the runs and the names, and those of B − A mirror those of A − B.
-    `instance` is the column that says on which instance a run is.
+    `instance` is the column that says on which instance a run is; None for all metrics of the runs.
     """
+    metrics = metrics_of(runs) if metrics is None else metrics
     rows = []
     for (first, second), metric in itertools.product(pairs, metrics):
         paired = _paired(runs, first, second, metric.key, instance)

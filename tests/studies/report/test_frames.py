@@ -129,6 +129,11 @@ def test_tasks_with_limits_and_observations_have_columns_of_them() -> None:
     assert run.mixing.dropna().to_dict() == {"driven": "none", "mixed": "nonlinear"}
     assert run.mixing_depth.dropna().to_dict() == {"mixed": 1}
     assert run.distractor_regret.dropna().index.to_list() == ["driven"]
+    inside = safety.regions[0]
+    assert run.wd_cost.dropna().to_dict() == {"safe": inside.cost}
+    assert run.wd_safe_regret.dropna().to_dict() == {"safe": inside.safe_regret}
+    first = observation.invariance[0].invariance
+    assert run.wd_invariance.dropna().to_dict() == {"driven": first}
     documented = set(re.findall(r"\w+", str(frames.__doc__)))
     assert not set(results) - documented
 
@@ -138,6 +143,8 @@ def test_plans_without_limits_and_observations_have_no_such_columns() -> None:
     limits = {
         "tightness",
         "online_cost",
+        "wd_cost",
+        "wd_safe_regret",
         "cost",
         "violating_share",
         "safe_regret",
@@ -145,7 +152,7 @@ def test_plans_without_limits_and_observations_have_no_such_columns() -> None:
     }
     assert safe - plain == limits
     fields = {"distractors", "dynamics", "mixing", "mixing_depth"}
-    assert driven - plain == fields | {"distractor_regret", "invariance"}
+    assert driven - plain == fields | {"distractor_regret", "invariance", "wd_invariance"}
     assert plain <= safe & driven
 
 
