@@ -1,6 +1,7 @@
-"""What a board accepts: uploads, submissions, and its own reference rows."""
+"""What a board accepts: uploads, submissions, sealed entries, and its own reference rows."""
 
 from leaderboard.intake.admission import admit, receive, submit_bundle
+from leaderboard.intake.entries import enter
 from leaderboard.intake.references import submit_references
 from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.uploads import UPLOAD_MINUTES, check_upload, upload_header, uploader
@@ -10,6 +11,7 @@ __all__ = [
     "Refusals",
     "admit",
     "check_upload",
+    "enter",
     "receive",
     "submit_bundle",
     "submit_references",
