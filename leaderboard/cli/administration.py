@@ -226,6 +226,13 @@ def serve(
             "Repeat it for several.",
         ),
     ] = None,
+    season_secret: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="File of the master of a sealed-online season, which is then stepped. Repeat it "
+            "for several.",
+        ),
+    ] = None,
     unsafe_no_sandbox: UnsafeNoSandbox = False,
 ) -> None:
     """Serve the board: its pages, and an API that accepts submissions, and score them.
@@ -251,6 +258,7 @@ def serve(
         url=url,
         trusted_proxies=trusted_proxy or (),
         unsafe_no_sandbox=unsafe_no_sandbox,
+        season_secrets=season_secret or (),
     )
 
 

@@ -8,6 +8,7 @@
     POST /api/withdrawals                200
     GET  /api/board?metric=wd_regret     the ranking
     GET  /api/log?start=0                a hundred entries of the signed log
+         /api/seasons/…                  sealed seasons, see `seasons`
     GET  /healthz                        200 while the server runs; scoring: ok, waiting or fault
 
 An error is {"code", "message"}: the code of a `Rejection`, or one of `errors.HTTP_CODES`. The
@@ -21,7 +22,7 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from typing import IO, Any, NamedTuple, get_args
 
 import anyio
@@ -44,6 +45,7 @@ from leaderboard.web import errors, limits
 from leaderboard.web.downloads import Downloads
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
+from leaderboard.web.seasons import SeasonRoutes
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import SMEError
 
@@ -67,6 +69,7 @@ def create_app(
     url: str = "",
     requests_of_address: int = limits.REQUESTS_OF_ADDRESS,
     isolation: Isolation = "bwrap",
+    season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> FastAPI:
     """The ASGI application of a board.
 
@@ -81,18 +84,21 @@ def create_app(
         those of this machine are not counted.
       isolation: of the scorers' sandboxes. "process", resource limits alone, is for a board to
         which nobody else can submit.
+      season_secrets: the masters of the sealed-online seasons that this server steps.
 
     Raises:
-      BoardError: the folder holds no board, or bubblewrap is to isolate scorers and does not work.
+      BoardError: the folder holds no board, bubblewrap is to isolate scorers and does not work, a
+        master is of no season of the board, or another server steps its season.
     """
     if score_workers:
         _refuse_missing(isolation)
     store = Store.open(os.fspath(path))
     routes = _Routes(store, upload_seconds, _PageCache(store, pages_kept, url))
+    seasons = SeasonRoutes(store, season_secrets)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with background_scorers(os.fspath(path), score_workers, isolation), store:
+        with store, background_scorers(os.fspath(path), score_workers, isolation), seasons.open():
             yield
 
     app = FastAPI(
@@ -112,6 +118,7 @@ def create_app(
     app.add_middleware(limits.RequestsByAddress, limit=requests_of_address)
     app.add_middleware(Guard)
     app.add_middleware(limits.RefusedBodies)  # the last one is the outermost
+    app.router.routes.extend(seasons.routes)
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])
     app.add_api_route("/api/objects/{digits}", routes.get_object, methods=["GET", "HEAD"])

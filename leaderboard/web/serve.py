@@ -38,6 +38,7 @@ def serve(
     url: str = "",
     trusted_proxies: Iterable[str] = (),
     unsafe_no_sandbox: bool = False,
+    season_secrets: Iterable[str | os.PathLike[str]] = (),
 ) -> None:
     """Serve a board and run its scorers until Ctrl-C or SIGTERM, which both end it cleanly.
 
@@ -57,10 +58,11 @@ def serve(
         connections. From anyone else the header is ignored.
       unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
         this account and use the network, so nobody else may be able to submit.
+      season_secrets: the files of the masters of the sealed-online seasons that are stepped.
 
     Raises:
-      BoardError: the folder holds no board, the address cannot be used, or bubblewrap, which the
-        scorers need, does not work.
+      BoardError: the folder holds no board, the address cannot be used, bubblewrap, which the
+        scorers need, does not work, or a master is of no season of the board.
       OptionError: the public address, or that of a proxy, is invalid.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
@@ -82,6 +84,7 @@ def serve(
         score_workers=workers,
         url=url.rstrip("/"),
         isolation="process" if unsafe_no_sandbox else "bwrap",
+        season_secrets=season_secrets,
     )
     config = server_config(app, Connections(limits, proxies))
     with listen(host, port) as listener:

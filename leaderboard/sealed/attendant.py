@@ -1,0 +1,115 @@
+"""`attending`: what a server does for its seasons beside requests: syncing, ending and scoring.
+
+Every second the journals are synced, and tickets that are over are closed and scored, one at a time
+in a process of its own, so that steps go on. A process that fails is tried again, after a second,
+then after growing pauses of up to five minutes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import threading
+import time
+from collections.abc import Collection, Iterator
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from leaderboard.documents.master import Master
+from leaderboard.sealed.scores import score_ticket
+from leaderboard.sealed.tickets import Tickets
+from leaderboard.store import Store
+from sme_registry.errors import SMEError
+
+_SECONDS = 1.0
+_FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0
+_STOP_SECONDS = 10.0
+_log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def attending(tickets: Collection[Tickets]) -> Iterator[None]:
+    """Sync, end and score in a thread while the block runs."""
+    if not tickets:
+        yield
+        return
+    stop = threading.Event()
+    attendants = [_Attendant(each) for each in tickets]
+
+    def attend() -> None:
+        while not stop.wait(_SECONDS):
+            for each in attendants:
+                each.attend()
+
+    thread = threading.Thread(target=attend, name="seasons", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        for each in attendants:
+            each.stop()
+
+
+class _Attendant:
+    """Of one season."""
+
+    def __init__(self, tickets: Tickets) -> None:
+        self._tickets = tickets
+        self._process: BaseProcess | None = None
+        self._pause, self._paused_until = _FIRST_PAUSE, 0.0
+
+    def attend(self) -> None:
+        """Sync the journals, and score the next ticket that is over."""
+        try:
+            self._tickets.sync()
+            if self._is_scoring() or time.monotonic() < self._paused_until:
+                return
+            for number in self._tickets.over():
+                self._tickets.close_ticket(number)
+                self._process = self._start(number)
+                return
+        except SMEError as error:  # the board is locked, or its disk is full
+            # Nothing but the kind of an error is logged: its text may name what is hidden.
+            _log.error("season: cannot be attended to: %s", type(error).__name__)
+
+    def stop(self) -> None:
+        """End the scoring; the next server does it."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.join(_STOP_SECONDS)
+
+    def _start(self, number: int) -> BaseProcess:
+        # Not forked: this process has threads, connections and locks.
+        process = multiprocessing.get_context("spawn").Process(
+            target=_score,
+            args=(self._tickets.board, self._tickets.digest, self._tickets.secret, number),
+            name="ticket",
+        )
+        process.start()
+        return process
+
+    def _is_scoring(self) -> bool:
+        if self._process is None or self._process.is_alive():
+            return self._process is not None
+        failed = self._process.exitcode != 0
+        self._process.close()
+        self._process = None
+        if failed:
+            _log.error("season: a ticket could not be scored; the next attempt follows")
+            self._paused_until = time.monotonic() + self._pause
+        self._pause = min(2.0 * self._pause, _LONGEST_PAUSE) if failed else _FIRST_PAUSE
+        return False
+
+
+def _score(board: Path, season: str, secret: Path, number: int) -> None:
+    """Score a ticket and log its result, in a process of its own."""
+    try:
+        with Store.open(board) as store:
+            result = score_ticket(store, store.season(season), Master.read(secret), number)
+            store.end_ticket(season, number, result)
+    except Exception as error:
+        _log.error("season: scoring a ticket failed: %s", type(error).__name__)
+        raise SystemExit(1) from None

@@ -1,0 +1,338 @@
+"""`SteppedInstance`: one hidden instance of a ticket, from its first step to its answers.
+
+    waiting ── start ──▶ stepping ── finish, or no step fits the budget ──▶ answering ──▶ answered
+
+Its files are `<number>.journal` and `<number>.npy` in the ticket's folder, and its state follows
+from them. Each method may be called again after a lost answer, without a further effect.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+from leaderboard.documents.reading import read_regular
+from leaderboard.documents.season import MAX_LANES, SeasonClass
+from leaderboard.errors import Rejection
+from leaderboard.scoring.sealed import Float32, read_answers, rows_of
+from leaderboard.sealed.journal import Journal
+from leaderboard.sealed.stepping import Lanes, Start
+from sme_registry import EvaluationProtocol, io
+from sme_registry.errors import ActionError, WireError
+from sme_registry.sealed import Begun, InstanceStatus, StepFormat, table_bytes
+
+Phase = Literal["waiting", "stepping", "answering", "answered"]
+
+
+class SteppedInstance:
+    """One hidden instance, for any number of threads.
+
+    Args:
+      folder: the ticket's.
+      number: of the instance in the ticket, from 0.
+      member: its class.
+      protocol: the season's.
+      start: derives what is hidden; called when it is needed.
+
+    Attributes:
+      budget: steps over all lanes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        number: int,
+        member: SeasonClass,
+        protocol: EvaluationProtocol,
+        start: Callable[[], Start],
+    ) -> None:
+        self._journal_path = folder / f"{number}.journal"
+        self._answers_path = folder / f"{number}.npy"
+        self._member = member
+        assert member.budget is not None  # the track is online
+        self.budget = member.budget
+        self._protocol = protocol
+        self._start = start
+        self._lock = threading.RLock()
+        self._journal: Journal | None = None
+        self._lanes: Lanes | None = None
+        self._format: StepFormat | None = None
+        self._last = b"", b""  # actions and answer of the last request
+        self._answered, self._closed = self._answers_path.exists(), False
+
+    @property
+    def phase(self) -> Phase:
+        """How far the entrant is."""
+        with self._lock:
+            journal = self._opened()
+            if self._answered:
+                return "answered"
+            if journal is None:
+                return "waiting"
+            spent = journal.steps + journal.lanes > self.budget
+            return "answering" if journal.ended or spent else "stepping"
+
+    @property
+    def status(self) -> InstanceStatus:
+        """What the entrant may know."""
+        with self._lock:
+            journal = self._opened()
+            return InstanceStatus(
+                phase=self.phase,
+                lanes=None if journal is None else journal.lanes,
+                requests=0 if journal is None else journal.requests,
+                used=0 if journal is None else journal.steps,
+            )
+
+    @property
+    def lanes(self) -> int:
+        """L; 0 before the start."""
+        journal = self._opened()
+        return 0 if journal is None else journal.lanes
+
+    @property
+    def journal(self) -> Journal | None:
+        """The steps; None before the start."""
+        with self._lock:
+            return self._opened()
+
+    @property
+    def stored_answers(self) -> tuple[Float32, str] | tuple[None, None]:
+        """The answers `[regions · n, A]` and the digest of their file; nothing without any.
+
+        Raises:
+          Rejection: `answer_shape` if the file was altered, `storage_full` if it cannot be read.
+        """
+        if not self._answered:
+            return None, None
+        with _storage():
+            data = read_regular(self._answers_path, self.answer_bytes)
+        digest = "sha256:" + hashlib.sha256(data).hexdigest()
+        return read_answers(data, self._member.setting, self._protocol), digest
+
+    @property
+    def answer_bytes(self) -> int:
+        """The most bytes of the answers' file."""
+        return table_bytes(rows_of(self._protocol), self._member.setting.action_dim)
+
+    @property
+    def answered(self) -> bool:
+        """Whether its answers are stored."""
+        return self._answered
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the next step needs no replay, and no other request is in progress."""
+        if self._lanes is None or not self._lock.acquire(blocking=False):
+            return False
+        self._lock.release()
+        return True
+
+    def start(self, lanes: int) -> bytes:
+        """Begin, or go on after a lost connection; the present observations.
+
+        Raises:
+          Rejection: `start_conflict`, `lanes_invalid`, `instance_phase` or `storage_full`.
+        """
+        with self._lock:
+            self._refuse_closed()
+            journal = self._opened()
+            if journal is None:
+                most = min(MAX_LANES, self.budget)
+                if not 1 <= lanes <= most:
+                    raise Rejection(
+                        "lanes_invalid", f"lanes={lanes}: must be in [1, {most}]. Correct it."
+                    )
+                journal = self._create(lanes)
+            if lanes != journal.lanes:
+                raise Rejection(
+                    "start_conflict",
+                    f"lanes={lanes}: the instance was started with {journal.lanes}. Go on with "
+                    "these.",
+                )
+            self._refuse_answered()
+            observation = self._present(journal).observation
+            assert self._format is not None  # with the lanes
+            return self._format.pack_begun(Begun(journal.requests, observation))
+
+    def step(self, body: bytes) -> bytes:
+        """Take the steps of a request, or answer the last one again.
+
+        Raises:
+          Rejection: `instance_phase`, `step_invalid`, `step_conflict`, `step_ahead`,
+            `budget_spent` or `storage_full`. No step was taken.
+        """
+        with self._lock:
+            self._refuse_closed()
+            journal = self._started()
+            self._refuse_answered()
+            lanes = self._present(journal)
+            assert self._format is not None  # with the lanes
+            try:
+                number, actions = self._format.unpack_request(body)
+            except (WireError, ActionError) as error:
+                raise Rejection("step_invalid", str(error)) from None
+            raw = body[-actions.nbytes :]
+            if number == journal.requests and raw == self._last[0]:
+                return self._last[1]
+            self._refuse_step(journal, number)
+            with _storage():
+                journal.append(raw)
+            self._last = raw, self._format.pack_steps(lanes.step(actions))
+            return self._last[1]
+
+    def finish(self) -> None:
+        """Take no more steps.
+
+        Raises:
+          Rejection: `ticket_ended` or `storage_full`.
+        """
+        with self._lock:
+            self._refuse_closed()
+            journal = self._opened() or self._create(1)
+            if self.phase == "stepping":
+                with _storage():
+                    journal.end()
+
+    def refuse_challenge(self) -> None:
+        """Raise `Rejection` (`instance_phase`) as long as steps may follow."""
+        phase = self.phase
+        if phase in ("waiting", "stepping"):
+            raise _wrong_phase(phase, "Take all steps, or finish it, before the challenge.")
+
+    def answer(self, data: bytes) -> bool:
+        """Store the answers to the challenge.
+
+        Args:
+          data: an .npy file of float32 actions `[rows, A]`, one for each challenge state.
+
+        Returns:
+          False if the same ones are stored.
+
+        Raises:
+          Rejection: `instance_phase`, `answer_shape`, `answer_not_finite`, `answer_conflict` or
+            `storage_full`.
+        """
+        with self._lock:
+            self._refuse_closed()
+            self.refuse_challenge()
+            read_answers(data, self._member.setting, self._protocol)
+            if self._answered:
+                if read_regular(self._answers_path, len(data) + 1) == data:
+                    return False
+                raise Rejection(
+                    "answer_conflict",
+                    "answers: others were stored for this instance, and count. Go on with the "
+                    "next instance.",
+                )
+            with _storage(), io.atomic_file(self._answers_path, new=True) as stream:
+                stream.write(data)
+            with _storage():
+                io.sync_folder(self._answers_path.parent)
+            self._answered = True
+            self.release()
+            return True
+
+    def sync(self) -> None:
+        """Make the steps taken survive a loss of power; raises OSError if the disk fails."""
+        journal = self._journal
+        if journal is not None:
+            journal.sync()
+
+    def close(self) -> None:
+        """Refuse all further requests, after those in progress."""
+        with self._lock:
+            self._closed = True
+            self.release()
+
+    def release(self) -> None:
+        """Free memory; the next steps replay the journal."""
+        with self._lock:
+            with contextlib.suppress(OSError):  # the steps survive all but a loss of power
+                self.sync()
+            self._lanes = self._format = None
+
+    def _opened(self) -> Journal | None:
+        """The journal; None before the start."""
+        if self._journal is None and self._journal_path.exists():
+            with _storage():
+                self._journal = Journal.open(self._journal_path)
+        return self._journal
+
+    def _create(self, lanes: int) -> Journal:
+        with _storage():
+            A = self._member.setting.action_dim
+            self._journal = Journal.create(self._journal_path, lanes, A)
+        return self._journal
+
+    def _started(self) -> Journal:
+        """The journal, or a rejection before the start."""
+        journal = self._opened()
+        if journal is None:
+            raise _wrong_phase("waiting", "Start it first.")
+        return journal
+
+    def _present(self, journal: Journal) -> Lanes:
+        """The lanes after the journal's steps, which are replayed where they are not in memory."""
+        if self._lanes is None:
+            setting = self._member.setting
+            lanes = Lanes(self._start(), journal.lanes)
+            wire = StepFormat(journal.lanes, setting.state_dim, setting.action_dim)
+            for actions in journal.actions():
+                steps = lanes.step(actions)
+            if journal.requests:
+                self._last = actions.tobytes(), wire.pack_steps(steps)
+            self._lanes, self._format = lanes, wire
+        return self._lanes
+
+    def _refuse_step(self, journal: Journal, number: int) -> None:
+        """Refuse steps that are not the next ones, or not in the budget."""
+        following = journal.requests + 1
+        if number < following:
+            raise Rejection(
+                "step_conflict",
+                f"number={number}: these steps were taken with other actions, or long ago. The "
+                f"next number is {following}.",
+            )
+        if number > following:
+            raise Rejection(
+                "step_ahead",
+                f"number={number}: must be {following}, the next one. Send that first.",
+            )
+        if journal.ended:
+            raise _wrong_phase(self.phase, "No more steps can be taken.")
+        if journal.steps + journal.lanes > self.budget:
+            raise Rejection(
+                "budget_spent",
+                f"steps: {journal.steps} of {self.budget} are taken, and {journal.lanes} more do "
+                "not fit. Answer the challenge.",
+            )
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise Rejection("ticket_ended", "ticket: has ended. What it had counts.")
+
+    def _refuse_answered(self) -> None:
+        if self._answered:
+            raise _wrong_phase("answered", "Go on with the next instance.")
+
+
+def _wrong_phase(phase: Phase, advice: str) -> Rejection:
+    return Rejection("instance_phase", f"instance: is {phase}. {advice}")
+
+
+@contextlib.contextmanager
+def _storage() -> Iterator[None]:
+    """Reject what the disk does not take."""
+    try:
+        yield
+    except OSError as error:
+        raise Rejection(
+            "storage_full",
+            f"storage: {error.strerror}. Nothing was changed. Send it again later, and tell the "
+            "board's owner.",
+        ) from None

@@ -1,0 +1,39 @@
+"""`score_ticket`: the result of a ticket that is over, from its journals and answers.
+
+An instance without answers scores 1 in every metric, whatever its steps.
+"""
+
+from __future__ import annotations
+
+from leaderboard.documents.master import Master
+from leaderboard.documents.result import SealedResult
+from leaderboard.documents.season import Season
+from leaderboard.scoring.sealed import score_run, sealed_result
+from leaderboard.sealed.regret import measured_steps
+from leaderboard.sealed.ticket import RunningTicket
+from leaderboard.store import Store
+
+
+def score_ticket(store: Store, season: Season, master: Master, number: int) -> SealedResult:
+    """Score a ticket.
+
+    Args:
+      store: the board.
+      season, master: the season.
+      number: the ticket's; nothing of it may change any more.
+
+    Raises:
+      Rejection: `ticket_unknown`, or `storage_full` if a file cannot be read.
+      TamperedError: a journal, or answers, are not those of the instance.
+    """
+    row = store.ticket(season.digest, number)
+    ticket = RunningTicket(store, season, master, row)
+    runs, stepping = [], []
+    versions: dict[str, str] = {}
+    for index, instance in enumerate(ticket.instances):
+        run, used = score_run(ticket.hidden(index), *instance.stored_answers)
+        runs.append(run)
+        versions |= used
+        stepping.append(measured_steps(ticket.start(index), instance.journal, instance.budget))
+    draws = store.document.draws
+    return sealed_result(season, row.entrant.id, runs, versions, draws, stepping)

@@ -1,0 +1,203 @@
+"""`Tickets`: those of one sealed-online season, whose master this server has."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import threading
+import time
+from collections import OrderedDict
+from pathlib import Path
+
+from leaderboard.documents.master import Master
+from leaderboard.documents.season import MAX_LANES, Season
+from leaderboard.errors import BoardError
+from leaderboard.sealed.instance import SteppedInstance
+from leaderboard.sealed.ticket import RunningTicket
+from leaderboard.store import Store
+from sme_registry.io import file_lock
+from sme_registry.sealed import StepFormat, TicketStatus
+
+MOST_HELD_LANES, _FIXED_LANES = 2**17, 128
+"""In memory, of all instances together, and what each takes besides its lanes.
+
+Those used longest ago are replayed when they go on.
+"""
+
+_LOCK = ".stepping"
+
+
+class Clock:
+    """The board's time, which does not go back while the server runs.
+
+    Args:
+      start: the store's time, as documents write it.
+    """
+
+    def __init__(self, start: str) -> None:
+        first = max(datetime.datetime.fromisoformat(start).timestamp(), time.time())
+        self._offset = first - time.monotonic()
+
+    @property
+    def now(self) -> float:
+        """Seconds since 1970."""
+        return max(time.time(), self._offset + time.monotonic())
+
+
+class Tickets:
+    """The tickets of one season, for any number of threads; `close` frees the season.
+
+    Args:
+      store: the board.
+      secret: the path of the season's master.
+
+    Raises:
+      BoardError: no online season of the board is committed to the master, or another server steps
+        the season.
+
+    Attributes:
+      season, digest: the season, and the digest of its document.
+      board, secret: paths of the board's folder and of the master.
+    """
+
+    def __init__(self, store: Store, secret: str | os.PathLike[str]) -> None:
+        self.master = Master.read(secret)
+        self.season = _season_of(store, self.master, secret)
+        self.digest = self.season.digest
+        folder = store.season_folder(self.digest)
+        lock = file_lock(folder.path / _LOCK)
+        if lock is None:
+            raise BoardError(
+                f"season={self.season.id}: another server steps it. Stop that one first."
+            )
+        self._process_lock = lock
+        self._store = store
+        self.board, self.secret = store.folder.path, Path(secret)
+        self._clock = Clock(store.time)
+        self._lock = threading.Lock()
+        self._running: dict[int, RunningTicket] = {}
+        self._held: OrderedDict[SteppedInstance, int] = OrderedDict()
+        self._held_lanes = 0
+
+    def ticket(self, number: int) -> RunningTicket:
+        """A ticket by its number.
+
+        Raises:
+          Rejection: `ticket_unknown`.
+        """
+        found = self._running.get(number)
+        if found is None:
+            row = self._store.ticket(self.digest, number)
+            found = RunningTicket(self._store, self.season, self.master, row)
+            with self._lock:
+                found = self._running.setdefault(number, found)
+        return found
+
+    @property
+    def now(self) -> float:
+        """The board's time in seconds since 1970."""
+        return self._clock.now
+
+    @property
+    def step_bytes(self) -> int:
+        """The most bytes of a request for steps, of any instance."""
+        dims = (member.setting.action_dim for member in self.season.classes)
+        return StepFormat(MAX_LANES, 1, max(dims)).request_bytes
+
+    def status(self, number: int, token: str) -> TicketStatus:
+        """How far an entrant is, with the password of the ticket."""
+        ticket = self.ticket(number)
+        ticket.refuse_token(token)
+        return ticket.status(self.now)
+
+    def answer_bytes(self, number: int, token: str, instance: int) -> int:
+        """The most bytes of an instance's answers, with the password of the ticket."""
+        return self._chosen(number, token, instance).answer_bytes
+
+    def start(self, number: int, token: str, instance: int, lanes: int) -> bytes:
+        """`SteppedInstance.start`, with the password of the ticket."""
+        chosen = self._chosen(number, token, instance)
+        answer = chosen.start(lanes)
+        self._hold(chosen)
+        return answer
+
+    def step(self, number: int, token: str, instance: int, body: bytes) -> bytes:
+        """`SteppedInstance.step`, with the password of the ticket."""
+        chosen = self._chosen(number, token, instance)
+        answer = chosen.step(body)
+        self._hold(chosen)
+        return answer
+
+    def finish(self, number: int, token: str, instance: int) -> None:
+        """`SteppedInstance.finish`, with the password of the ticket."""
+        self._chosen(number, token, instance).finish()
+
+    def challenge(self, number: int, token: str, instance: int) -> bytes:
+        """`RunningTicket.challenge`, with the password of the ticket."""
+        self._chosen(number, token, instance)
+        return self.ticket(number).challenge(instance)
+
+    def answer(self, number: int, token: str, instance: int, data: bytes) -> bool:
+        """`SteppedInstance.answer`, with the password of the ticket."""
+        return self._chosen(number, token, instance).answer(data)
+
+    def is_ready(self, number: int, instance: int) -> bool:
+        """Whether a step of this instance needs no replay, and waits for no other request."""
+        ticket = self._running.get(number)
+        instances = () if ticket is None else ticket.instances
+        return instance < len(instances) and instances[instance].is_ready
+
+    def over(self) -> list[int]:
+        """The numbers of tickets that are over and have no result, in order."""
+        waiting = [row.number for row in self._store.entrants(self.digest) if row.result is None]
+        return [number for number in waiting if self.ticket(number).is_over(self.now)]
+
+    def close_ticket(self, number: int) -> None:
+        """Refuse all further requests for a ticket, after those in progress."""
+        self.ticket(number).close()
+
+    def sync(self) -> None:
+        """Make all steps taken survive a loss of power."""
+        for each in list(self._held):
+            with contextlib.suppress(OSError):  # the next steps fail, too, and say so
+                each.sync()
+
+    def close(self) -> None:
+        """End what this server does for the season; another one can go on."""
+        for ticket in list(self._running.values()):
+            for each in ticket.instances:
+                each.release()
+        self._process_lock.release()
+
+    def _chosen(self, number: int, token: str, instance: int) -> SteppedInstance:
+        ticket = self.ticket(number)
+        ticket.refuse_token(token)
+        ticket.refuse_over(self.now)
+        return ticket.instance(instance)
+
+    def _hold(self, instance: SteppedInstance) -> None:
+        """Note that an instance was used, and free others if too many are held."""
+        freed = []
+        with self._lock:
+            if instance not in self._held:
+                self._held[instance] = instance.lanes + _FIXED_LANES
+                self._held_lanes += self._held[instance]
+            self._held.move_to_end(instance)
+            while self._held_lanes > MOST_HELD_LANES:
+                oldest, lanes = self._held.popitem(last=False)
+                self._held_lanes -= lanes
+                freed.append(oldest)
+        for each in freed:
+            each.release()
+
+
+def _season_of(store: Store, master: Master, secret: str | os.PathLike[str]) -> Season:
+    for row in store.seasons():
+        season = store.season(row.id)
+        if row.track == "sealed-online" and season.is_committed_to(master):
+            return season
+    raise BoardError(
+        f"{secret}: is the master of no sealed-online season of this board. Give the file that "
+        "`sme-leaderboard season new` wrote."
+    )

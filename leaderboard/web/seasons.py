@@ -1,0 +1,248 @@
+"""`SeasonRoutes`: the sealed-online track over HTTP; `sme_registry.sealed` defines the messages.
+
+    GET  /api/seasons                                           the board's seasons
+    GET  /api/seasons/{id}                                      one season, its state and its reveal
+    POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again
+    GET  /api/seasons/{id}/tickets/{n}                          its status
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/start      present observations
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
+    POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish     take no more steps
+    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge  challenge states
+    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
+
+Steps are answered in the event loop, where they take less time than a thread would; what replays a
+journal, or waits for the disk, runs in threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from typing import Any, NamedTuple, TypeVar
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from leaderboard import intake
+from leaderboard.documents.entry import SignedTicketRequest
+from leaderboard.documents.submission import Envelope
+from leaderboard.sealed import Tickets, attending
+from leaderboard.store import SeasonRow, Store
+from leaderboard.web import limits
+from leaderboard.web.errors import HTTP_CODES, RequestError
+from sme_registry import sealed
+
+_SEASON = "/api/seasons/{season}"
+_TICKET = _SEASON + "/tickets/{ticket:int}"
+_INSTANCE = _TICKET + "/instances/{instance:int}"
+_WORKERS = 4  # threads that replay journals, write answers and compute challenges
+_REQUESTS = 64  # for tickets, checked at the same time
+_BODY_SECONDS = 30.0
+_LARGEST = 2**31
+_TYPE = (b"content-type", b"application/octet-stream")
+_T = TypeVar("_T")
+
+
+class SeasonRoutes:
+    """The handlers of the online track.
+
+    Args:
+      store: the board.
+      secrets: paths of the masters of the seasons that this server steps.
+
+    Raises:
+      BoardError: a master belongs to no season of the board, or another server steps its season.
+    """
+
+    def __init__(self, store: Store, secrets: Iterable[str | os.PathLike[str]]) -> None:
+        self._store = store
+        self._tickets = {
+            each.season.id: each for each in (Tickets(store, path) for path in secrets)
+        }
+        self._threads = CapacityLimiter(_WORKERS)
+        self._requests = limits.Turns(_REQUESTS)
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[None]:
+        """End and score tickets while the block runs; afterwards another server may step them."""
+        try:
+            with attending(self._tickets.values()):
+                yield
+        finally:
+            for each in self._tickets.values():
+                each.close()
+
+    @property
+    def routes(self) -> list[Route]:
+        """For a Starlette application; steps first, since they come most often."""
+        return [
+            Route(f"{_INSTANCE}/steps", _Raw(self.step), methods=["POST"]),
+            Route(f"{_INSTANCE}/start", self.start, methods=["POST"]),
+            Route(f"{_INSTANCE}/finish", self.finish, methods=["POST"]),
+            Route(f"{_INSTANCE}/challenge", self.challenge, methods=["GET"]),
+            Route(f"{_INSTANCE}/answers", self.answer, methods=["PUT"]),
+            Route("/api/seasons", self.get_seasons, methods=["GET"]),
+            Route(_SEASON, self.get_season, methods=["GET"]),
+            Route(f"{_SEASON}/tickets", self.post_ticket, methods=["POST"]),
+            Route(_TICKET, self.get_ticket, methods=["GET"]),
+        ]
+
+    async def get_seasons(self, request: Request) -> Response:
+        """The board's seasons, in the order in which they were announced."""
+        rows = await self._in_thread(self._store.seasons)
+        return JSONResponse({"seasons": [self._view(row) for row in rows]})
+
+    async def get_season(self, request: Request) -> Response:
+        """One season, with its document, and its master after the reveal."""
+        name = request.path_params["season"]
+
+        def view() -> dict[str, Any]:
+            row = self._store.season_row(name)
+            master = self._store.revealed_master(row.digest).raw.hex() if row.reveal else None
+            document = self._store.season(row.digest).to_dict()
+            return {**self._view(row), "document": document, "master": master}
+
+        return JSONResponse(await self._in_thread(view))
+
+    def _view(self, row: SeasonRow) -> dict[str, Any]:
+        """What is public of a season in short."""
+        return {
+            "id": row.id,
+            "digest": row.digest,
+            "title": row.title,
+            "track": row.track,
+            "opens": row.opens,
+            "closes": row.closes,
+            "revealed": row.revealed or None,
+            "served": row.id in self._tickets,
+        }
+
+    async def post_ticket(self, request: Request) -> Response:
+        """Start a ticket."""
+        tickets = self.tickets_of(request.path_params["season"])
+        text = await limits.read_document(request, "ticket")
+
+        def start() -> tuple[sealed.Ticket, bool]:
+            envelope = Envelope.read(text, SignedTicketRequest)
+            number, new = intake.start_ticket(self._store, envelope, tickets.digest)
+            return tickets.ticket(number).document, new
+
+        ticket, new = await self._requests.run(start)
+        return JSONResponse(ticket.to_dict(), 201 if new else 200)
+
+    async def get_ticket(self, request: Request) -> Response:
+        """A ticket's status."""
+        tickets = self.tickets_of(request.path_params["season"])
+        number, token = _small(request.scope, "ticket"), _token(request.scope)
+        status = await self._in_thread(lambda: tickets.status(number, token))
+        return JSONResponse(status.to_dict())
+
+    async def start(self, request: Request) -> Response:
+        """Begin an instance, or go on."""
+        text = request.query_params.get("lanes", "")
+        if not (text.isascii() and text.isdigit() and len(text) < 10):
+            raise RequestError("bad_request", f"lanes={text!r:.80}: must be a number. Correct it.")
+        tickets, where = self.place(request.scope)
+        lanes = int(text)
+        return _octets(await self._in_thread(lambda: tickets.start(*where, lanes)))
+
+    async def finish(self, request: Request) -> Response:
+        """Take no more steps of an instance."""
+        tickets, where = self.place(request.scope)
+        await self._in_thread(lambda: tickets.finish(*where))
+        return Response()
+
+    async def challenge(self, request: Request) -> Response:
+        """The challenge states of an instance."""
+        tickets, where = self.place(request.scope)
+        return _octets(await self._in_thread(lambda: tickets.challenge(*where)))
+
+    async def answer(self, request: Request) -> Response:
+        """Store the answers to a challenge."""
+        tickets, where = self.place(request.scope)
+        limit = await self._in_thread(lambda: tickets.answer_bytes(*where))
+        chunks = limits.body_chunks(request, limit, limits.UPLOAD_SECONDS, "answers")
+        data = b"".join([chunk async for chunk in chunks])
+        new = await self._in_thread(lambda: tickets.answer(*where, data))
+        return Response(status_code=201 if new else 200)
+
+    async def step(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Take the steps of a request; without the objects that other requests get."""
+        tickets, where = self.place(scope)
+        chunks = limits.body_chunks(
+            Request(scope, receive), tickets.step_bytes, _BODY_SECONDS, "steps"
+        )
+        body = b"".join([chunk async for chunk in chunks])
+        if tickets.is_ready(where.ticket, where.instance):
+            answer = tickets.step(*where, body)
+        else:
+            answer = await self._in_thread(lambda: tickets.step(*where, body))
+        length = str(len(answer)).encode()
+        headers = [_TYPE, (b"content-length", length)]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": answer})
+
+    def tickets_of(self, season: str) -> Tickets:
+        """The tickets of a season that this server steps.
+
+        Raises:
+          Rejection: `season_unknown`, or `season_track` if the season is not online.
+          RequestError: `season_not_served`.
+        """
+        found = self._tickets.get(season)
+        if found is not None:
+            return found
+        self._store.season_row(season)
+        raise RequestError(
+            "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
+        )
+
+    def place(self, scope: Scope) -> tuple[Tickets, _Where]:
+        """The tickets and the instance that a request is for."""
+        parameters = scope["path_params"]
+        where = _Where(_small(scope, "ticket"), _token(scope), _small(scope, "instance"))
+        return self.tickets_of(parameters["season"]), where
+
+    async def _in_thread(self, work: Callable[[], _T]) -> _T:
+        return await to_thread.run_sync(work, limiter=self._threads)
+
+
+class _Where(NamedTuple):
+    """An instance of a ticket, and the password that a request sent for it."""
+
+    ticket: int
+    token: str
+    instance: int
+
+
+class _Raw:
+    """An ASGI application from a handler; Starlette gives functions a request, and no `send`."""
+
+    def __init__(self, handler: Callable[[Scope, Receive, Send], Awaitable[None]]) -> None:
+        self._handler = handler
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        await self._handler(scope, receive, send)
+
+
+def _small(scope: Scope, name: str) -> int:
+    """A number of the path; what no ticket or instance has is a number that none of them has."""
+    return min(int(scope["path_params"][name]), _LARGEST)
+
+
+def _token(scope: Scope) -> str:
+    """The password in the header `Authorization`; empty without one."""
+    for name, value in scope["headers"]:
+        if name == b"authorization":
+            text: str = value.decode("latin-1")
+            return text.removeprefix(sealed.bearer(""))
+    return ""
+
+
+def _octets(data: bytes) -> Response:
+    return Response(data, media_type="application/octet-stream")

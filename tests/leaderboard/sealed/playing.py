@@ -1,0 +1,52 @@
+"""A board with a small sealed-online season, and an entrant of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.season import Season
+from leaderboard.documents.submission import SignedManifest
+from leaderboard.store import Store
+from sme_registry import sealed
+from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.sealing import MASTER, signed_request, tiny_season
+
+Floats = npt.NDArray[np.float32]
+
+
+class Board(NamedTuple):
+    """A board's folder, its online season, and the file of the master."""
+
+    path: Path
+    season: Season
+    secret: Path
+
+    def request(self, key: SigningKey, nonce: int = 0, **fields: Any) -> SignedManifest:
+        """A signed request for a ticket."""
+        with Store.open(self.path) as store:
+            return signed_request(store, self.season, key, nonce, **fields)
+
+    def ticket(self, url: str, key: SigningKey, nonce: int = 0) -> sealed.Ticket:
+        """A ticket that a served board starts."""
+        answer = httpx.post(
+            url + sealed.tickets_path(self.season.id),
+            content=self.request(key, nonce).to_bytes(),
+            trust_env=False,
+        )
+        assert answer.status_code in (200, 201), answer.text
+        return sealed.Ticket.from_dict(answer.json())
+
+
+def online_board(folder: Path, **fields: Any) -> Board:
+    """A board with an open season of one class, 64 steps on each of two instances."""
+    season = tiny_season("sealed-online", **fields)
+    secret = MASTER.write(folder / "season.master")
+    with tiny_board(folder / "board") as store:
+        store.announce(season)
+    return Board(folder / "board", season, secret)
