@@ -1,6 +1,7 @@
-"""What a board accepts: uploads, submissions, and its own reference rows."""
+"""What a board accepts: uploads, submissions, sealed entries, and its own reference rows."""
 
 from leaderboard.intake.admission import admit, receive, submit_bundle
+from leaderboard.intake.entries import enter
 from leaderboard.intake.references import submit_references
 from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.tickets import start_ticket
@@ -11,6 +12,7 @@ __all__ = [
     "Refusals",
     "admit",
     "check_upload",
+    "enter",
     "receive",
     "start_ticket",
     "submit_bundle",

@@ -120,7 +120,7 @@ def admit(
         if key != store.document.key:
             check_room(store, key, len(signed.to_bytes()))
         for declared in _artefacts(submission).values():  # nor can `gc` take an artefact
-            _check_stored(store, key, declared)
+            check_stored(store, key, declared)
         return store.receive(signed)
 
 
@@ -168,6 +168,21 @@ def _check_quotas(
     limits = store.document.limits
     if key == store.document.key:
         return
+    check_daily_quota(store, key, moment, refused)
+    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
+    if waiting >= limits.waiting_submissions:
+        raise Rejection(
+            "quota",
+            f"board: the queue is full, with {waiting} of {limits.waiting_submissions} waiting "
+            "submissions. Send it again when some of them are scored.",
+        )
+
+
+def check_daily_quota(
+    store: Store, key: str, moment: datetime.datetime, refused: Sequence[str] = ()
+) -> None:
+    """Reject (`quota`) one more submission or entry of a key that has sent a day's number."""
+    limits = store.document.limits
     times = sorted([*store.submission_times(key, *quota_window(moment)), *refused])
     if len(times) >= limits.submissions_per_day:
         first = datetime.datetime.fromisoformat(times[-limits.submissions_per_day])
@@ -177,13 +192,6 @@ def _check_quotas(
             f"key={key[:16]}…: has sent {len(times)} of {limits.submissions_per_day} submissions "
             f"within 24 hours, {len(refused)} of them refused. Send the next one after "
             f"{utc(free)}.",
-        )
-    waiting = store.queue.queued()  # those that faults have stopped take nobody's place
-    if waiting >= limits.waiting_submissions:
-        raise Rejection(
-            "quota",
-            f"board: the queue is full, with {waiting} of {limits.waiting_submissions} waiting "
-            "submissions. Send it again when some of them are scored.",
         )
 
 
@@ -196,7 +204,7 @@ def _check_artefacts(store: Store, submission: Submission, artefact: ReadArtefac
     """Check that all are present with the declared sizes; then inspect one after the other."""
     if artefact is None:
         for declared in _artefacts(submission).values():
-            _check_stored(store, submission.submitter.key, declared)
+            check_stored(store, submission.submitter.key, declared)
     instances = store.document.instances
     dimensions: dict[str, set[tuple[int, int]]] = {}
     for run in submission.runs:
@@ -223,7 +231,7 @@ def _inspect(read: ReadArtefact, digest: str, observation_dim: int, action_dim: 
         raise Rejection(*verdict)
 
 
-def _check_stored(store: Store, key: str, declared: Artefact) -> None:
+def check_stored(store: Store, key: str, declared: Artefact) -> None:
     """Check that the key has uploaded an artefact; if not, say nothing about it."""
     digest = declared.sha256
     if not (store.possesses(key, digest) and store.objects.has(digest)):

@@ -14,21 +14,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from leaderboard.artefact.answers import Float32 as Float32
+from leaderboard.artefact.answers import read_answers as read_answers
+from leaderboard.artefact.answers import rows_of as rows_of
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master, Place
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Hidden, Season, Terms
-from leaderboard.errors import Rejection
 from leaderboard.scoring.aggregation import Groups, class_score, is_oracle_like, method_scores
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
-from sme_registry.errors import ActionError, WireError
-from sme_registry.sealed import unpack_table
-from sme_registry.spec import Setting
-
-Float32 = npt.NDArray[np.float32]
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
@@ -57,11 +53,6 @@ class Instance:
     def rows(self) -> int:
         """The number of challenge states: of each region as many, region after region."""
         return rows_of(self.protocol)
-
-
-def rows_of(protocol: EvaluationProtocol) -> int:
-    """The number of challenge states of an instance."""
-    return protocol.states_per_region * len(protocol.edges)
 
 
 def instances(
@@ -100,28 +91,6 @@ def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
 
     evaluate(record, spec, protocol, action_range="unit", name="challenge")
     return np.concatenate(shown)
-
-
-def read_answers(data: bytes, setting: Setting, protocol: EvaluationProtocol) -> Float32:
-    """The answers in the bytes of an .npy file, whose reading runs no code.
-
-    Args:
-      data: the file.
-      setting: of the task, or its spec.
-      protocol: the regions.
-
-    Returns:
-      `[regions · n, A]` finite actions, which are not clipped yet.
-
-    Raises:
-      Rejection: `answer_shape` or `answer_not_finite`.
-    """
-    try:
-        return unpack_table(data, setting.action_dim, rows_of(protocol))
-    except WireError as error:
-        raise Rejection("answer_shape", str(error)) from None
-    except ActionError as error:
-        raise Rejection("answer_not_finite", str(error)) from None
 
 
 def score_run(

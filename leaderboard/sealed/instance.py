@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
+from leaderboard.artefact.answers import Float32, read_answers, rows_of
 from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_LANES, SeasonClass
 from leaderboard.errors import Rejection
-from leaderboard.scoring.sealed import Float32, read_answers, rows_of
 from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, io

@@ -327,11 +327,15 @@ class Store(SealedStore):
             )
 
     def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:
-        """When each submission of a key was received, in order: after `since`, up to `until`."""
+        """When each submission, or sealed entry, of a key was received, in order.
+
+        After `since`, up to `until`.
+        """
         with self.reading() as index:
             rows = index.connection.execute(
-                "SELECT received FROM entry WHERE key = ? AND received > ? AND received <= ? "
-                "ORDER BY received",
+                "SELECT received FROM (SELECT key, received FROM entry "
+                "UNION ALL SELECT key, received FROM sealed) "
+                "WHERE key = ? AND received > ? AND received <= ? ORDER BY received",
                 (key, since, until),
             )
             return [received for (received,) in rows]

@@ -12,6 +12,7 @@ from sme_registry.datasets.recipe import Behaviour, DatasetRecipe
 from sme_registry.datasets.record import DatasetRecord
 from sme_registry.datasets.replay import replay
 from sme_registry.datasets.returns import ExactReturn, exact_return, positions
+from sme_registry.datasets.sealed import SealedDataset
 from sme_registry.datasets.storage import (
     Dataset,
     check_location,
@@ -26,6 +27,7 @@ __all__ = [
     "DatasetRecipe",
     "DatasetRecord",
     "ExactReturn",
+    "SealedDataset",
     "Transitions",
     "check_location",
     "collect",

@@ -12,6 +12,7 @@ observations and actions cannot be misaligned.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -95,13 +96,18 @@ class Transitions:
 
     @property
     def digest(self) -> str:
-        """`sha256:` and 64 hex digits over the names, types, shapes and bytes of all arrays."""
-        content = hashlib.sha256()
-        for name, array in self.columns().items():
-            little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-            content.update(f"{name}/{little.dtype.str}/{little.shape}\n".encode())
-            content.update(little.data)
-        return "sha256:" + content.hexdigest()
+        """`digest_of` all arrays."""
+        return digest_of(self.columns())
+
+
+def digest_of(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+    """`sha256:` and 64 hex digits over the names, types, shapes and bytes of arrays, in order."""
+    content = hashlib.sha256()
+    for name, array in arrays.items():
+        little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+        content.update(f"{name}/{little.dtype.str}/{little.shape}\n".encode())
+        content.update(little.data)
+    return "sha256:" + content.hexdigest()
 
 
 def to_d3rlpy(

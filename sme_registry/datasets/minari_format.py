@@ -11,8 +11,9 @@ These are of fixed size, so Minari cannot append steps to an existing episode.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from sme_registry.datasets.arrays import Transitions
 from sme_registry.datasets.record import KEY, DatasetRecord
+from sme_registry.envs.types import Mask, Observation
 from sme_registry.io import require_packages
 from sme_registry.registration import env_spec
 from sme_registry.spec import SMESpec
@@ -68,23 +70,11 @@ def minari_dataset(data_folder: Path) -> Any:
 
 def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> dict[str, Any]:
     """Minari's metadata of a data set, with our record in it."""
-    import minari
-    from minari.serialization import serialize_space
-
     recipe, scores = record.recipe, record.scores
     observation_dim = recipe.spec.observation_dim - 1 + len(agents(recipe.spec))
-    observation_space, action_space = (
-        gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32)
-        for width in (observation_dim, recipe.spec.action_dim)
-    )
-    metadata: dict[str, Any] = {
-        "total_episodes": record.trajectories,
-        "total_steps": recipe.transitions,
-        "data_format": "hdf5",
-        "jpeg_encoding": False,
-        "observation_space": serialize_space(observation_space),
-        "action_space": serialize_space(action_space),
-        "dataset_id": dataset_id,
+    widths = observation_dim, recipe.spec.action_dim
+    metadata = {
+        **plain_metadata(dataset_id, widths, record.trajectories, recipe.transitions, size_bytes),
         "algorithm_name": " + ".join(
             f"{behaviour.weight:g} × {behaviour.label}" for behaviour in recipe.behaviours
         ),
@@ -94,7 +84,6 @@ def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> 
             "scores are returns: the least of the constant action 0.5, the greatest of π*."
         ),
         "requirements": [f"sme-registry>={record.versions['sme_registry']}"],
-        "minari_version": minari.__version__,
     }
     if recipe.spec.team is None:  # Gymnasium has no environments for several agents
         metadata["env_spec"] = env_spec(recipe.spec).to_json()
@@ -105,11 +94,100 @@ def minari_metadata(dataset_id: str, record: DatasetRecord, size_bytes: int) -> 
             "ref_max_score": ceiling.mean_return,
             "num_episodes_average_score": floor.episodes,
         }
-    return {**metadata, KEY: record.to_dict(), "dataset_size": round(size_bytes / 1e6, 1)}
+    return {**metadata, KEY: record.to_dict()}
+
+
+def plain_metadata(
+    dataset_id: str, widths: tuple[int, int], episodes: int, steps: int, size_bytes: int
+) -> dict[str, Any]:
+    """The metadata that Minari needs; nothing in it is about the task but its dimensions.
+
+    `widths` are those of observations and actions.
+    """
+    import minari
+    from minari.serialization import serialize_space
+
+    observation_space, action_space = (
+        gymnasium.spaces.Box(0.0, 1.0, (width,), np.float32) for width in widths
+    )
+    return {
+        "total_episodes": episodes,
+        "total_steps": steps,
+        "data_format": "hdf5",
+        "jpeg_encoding": False,
+        "observation_space": serialize_space(observation_space),
+        "action_space": serialize_space(action_space),
+        "dataset_id": dataset_id,
+        "minari_version": minari.__version__,
+        "dataset_size": round(size_bytes / 1e6, 1),
+    }
+
+
+class Episode(NamedTuple):
+    """One episode of a file: its attributes, its arrays, and its infos by name."""
+
+    attributes: dict[str, int]
+    arrays: dict[str, npt.NDArray[Any]]
+    infos: dict[str, npt.NDArray[Any]]
+
+
+def visible_episode(
+    number: int,
+    observations: Observation,
+    last_observation: Observation,
+    **arrays: npt.NDArray[Any],
+) -> Episode:
+    """An episode as its agent saw it.
+
+    Args:
+      number: from 0.
+      observations: `[T, O]` before each step.
+      last_observation: `[1, O]` after the last one.
+      arrays: `[T, …]` actions, rewards, terminations and truncations.
+    """
+    seen = np.concatenate([observations, last_observation])
+    attributes = {"id": number, "total_steps": len(observations)}
+    return Episode(attributes, {"observations": seen, **arrays}, {})
 
 
 def to_hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:
-    """The content of `main_data.hdf5`; the same arrays give the same bytes.
+    """The content of `main_data.hdf5`; the same arrays give the same bytes."""
+    return hdf5_content(_episodes(transitions, record.recipe.spec))
+
+
+def _episodes(transitions: Transitions, spec: SMESpec) -> Iterator[Episode]:
+    columns = transitions.columns()
+    truncations = truncations_of(transitions, spec)
+    infos = {info: columns[name] for info, name in _infos(spec).items()}
+    first = 0
+    for number, end in enumerate(transitions.ends.tolist()):
+        rows, last = slice(first, end), slice(end - 1, end)
+        episode = visible_episode(
+            number,
+            transitions.observations[rows],
+            transitions.next_observations[last],
+            actions=transitions.actions[rows],
+            rewards=transitions.rewards[rows],
+            terminations=transitions.terminations[rows],
+            truncations=truncations[rows],
+        )
+        episode.attributes["behaviour"] = int(transitions.components[first])
+        for info, (before, after) in _position_infos(spec).items():
+            episode.infos[info] = np.concatenate([columns[before][rows], columns[after][last]])
+        for info, column in infos.items():
+            episode.infos[info] = np.concatenate([column[rows], column[last]])
+        yield episode
+        first = end
+
+
+def truncations_of(transitions: Transitions, spec: SMESpec) -> Mask:
+    """`[N]` truncations: the task also truncates at its horizon when that step terminates."""
+    at_horizon: Mask = transitions.next_observations[:, spec.observation_dim - 2] == 1.0
+    return transitions.timeouts | at_horizon
+
+
+def hdf5_content(episodes: Iterable[Episode]) -> bytes:
+    """The content of `main_data.hdf5` with these episodes.
 
     Built in memory, so that a full disk fails one write instead of HDF5 in the middle of its work.
     h5py's low-level interface takes half the time: short episodes are many tiny objects.
@@ -131,32 +209,16 @@ def to_hdf5(transitions: Transitions, record: DatasetRecord) -> bytes:
         )
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(array))
 
-    columns, spec = transitions.columns(), record.recipe.spec
-    infos = {info: columns[name] for info, name in _infos(spec).items()}
-    observations, next_observations = transitions.observations, transitions.next_observations
-    # The task also truncates at its horizon when the same step terminates the episode.
-    at_horizon = next_observations[:, spec.observation_dim - 2] == 1.0
-    truncations = transitions.timeouts | at_horizon
     with h5py.File("memory", "w", driver="core", backing_store=False, block_size=2**22) as file:
-        first = 0
-        for number, end in enumerate(transitions.ends.tolist()):
-            rows, last = slice(first, end), slice(end - 1, end)
-            episode = file.create_group(f"episode_{number}")
-            episode.attrs["id"] = number
-            episode.attrs["total_steps"] = end - first
-            episode.attrs["behaviour"] = int(transitions.components[first])
-            seen = np.concatenate([observations[rows], next_observations[last]])
-            put(episode.id, "observations", seen)
-            put(episode.id, "actions", transitions.actions[rows])
-            put(episode.id, "rewards", transitions.rewards[rows])
-            put(episode.id, "terminations", transitions.terminations[rows])
-            put(episode.id, "truncations", truncations[rows])
-            group = episode.create_group("infos").id
-            for info, (before, after) in _position_infos(spec).items():
-                put(group, info, np.concatenate([columns[before][rows], columns[after][last]]))
-            for info, column in infos.items():
-                put(group, info, np.concatenate([column[rows], column[last]]))
-            first = end
+        for episode in episodes:
+            group = file.create_group(f"episode_{episode.attributes['id']}")
+            for name, value in episode.attributes.items():
+                group.attrs[name] = value
+            for name, array in episode.arrays.items():
+                put(group.id, name, array)
+            infos = group.create_group("infos").id
+            for name, array in episode.infos.items():
+                put(infos, name, array)
         file.flush()
         return bytes(file.id.get_file_image())
 
@@ -172,12 +234,6 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
     spec = record.recipe.spec
     parts: dict[str, list[npt.NDArray[Any]]] = {}
 
-    def get(group: Any, name: str) -> npt.NDArray[Any]:
-        stored = h5py.h5d.open(group, name.encode())
-        array = np.empty(stored.shape, stored.dtype)
-        stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
-        return array
-
     def add(**arrays: npt.NDArray[Any]) -> None:
         for name, array in arrays.items():
             parts.setdefault(name, []).append(array)
@@ -185,22 +241,52 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
     with h5py.File(path, "r") as file:
         for number in range(record.trajectories):
             episode = file[f"episode_{number}"]
-            observations = get(episode.id, "observations")
-            terminations = get(episode.id, "terminations")
+            truncations = _get(episode.id, "truncations")
+            add(**(seen := _visible(episode.id)))
             add(
-                observations=observations[:-1],
-                actions=get(episode.id, "actions"),
-                rewards=get(episode.id, "rewards"),
-                next_observations=observations[1:],
-                terminations=terminations,
-                timeouts=get(episode.id, "truncations") & ~terminations,
-                episodes=np.full(len(terminations), number, np.int64),
-                components=np.full(len(terminations), episode.attrs["behaviour"], np.int64),
+                timeouts=truncations & ~seen["terminations"],
+                episodes=np.full(len(truncations), number, np.int64),
+                components=np.full(len(truncations), episode.attrs["behaviour"], np.int64),
             )
             infos = h5py.h5g.open(episode.id, b"infos")
             for info, (before, after) in _position_infos(spec).items():
-                positions = get(infos, info)
+                positions = _get(infos, info)
                 add(**{before: positions[:-1], after: positions[1:]})
             for info, name in _infos(spec).items():
-                add(**{name: get(infos, info)[:-1]})
+                add(**{name: _get(infos, info)[:-1]})
     return Transitions(**{name: np.concatenate(arrays) for name, arrays in parts.items()})
+
+
+def read_visible(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a `main_data.hdf5` that agents see, with the truncations.
+
+    Raises:
+      OSError, KeyError, ValueError, RuntimeError: h5py cannot read it, or a part is missing.
+    """
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        episodes = [file[f"episode_{number}"].id for number in range(len(file))]
+        parts = [{**_visible(each), "truncations": _get(each, "truncations")} for each in episodes]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _visible(episode: Any) -> dict[str, npt.NDArray[Any]]:
+    """The columns of an episode's group that an agent sees, without truncations."""
+    observations = _get(episode, "observations")
+    return {
+        "observations": observations[:-1],
+        "actions": _get(episode, "actions"),
+        "rewards": _get(episode, "rewards"),
+        "next_observations": observations[1:],
+        "terminations": _get(episode, "terminations"),
+    }
+
+
+def _get(group: Any, name: str) -> npt.NDArray[Any]:
+    import h5py
+
+    stored = h5py.h5d.open(group, name.encode())
+    array = np.empty(stored.shape, stored.dtype)
+    stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
+    return array

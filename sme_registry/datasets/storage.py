@@ -182,12 +182,19 @@ def write_dataset(
     check_target(target, folder, record.recipe, force)
     content = to_hdf5(transitions, record)
     metadata = minari_metadata(dataset_id, record, len(content))
+    write_minari(target, folder, content, metadata, force=force)
+    return Dataset(dataset_id, target, record)
+
+
+def write_minari(
+    target: Path, folder: Path, content: bytes, metadata: dict[str, Any], *, force: bool
+) -> None:
+    """Write the files of a data set in the root of all data sets, completely or not at all."""
     with build_folder(target, force=force) as building:
         _write_namespaces(target.parent, folder)
         (building / "data").mkdir()
         (building / "data" / DATA).write_bytes(content)
         (building / "data" / METADATA).write_bytes(to_json(metadata).encode())
-    return Dataset(dataset_id, target, record)
 
 
 def _write_namespaces(namespace: Path, folder: Path) -> None:

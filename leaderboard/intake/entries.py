@@ -1,0 +1,90 @@
+"""Entries of sealed-offline seasons: read, checked, then stored in the signed log.
+
+The answers come first, as uploads of the entrant's key. Nothing is scored before the reveal.
+"""
+
+from __future__ import annotations
+
+import datetime
+
+from leaderboard.artefact.answers import read_answers
+from leaderboard.documents.checks import check_board, check_names, check_time
+from leaderboard.documents.entry import SignedEntry
+from leaderboard.documents.season import Season
+from leaderboard.documents.submission import Artefact
+from leaderboard.errors import Rejection
+from leaderboard.intake.admission import ReadArtefact, check_daily_quota, check_name, check_stored
+from leaderboard.intake.uploads import check_room
+from leaderboard.store import Store
+
+
+def enter(
+    store: Store,
+    signed: SignedEntry,
+    at: datetime.datetime | None = None,
+    answers: ReadArtefact | None = None,
+) -> bool:
+    """Check an entry and store it.
+
+    Args:
+      store: the board.
+      signed: the entry, its signature verified.
+      at: time of arrival; now by default.
+      answers: returns the bytes of an answer by digest; they are stored with the entry. By default
+        the entrant's key has uploaded them.
+
+    Returns:
+      True if it is new, False if the board already has it.
+
+    Raises:
+      Rejection: with the code of the first fault.
+    """
+    check_board(store.document, signed.board)
+    if store.entrant(signed.id) is not None:
+        return False
+    entry, key = signed.entry, signed.entry.submitter.key
+    check_names(entry, store.document.key)
+    moment = at or datetime.datetime.now(datetime.UTC)
+    check_time(entry.created, moment, store.document.limits.age_days)
+    store.open_season(entry.season, "sealed-offline")
+    season = store.season(entry.season)
+    check_name(store, entry.submitter)
+    check_daily_quota(store, key, moment)
+    given = _check_answers(store, season, signed, answers)
+    if answers is not None:
+        for answer in given:
+            store.put_object(answer.sha256, [answers(answer.sha256)], by=key)
+    with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
+        check_name(store, entry.submitter)
+        check_daily_quota(store, key, moment)
+        check_room(store, key, len(signed.to_bytes()))
+        for answer in given:
+            check_stored(store, key, answer)
+        return store.enter(signed)
+
+
+def _check_answers(
+    store: Store, season: Season, signed: SignedEntry, read: ReadArtefact | None
+) -> list[Artefact]:
+    """The answers that are not null, each in the shape of its instance's challenge."""
+    entry, hidden = signed.entry, list(season.hidden)
+    if len(entry.answers) != len(hidden):
+        raise Rejection(
+            "answer_missing",
+            f"answers: has {len(entry.answers)}: must have {len(hidden)}, one for each instance of "
+            f"the season {season.id}, null where the method failed.",
+        )
+    given = []
+    for number, (answer, each) in enumerate(zip(entry.answers, hidden, strict=True)):
+        if answer is None:
+            continue
+        if read is None:
+            check_stored(store, entry.submitter.key, answer)
+        try:
+            data = (read or store.objects.read)(answer.sha256)
+            read_answers(data, each.member.setting, season.protocol)
+        except Rejection as error:
+            where = f"answers.{number} (class {each.member.name}, instance {each.instance})"
+            raise Rejection(error.code, f"{where}: {error.message}") from None
+        given.append(answer)
+    return given

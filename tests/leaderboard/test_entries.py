@@ -1,0 +1,136 @@
+"""Entries of a sealed-offline season: what a board accepts, and what it refuses with which code."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard import intake
+from leaderboard.documents.entry import Entry, SignedEntry
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.submission import Envelope
+from leaderboard.errors import Rejection
+from leaderboard.store import Store
+from sme_registry.errors import SpecError
+from sme_registry.sealed import pack_table
+from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.sealing import manifest, moment, signed_entry, tiny_season
+
+SEASON = tiny_season()
+GOOD = pack_table(np.full((300, 1), 0.5, np.float32))
+NOT_FINITE = GOOD.replace(b"\0\0\0?", b"\0\0\xc0\x7f")
+
+
+def digest(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def entry(store: Store, key: SigningKey, *answers: bytes | None, **fields: Any) -> SignedEntry:
+    named = [
+        None if data is None else {"sha256": digest(data), "size": len(data)} for data in answers
+    ]
+    return signed_entry(store, SEASON, key, named, **fields)
+
+
+def send(store: Store, signed: SignedEntry, *answers: bytes) -> bool:
+    return intake.enter(store, signed, answers={digest(data): data for data in answers}.__getitem__)
+
+
+@pytest.fixture(autouse=True)
+def announced(store: Store) -> None:
+    store.announce(SEASON)
+
+
+def refused(store: Store, signed: SignedEntry, *answers: bytes) -> str:
+    before = store.head
+    with pytest.raises(Rejection) as error:
+        send(store, signed, *answers)
+    assert store.head == before
+    return error.value.code
+
+
+def test_an_entry_is_stored_once_with_its_answers(store, key):
+    signed = entry(store, key, GOOD, None)
+    assert send(store, signed, GOOD)
+    assert not send(store, signed, GOOD)
+    [row] = store.entrants(SEASON.digest)
+    assert (row.entrant.runs, row.entrant.policies) == (2, 1)
+    assert store.objects.read(digest(GOOD)) == GOOD
+    assert not store.is_public(digest(GOOD))
+
+
+def test_answers_may_be_uploaded_before(store, key):
+    signed = entry(store, key, GOOD, GOOD)
+    with pytest.raises(Rejection, match="artefact_missing"):
+        intake.enter(store, signed)
+    store.put_object(digest(GOOD), [GOOD], by=SigningKey.generate().public)
+    with pytest.raises(Rejection, match="artefact_missing"):
+        intake.enter(store, signed)
+    store.put_object(digest(GOOD), [GOOD], by=key.public)
+    assert intake.enter(store, signed)
+
+
+@pytest.mark.parametrize(
+    ("answer", "code"),
+    [
+        (pack_table(np.zeros((299, 1))), "answer_shape"),
+        (pack_table(np.zeros((300, 2))), "answer_shape"),
+        (b"", "answer_shape"),
+        (GOOD[:-1], "answer_shape"),
+        (GOOD.replace(b"<f4", b"|O4"), "answer_shape"),
+        (NOT_FINITE, "answer_not_finite"),
+    ],
+)
+def test_bad_answers_are_refused(store, key, answer, code):
+    signed = entry(store, key, GOOD, answer or b"0")
+    assert refused(store, signed, GOOD, answer or b"0") == code
+
+
+def test_bad_entries_are_refused_with_stable_codes(store, key):
+    other = SigningKey.generate()
+    assert refused(store, entry(store, key, GOOD), GOOD) == "answer_missing"
+    assert refused(store, entry(store, key, None, None, created=moment(-30))) == "stale_time"
+    unsafe = {"name": "<b>", "key": key.public}
+    assert refused(store, entry(store, key, None, None, submitter=unsafe)) == "unsafe_name"
+    reserved = {"name": "the board", "key": key.public}
+    assert refused(store, entry(store, key, None, None, submitter=reserved)) == "unsafe_name"
+    elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
+    assert refused(store, elsewhere) == "season_unknown"
+    unbound = entry(store, key, None, None).entry.signed(key, None)
+    assert refused(store, unbound) == "wrong_board"
+    name = {"submitter": {"name": "Ada", "key": key.public}}
+    assert send(store, entry(store, key, None, None, **name))
+    name["submitter"]["key"] = other.public
+    assert refused(store, entry(store, other, None, None, **name)) == "name_taken"
+
+
+def test_a_changed_entry_has_no_valid_signature(store, key):
+    text = entry(store, key, None, None).to_bytes()
+    assert Envelope.read(text, SignedEntry).open().is_valid
+    with pytest.raises(Rejection, match="bad_signature"):
+        Envelope.read(text.replace(b'"Test"', b'"Best"'), SignedEntry)
+
+
+def test_no_entry_knows_the_optimum(key):
+    method = {"name": "Test", "version": "1", "family": "test", "knowledge": "oracle"}
+    with pytest.raises(SpecError, match="must be 'generic' or 'family'"):
+        Entry.from_dict(manifest(SEASON, key, answers=[None, None], method=method))
+
+
+def test_a_full_board_loses_nothing(tmp_path: Path, key):
+    with tiny_board(tmp_path / "small", limits={"total_bytes": 100}) as store:
+        store.announce(SEASON)
+        assert refused(store, entry(store, key, None, None)) == "quota"
+        assert store.entrants(SEASON.digest) == []
+
+
+def test_a_key_sends_so_many_entries_a_day(tmp_path: Path, key):
+    with tiny_board(tmp_path / "small", limits={"submissions_per_day": 2}) as store:
+        store.announce(SEASON)
+        for version in ("1", "2"):
+            assert send(store, entry(store, key, None, None, statement=version))
+        assert refused(store, entry(store, key, None, None, statement="3")) == "quota"
