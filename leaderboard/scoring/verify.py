@@ -402,7 +402,7 @@ def _check_scores(store: Store, result: Result) -> None:
         for name, value in run_metrics(
             run.normalised_regret, run.similarity, levels_of(document.protocol)
         ).items():
-            if not _close(value, getattr(run, name), EXACT):
+            if not close(value, getattr(run, name), EXACT):
                 _refuse_result(
                     result.submission, f"runs.{number}.{name}: does not follow from its regions"
                 )
@@ -418,23 +418,23 @@ def _check_scores(store: Store, result: Result) -> None:
         unlisted=unlisted,
         isolation=result.isolation,
     )
-    if not _close(expected.to_dict(), result.to_dict(), EXACT):
+    if not close(expected.to_dict(), result.to_dict(), EXACT):
         _refuse_result(result.submission, "its runs or scores do not follow from its submission")
 
 
-def _close(one: Any, other: Any, tolerance: float) -> bool:
+def close(one: Any, other: Any, tolerance: float) -> bool:
     """Whether two pieces of plain data are equal up to a tolerance of their numbers."""
     match one, other:
         case {"low": None}, {"low": float(low), "high": float(high), "value": float(value)}:
             # Earlier versions gave single runs an interval of zero width.
-            return low == high == value and _close(one["value"], value, tolerance)
+            return low == high == value and close(one["value"], value, tolerance)
         case dict(), dict():
             return one.keys() == other.keys() and all(
-                _close(value, other[key], tolerance) for key, value in one.items()
+                close(value, other[key], tolerance) for key, value in one.items()
             )
         case ((list() | tuple()), (list() | tuple())):
             return len(one) == len(other) and all(
-                _close(left, right, tolerance) for left, right in zip(one, other, strict=True)
+                close(left, right, tolerance) for left, right in zip(one, other, strict=True)
             )
         case float(), float():
             return abs(one - other) <= tolerance * max(1.0, abs(one))

@@ -1,0 +1,217 @@
+"""What is published of a sealed-offline season: a data set and challenge states of each instance.
+
+    season.json
+    datasets/sealed/<season>/<class>-<instance>-v0/data/…   in Minari's format
+    challenges/<class>-<instance>.npy                       float32 `[regions · n, S + 2]`
+
+All of it follows from the terms and the master, and `season.json` has its digests.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from leaderboard.artefact.answers import rows_of
+from leaderboard.documents.master import Master
+from leaderboard.documents.reading import read_regular
+from leaderboard.documents.season import Digests, Hidden, Season, Terms
+from leaderboard.errors import BoardError
+from leaderboard.scoring.sealed import Instance, challenge, instances
+from sme_registry.datasets import DatasetRecipe, SealedDataset
+from sme_registry.io import build_folder, read_json, to_json
+from sme_registry.sealed import pack_table, table_bytes
+
+Progress = Callable[[int, int], None]
+
+SEASON = "season.json"
+_UNKNOWN = "sha256:" + "0" * 64
+
+
+def name_of(hidden: Hidden) -> str:
+    """The name of an instance in files: its class and its number in it."""
+    return f"{hidden.member.name}-{hidden.instance}"
+
+
+def challenge_path(folder: Path, hidden: Hidden) -> Path:
+    """The file with the challenge states of an instance."""
+    return folder / "challenges" / f"{name_of(hidden)}.npy"
+
+
+def dataset_path(folder: Path, season: str, hidden: Hidden) -> Path:
+    """The folder of the data set of an instance."""
+    return folder / "datasets" / _dataset_id(season, hidden)
+
+
+def refuse_large_answers(terms: Terms, limit: int) -> None:
+    """Refuse a season whose answers are larger than a board's artefacts may be.
+
+    Raises:
+      BoardError: names the class.
+    """
+    for member in terms.classes:
+        size = table_bytes(rows_of(terms.protocol), member.setting.action_dim)
+        if size > limit:
+            raise BoardError(
+                f"classes.{member.name}: its answers have {size:,} bytes: must be at most "
+                f"{limit:,}, the board's limit on artefacts. Use fewer states per region."
+            )
+
+
+def create_season(
+    plan: dict[str, Any],
+    master: Master,
+    folder: str | os.PathLike[str],
+    progress: Progress | None = None,
+) -> Season:
+    """Generate all that is published of a season, into a new folder.
+
+    Args:
+      plan: the fields of `Terms`, without `published`.
+      master: the season's secret.
+      folder: it gets `season.json` and, offline, data sets and challenge states; completely or not
+        at all.
+      progress: called with the number of instances done, and of all.
+
+    Returns:
+      The season, committed to the master.
+
+    Raises:
+      SpecError: a field is invalid.
+      BoardError, NameTakenError, OptionError: the folder exists or cannot be written.
+      ResourceLimitError, MissingDependencyError: a data set cannot be generated or written.
+    """
+    terms = _with_placeholders(plan)
+    with build_folder(Path(folder)) as building:
+        published = []
+        if terms.track == "sealed-offline":
+            every = list(instances(terms, master))
+            for done, instance in enumerate(every, start=1):
+                published.append(_publish(instance, terms.id, master, Path(building)))
+                if progress is not None:
+                    progress(done, len(every))
+        fields = {**terms.to_dict(), "published": [each.to_dict() for each in published]}
+        season = Terms.from_dict(fields).commit(master)
+        (Path(building) / SEASON).write_text(to_json(season.to_dict()))
+    return season
+
+
+def read_season(folder: str | os.PathLike[str]) -> Season:
+    """The season in a folder that `create_season` wrote, or in a downloaded copy.
+
+    Raises:
+      SpecError: there is none.
+    """
+    path = Path(folder) / SEASON
+    return Season.from_dict(read_json(path), str(path))
+
+
+def check_published(
+    season: Season, folder: str | os.PathLike[str], progress: Progress | None = None
+) -> int:
+    """Check that data sets and challenge states are those that a season was committed to.
+
+    Returns:
+      Their number.
+
+    Raises:
+      BoardError: a file is missing, or differs from its digest.
+    """
+    folder = Path(folder)
+    for done, (hidden, digests) in enumerate(
+        zip(season.hidden, season.published, strict=False), start=1
+    ):
+        data = SealedDataset.read(dataset_path(folder, season.id, hidden)).digest
+        path = challenge_path(folder, hidden)
+        for name, found, expected in (
+            (dataset_path(folder, season.id, hidden), data, digests.data),
+            (path, _file_digest(path, season, hidden), digests.challenge),
+        ):
+            if found != expected:
+                raise BoardError(
+                    f"{name}: has the digest {found[:19]}…: must be {expected[:19]}…, as in "
+                    f"{SEASON}. Download it again."
+                )
+        if progress is not None:
+            progress(done, len(season.published))
+    return len(season.published)
+
+
+def published_digests(instance: Instance, master: Master) -> Digests:
+    """The digests of an instance's data set and challenge states, generated again."""
+    data, states = _generate(instance, master)
+    return _digests(instance.hidden, data, states)
+
+
+def _generate(instance: Instance, master: Master) -> tuple[SealedDataset, bytes]:
+    data = SealedDataset.collect(recipe(instance, master))
+    return data, pack_table(challenge(instance.spec, instance.protocol))
+
+
+def recipe(instance: Instance, master: Master) -> DatasetRecipe:
+    """What the data set of an instance is generated from; secret until the reveal."""
+    data = instance.hidden.member.data
+    assert data is not None  # the track is offline
+    return DatasetRecipe.from_dict(
+        {
+            "spec": instance.spec.to_dict(),
+            "behaviours": [{"kind": "mixture", "nu": data.nu}],
+            "transitions": data.transitions,
+            "seed": master.number("data", instance.place),
+        }
+    )
+
+
+def _publish(instance: Instance, season: str, master: Master, folder: Path) -> Digests:
+    data, states = _generate(instance, master)
+    data.write(_dataset_id(season, instance.hidden), folder / "datasets")
+    path = challenge_path(folder, instance.hidden)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(states)
+    return _digests(instance.hidden, data, states)
+
+
+def _digests(hidden: Hidden, data: SealedDataset, states: bytes) -> Digests:
+    return Digests(
+        class_name=hidden.member.name,
+        instance=hidden.instance,
+        data=data.digest,
+        challenge=_sha256(states),
+    )
+
+
+def _dataset_id(season: str, hidden: Hidden) -> str:
+    return f"sealed/{season}/{name_of(hidden)}-v0"
+
+
+def _file_digest(path: Path, season: Season, hidden: Hidden) -> str:
+    size = table_bytes(rows_of(season.protocol), hidden.member.setting.state_dim + 2)
+    try:
+        return _sha256(read_regular(path, size))
+    except OSError as error:
+        raise BoardError(f"{path}: cannot be read: {error.strerror}. Download it again.") from None
+
+
+def _sha256(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def _with_placeholders(plan: dict[str, Any]) -> Terms:
+    """The terms of a plan, with digests that are still unknown."""
+    classes = plan.get("classes")
+    listed = (
+        []
+        if plan.get("track") != "sealed-offline"
+        else [
+            {"class_name": member["name"], "instance": i, "data": _UNKNOWN, "challenge": _UNKNOWN}
+            for member in (classes if isinstance(classes, list) else [])
+            if isinstance(member, dict)
+            and type(member.get("instances")) is int
+            and "name" in member
+            for i in range(min(member["instances"], 1000))
+        ]
+    )
+    return Terms.from_dict({**plan, "published": listed}, "season")

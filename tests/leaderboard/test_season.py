@@ -1,0 +1,245 @@
+"""An offline season from its plan to its replay: what is published, scored, ranked and verified."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard import intake
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.documents.season import Reveal, Season
+from leaderboard.errors import BoardError, Rejection, TamperedError
+from leaderboard.scoring.publication import (
+    challenge_path,
+    check_published,
+    create_season,
+    dataset_path,
+    read_season,
+    refuse_large_answers,
+)
+from leaderboard.scoring.sealed import instances
+from leaderboard.scoring.season import counting, score_entries, season_rankings, verify_season
+from leaderboard.store import Store
+from sme_registry import evaluate, materialize
+from sme_registry.datasets import SealedDataset
+from sme_registry.errors import SMEError
+from sme_registry.sealed import pack_table, unpack_table
+from tests.leaderboard.conftest import tiny_board
+from tests.leaderboard.sealing import AFTERWARDS, MASTER, signed_entry, tiny_terms
+
+
+def plan(**fields: Any) -> dict[str, Any]:
+    terms = tiny_terms(**fields).to_dict()
+    del terms["published"]
+    return terms
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("season") / "published"
+    create_season(plan(), MASTER, folder)
+    return folder
+
+
+@pytest.fixture
+def later(monkeypatch: pytest.MonkeyPatch) -> Any:
+    def move() -> None:
+        for module in ("sealed", "log"):
+            monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+
+    return move
+
+
+def challenges(folder: Path) -> list[np.ndarray]:
+    season = read_season(folder)
+    return [
+        unpack_table(challenge_path(folder, hidden).read_bytes(), 4) for hidden in season.hidden
+    ]
+
+
+def enter(
+    store: Store, season: Season, key: SigningKey, answers: list[np.ndarray | None], **fields: Any
+) -> str:
+    files = [None if each is None else pack_table(each) for each in answers]
+    digests = [None if each is None else _digest(each) for each in files]
+    named = [
+        None if data is None else {"sha256": digest, "size": len(data)}
+        for data, digest in zip(files, digests, strict=True)
+    ]
+    signed = signed_entry(store, season, key, named, **fields)
+    data = dict(zip(digests, files, strict=True))
+    assert intake.enter(store, signed, answers=lambda digest: data[digest] or b"")
+    return signed.id
+
+
+def _digest(data: bytes) -> str:
+    return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def method(name: str, knowledge: str = "generic") -> dict[str, Any]:
+    return {"name": name, "version": "1", "family": "test", "knowledge": knowledge}
+
+
+def halves(folder: Path) -> list[np.ndarray]:
+    return [np.full((len(each), 1), 0.5, np.float32) for each in challenges(folder)]
+
+
+def optima(season: Season, folder: Path) -> list[np.ndarray]:
+    """What nobody but the organiser can answer."""
+    tasks = [materialize(each.spec) for each in instances(season, MASTER)]
+    return [
+        task.optimal_action(shown[:, :2].astype(np.float64)).astype(np.float32)
+        for task, shown in zip(tasks, challenges(folder), strict=True)
+    ]
+
+
+def test_a_season_is_generated_from_its_plan_and_its_master(
+    published: Path, tmp_path: Path
+) -> None:
+    season = read_season(published)
+    assert season.is_committed_to(MASTER)
+    assert check_published(season, published) == 2
+    assert create_season(plan(), MASTER, tmp_path / "again") == season
+    other = create_season(plan(), Master(bytes(32)), tmp_path / "other")
+    mine = {(each.data, each.challenge) for each in season.published}
+    assert not mine & {(each.data, each.challenge) for each in other.published}
+    with pytest.raises(SMEError, match="already exists"):
+        create_season(plan(), MASTER, published)
+    assert not (create_season(plan(track="sealed-online"), MASTER, tmp_path / "online")).published
+
+
+def test_nothing_published_tells_a_secret(published: Path) -> None:
+    season = read_season(published)
+    secrets = {MASTER.raw.hex()}
+    for instance in instances(season, MASTER):
+        secrets |= {str(instance.spec.seed)[2:], instance.spec.digest[7:]}
+        secrets |= {str(instance.protocol.seed), instance.spec.content_name}
+        secrets |= {str(MASTER.number("data", instance.place))}
+    for path in published.rglob("*"):
+        content = path.name.encode() + (path.read_bytes() if path.is_file() else b"")
+        assert not any(secret.encode() in content for secret in secrets)
+        assert MASTER.raw not in content
+
+
+def test_an_altered_publication_is_named(published: Path, tmp_path: Path) -> None:
+    season = create_season(plan(), MASTER, tmp_path / "copy")
+    first, second = season.hidden
+    path = challenge_path(tmp_path / "copy", first)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(BoardError, match=r"deep-0\.npy: has the digest"):
+        check_published(season, tmp_path / "copy")
+    path.write_bytes(whole)
+    target = dataset_path(tmp_path / "copy", season.id, second)
+    data = SealedDataset.read(dataset_path(tmp_path / "copy", season.id, first))
+    for file in (target / "data").iterdir():
+        file.unlink()
+    (target / "data").rmdir()
+    target.rmdir()
+    data.write(f"sealed/{season.id}/deep-1-v0", tmp_path / "copy" / "datasets")
+    with pytest.raises(BoardError, match="deep-1-v0: has the digest"):
+        check_published(season, tmp_path / "copy")
+
+
+def test_answers_must_fit_a_board() -> None:
+    refuse_large_answers(tiny_terms(), 10_000)
+    with pytest.raises(BoardError, match=r"classes\.deep: its answers have"):
+        refuse_large_answers(tiny_terms(), 1000)
+
+
+def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path: Path) -> None:
+    for fields in ({"classes": None}, {"classes": [{"name": "deep"}]}, {"track": "open"}):
+        with pytest.raises(SMEError):
+            create_season({**plan(), **fields}, MASTER, tmp_path / "new")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) -> None:
+    season = read_season(published)
+    store.announce(season)
+    friend = SigningKey.generate()
+    enter(store, season, key, optima(season, published), method=method("Best"))
+    last = enter(store, season, key, halves(published), method=method("Best"))
+    family = enter(store, season, friend, optima(season, published), method=method("Fit", "family"))
+    failed = enter(store, season, friend, [None, None], method=method("Failed"))
+    with pytest.raises(Rejection, match="season_not_closed"):
+        score_entries(store, season.id)
+    later()
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    assert [row.entrant.id for row in counting(store, season)] == [last, family, failed]
+    assert score_entries(store, season.id) == 3
+    assert score_entries(store, season.id) == 0
+    rankings = season_rankings(store, season, "wd_regret")
+    generic, fitted = rankings["generic"], rankings["family"]
+    assert [row.entry.id for row in generic] == [last, failed]
+    assert [row.entry.id for row in fitted] == [family]
+    assert generic[0].value.value == pytest.approx(1.0, abs=1e-6)
+    assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
+    assert fitted[0].entry.oracle_like
+    report = verify_season(store, season.id)
+    assert (report.instances, report.entries, report.results) == (2, 4, 3)
+
+
+def test_a_score_is_that_of_the_open_board(store, key, published, later) -> None:
+    season = read_season(published)
+    store.announce(season)
+
+    def policy(observations: np.ndarray) -> np.ndarray:
+        return np.clip(1.4 * observations[:, 1:2] - 0.1, 0, 1)
+
+    enter(store, season, key, [policy(each) for each in challenges(published)])
+    later()
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    score_entries(store, season.id)
+    [row] = store.entrants(season.digest)
+    result = store.sealed_result(row)
+    assert result is not None
+    for run, instance in zip(result.runs, instances(season, MASTER), strict=True):
+        report = evaluate(policy, instance.spec, instance.protocol)
+        expected = [region.normalised_regret for region in report.regions]
+        assert run.normalised_regret == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_replay_finds_scores_and_data_that_do_not_follow(tmp_path: Path, key, published, later):
+    """The organiser, who holds the board's key, publishes another score or other data."""
+    season = read_season(published)
+    with tiny_board(tmp_path / "board") as store:
+        store.announce(season)
+        enter(store, season, key, halves(published))
+        later()
+        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        with pytest.raises(TamperedError, match="must exist for each entry that counts"):
+            verify_season(store, season.id)
+        rank = store.rank
+
+        def better(result: Any) -> bool:
+            run = result.runs[0]
+            regrets = (0.5 * run.normalised_regret[0], *run.normalised_regret[1:])
+            lower = run.model_copy(update={"normalised_regret": regrets})
+            return rank(result.model_copy(update={"runs": (lower, *result.runs[1:])}))
+
+        store.rank = better  # type: ignore[method-assign]
+        score_entries(store, season.id)
+        with pytest.raises(TamperedError, match=r"runs\.0: scored again, it differs"):
+            verify_season(store, season.id)
+
+    fields = season.terms.to_dict()
+    fields["published"][1]["data"] = fields["published"][0]["data"]
+    with tiny_board(tmp_path / "other") as store:
+        false = type(season.terms).from_dict(fields).commit(MASTER)
+        monkey_open(store, false)
+        with pytest.raises(TamperedError, match="published: deep 1"):
+            verify_season(store, false.id)
+
+
+def monkey_open(store: Store, season: Season) -> None:
+    """Announces a season that is over, and reveals it."""
+    path = store.season_folder(season.digest)
+    with store.transaction():
+        store.record("season", season.digest, season, path.season)
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
