@@ -12,7 +12,7 @@
 
 from sme_registry.sealed.connection import PATIENCE
 from sme_registry.sealed.envs import SealedEnv, SealedVectorEnv, make, make_vec
-from sme_registry.sealed.instance import Instance, actions_in, answer
+from sme_registry.sealed.instance import Instance, actions_in, answer, prepare_policy
 from sme_registry.sealed.ticket import (
     InstanceStatus,
     Place,
@@ -53,6 +53,7 @@ __all__ = [
     "make",
     "make_vec",
     "pack_table",
+    "prepare_policy",
     "table_bytes",
     "ticket_path",
     "tickets_path",

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.errors import MalformedDocumentError, PolicyError, SealedError, SpecError
-from sme_registry.evaluation import as_policy
+from sme_registry.evaluation import Policy, as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
 from sme_registry.io import integer_in, parse_json
@@ -155,6 +155,12 @@ class Instance:
         data = self._connection.request("GET", path, most=_MAX_STATUS)
         return parse_answer(TicketStatus, data)
 
+    def __enter__(self) -> Instance:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Close the connection; the next request opens another one."""
         self._connection.close()
@@ -181,49 +187,38 @@ def answer(
     Args:
       url: the board's.
       ticket: a ticket, or the path of its file.
-      policy, action_range, algorithm: see `actions_in`.
+      policy, action_range, algorithm: see `prepare_policy`.
       instance: its number in the ticket, from 0.
       insecure, patience: see `Connection`.
 
     Raises:
       SealedError: the server refuses it, or gives no answer.
-      PolicyError, OptionError, SpecError: see `actions_in` and `Instance`.
+      PolicyError, OptionError, SpecError: see `prepare_policy` and `Instance`.
     """
-    hidden = Instance(url, ticket, instance, insecure=insecure, patience=patience)
-    try:
-        states = hidden.challenge()
-        hidden.send_answers(
-            actions_in(
-                states, policy, hidden.setting, action_range=action_range, algorithm=algorithm
-            )
+    with Instance(url, ticket, instance, insecure=insecure, patience=patience) as hidden:
+        prepared = prepare_policy(  # before the stepping ends for good
+            policy, hidden.setting, action_range=action_range, algorithm=algorithm
         )
-    finally:
-        hidden.close()
+        hidden.send_answers(actions_in(hidden.challenge(), prepared, hidden.setting))
 
 
-def actions_in(
-    states: Float32,
+def prepare_policy(
     policy: Any,
     setting: Setting,
     *,
     action_range: str | None = None,
     algorithm: str | None = None,
-) -> Float32:
-    """A policy's actions in challenge states.
+) -> Policy:
+    """A policy for the hidden tasks of a setting.
 
     Args:
-      states: `[rows, S + 2]` observations.
       policy: as `evaluate` accepts it.
       setting: of the task.
       action_range: of the policy's actions, "unit" or "symmetric"; None as in `evaluate`.
       algorithm: the class of a model's .zip that does not tell it.
 
-    Returns:
-      `[rows, A]` of the unit range, finite; not clipped.
-
     Raises:
-      PolicyError: the policy cannot be loaded, its actions are invalid, or it is a reference that
-        depends on the hidden task.
+      PolicyError: the policy cannot be loaded, or is a reference that depends on the hidden task.
       UnknownNameError, OptionError, MissingDependencyError: see `as_policy`.
     """
     if isinstance(policy, str) and policy in POLICIES and policy not in _WITHOUT_TASK:
@@ -231,11 +226,35 @@ def actions_in(
             f"policy={policy!r}: follows from the task, which is hidden. Give a policy of your "
             "own, constant_half or uniform_random."
         )
-    spec = SMESpec.from_dict({**setting.to_dict(), "seed": 0})  # for its widths: the seed is hidden
+    spec = _any_spec(setting)
     prepared = as_policy(policy, spec, action_range=action_range, algorithm=algorithm)
-    rows = batch_rows(spec)
+    assert isinstance(prepared, Policy)  # seasons have no teams
+    return prepared
+
+
+def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
+    """A policy's actions in challenge states.
+
+    Args:
+      states: `[rows, S + 2]` observations.
+      policy: as `evaluate` accepts it, or prepared.
+      setting: of the task.
+
+    Returns:
+      `[rows, A]` of the unit range, finite; not clipped.
+
+    Raises:
+      PolicyError: the actions are invalid; or see `prepare_policy`.
+      UnknownNameError, OptionError, MissingDependencyError: see `prepare_policy`.
+    """
+    prepared, rows = prepare_policy(policy, setting), batch_rows(_any_spec(setting))
     batches = [prepared(states[at : at + rows].copy()) for at in range(0, len(states), rows)]
     return np.concatenate([np.empty((0, setting.action_dim)), *batches]).astype(np.float32)
+
+
+def _any_spec(setting: Setting) -> SMESpec:
+    """A task of this setting, for its widths: that of the hidden ones."""
+    return SMESpec.from_dict({**setting.to_dict(), "seed": 0})
 
 
 def parse_answer(kind: type[_Document], data: bytes) -> _Document:

@@ -215,8 +215,15 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
     for _ in range(2):  # answers may be repeated
         sealed.answer(server.url, ticket, policy, 1, action_range="symmetric")
     assert np.allclose(server.hidden[1].answers, challenge_of(1)[:, :2], atol=1e-7)
-    status = Instance(server.url, TICKET).status()
+    with Instance(server.url, TICKET) as first:
+        status = first.status()
     assert [each.phase for each in status.instances] == ["waiting", "answered"]
+
+
+def test_a_policy_that_cannot_be_used_does_not_end_the_stepping(server):
+    with pytest.raises(PolicyError):
+        sealed.answer(server.url, TICKET, "missing.zip")
+    assert server.requests == []
 
 
 def test_actions_are_asked_for_in_every_form_that_evaluate_takes():
