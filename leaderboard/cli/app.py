@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from leaderboard.cli import administration, demo, results, submissions
+from leaderboard.cli import administration, demo, results, submissions, tickets
 from leaderboard.errors import Rejection, TamperedError
+from sme_registry.errors import SealedError
 from sme_registry.terminal import CommandGroup, application
 
 
 class _Commands(CommandGroup):
-    exit_codes = ((Rejection, 1), (TamperedError, 3))
+    exit_codes = ((Rejection, 1), (SealedError, 1), (TamperedError, 3))
     extra = "leaderboard"
 
 
@@ -45,6 +46,10 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "check": submissions.check,
         "submit": submissions.submit,
         "withdraw": submissions.withdraw,
+    },
+    "Seasons": {
+        "ticket": tickets.ticket,
+        "answer": tickets.answer,
     },
     "Results": {
         "rank": results.rank,

@@ -156,6 +156,17 @@ KeyFile = Annotated[
     ),
 ]
 
+MethodName = Annotated[
+    str, typer.Option("--method", help="Name of the method, as the board shows it.")
+]
+SubmitterName = Annotated[str, typer.Option("--submitter", help="Your name or your lab's.")]
+MethodVersion = Annotated[str, typer.Option(help="Version of the method.")]
+Family = Annotated[
+    str | None, typer.Option(help="Family such as PPO; the method's name by default.")
+]
+CodeLink = Annotated[str | None, typer.Option("--code", help="An https link to the code.")]
+Statement = Annotated[str, typer.Option(help="A note for readers of the board.")]
+
 
 def find_suite(name: str) -> SuiteFile:
     """A suite by its name in the catalogue, its file's path, or a board that has it.

@@ -13,8 +13,14 @@ from leaderboard.cli.options import (
     DEFAULT_KEY,
     BoardOrUrl,
     BundleFolder,
+    CodeLink,
+    Family,
     Json,
     KeyFile,
+    MethodName,
+    MethodVersion,
+    Statement,
+    SubmitterName,
     board_document,
     board_or_url,
     complete_protocol,
@@ -86,8 +92,8 @@ def new(
             "failed. Accepts patterns; repeatable.",
         ),
     ],
-    method: Annotated[str, typer.Option(help="Name of the method, as the board shows it.")],
-    submitter: Annotated[str, typer.Option(help="Your name or your lab's.")],
+    method: MethodName,
+    submitter: SubmitterName,
     board: Annotated[
         str | None,
         typer.Option(
@@ -111,10 +117,8 @@ def new(
             "--algorithm", "-a", help="Of --runs with several algorithms, the one to submit."
         ),
     ] = None,
-    method_version: Annotated[str, typer.Option(help="Version of the method.")] = "1",
-    family: Annotated[
-        str | None, typer.Option(help="Family such as PPO; the method's name by default.")
-    ] = None,
+    method_version: MethodVersion = "1",
+    family: Family = None,
     knowledge: Annotated[
         Knowledge,
         typer.Option(
@@ -123,8 +127,8 @@ def new(
             "oracle: its optimal policy.",
         ),
     ] = "generic",
-    code: Annotated[str | None, typer.Option(help="An https link to the code.")] = None,
-    statement: Annotated[str, typer.Option(help="A note for readers of the board.")] = "",
+    code: CodeLink = None,
+    statement: Statement = "",
     started: Annotated[
         list[str] | None,
         typer.Option(

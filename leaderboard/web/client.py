@@ -1,4 +1,4 @@
-"""Client of a served board: sends artefacts and submissions, reads status, withdraws.
+"""Client of a served board: sends artefacts and submissions, reads status, withdraws, gets tickets.
 
 Every object is addressed by its hash, so a lost request can be repeated unchanged. A rejection by
 the board is raised here as the same `Rejection`, with the board's code and message.
@@ -10,18 +10,22 @@ import contextlib
 import functools
 import json
 import os
+import re
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
+from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedWithdrawal
 from leaderboard.errors import CODES, BoardError, Rejection
 from leaderboard.intake import upload_header
 from sme_registry.errors import MalformedDocumentError, OptionError, SpecError
 from sme_registry.io import parse_json, printable, require_packages, server_address
+from sme_registry.sealed import Ticket, tickets_path
 
 if TYPE_CHECKING:
     import httpx
@@ -105,6 +109,46 @@ def board_document(url: str, *, insecure: bool = False) -> BoardDocument:
     """
     with _Client(url, insecure=insecure) as client:
         return client.board_document()
+
+
+def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
+    """The digest of a season of a served board, and the board's public key.
+
+    Raises:
+      Rejection: `season_unknown`.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL or the id is invalid.
+    """
+    with _Client(url, insecure=insecure) as client:
+        _, answer = client.request("GET", f"/api/seasons/{_name(id)}")
+        try:
+            found = Season.from_dict(answer["document"], "season.json")
+        except (SpecError, LookupError, TypeError) as error:
+            raise BoardError(f"{url}: answered with no season: {printable(error)}") from None
+        return found.digest, client.board_document().key
+
+
+def request_ticket(
+    url: str, season: str, signed: SignedTicketRequest, *, insecure: bool = False
+) -> Ticket:
+    """Start a ticket, or get the one that this request has started before.
+
+    Args:
+      url, insecure: as for `submit`.
+      season: the season's id.
+      signed: the request, signed for this board.
+
+    Raises:
+      Rejection: the board rejects it.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL or the id is invalid.
+    """
+    with _Client(url, insecure=insecure) as client:
+        _, answer = client.request("POST", tickets_path(_name(season)), signed.to_bytes())
+    try:
+        return Ticket.from_dict(answer, "ticket")
+    except SpecError as error:
+        raise BoardError(f"{url}: answered with no ticket: {printable(error)}") from None
 
 
 def withdraw(
@@ -213,6 +257,15 @@ def _answer_for(id: str, answer: Any, url: str) -> dict[str, Any]:
     if not isinstance(answer, dict) or answer.get("id") != id:
         raise BoardError(f"{url}: answered for another submission. Contact the board's owner.")
     return answer
+
+
+def _name(id: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", id):
+        raise OptionError(
+            f"season={id!r:.80}: must be an id of letters, digits, '_' and '-'. Copy it from the "
+            "board."
+        )
+    return id
 
 
 def _digits(id: str) -> str:

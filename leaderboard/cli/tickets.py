@@ -1,0 +1,179 @@
+"""`sme-leaderboard ticket · answer`: take part in a sealed-online season."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.markup import escape
+
+from leaderboard.cli.options import (
+    DEFAULT_KEY,
+    CodeLink,
+    Family,
+    KeyFile,
+    MethodName,
+    MethodVersion,
+    Statement,
+    SubmitterName,
+)
+from leaderboard.documents.keys import SigningKey
+from sme_registry.errors import OptionError
+from sme_registry.io import refuse_existing, write_atomically
+from sme_registry.terminal import Progress, Table, err, out
+
+ServedBoard = Annotated[
+    str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
+]
+
+
+def ticket(
+    url: ServedBoard,
+    season: Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")],
+    method: MethodName,
+    submitter: SubmitterName,
+    method_version: MethodVersion = "1",
+    family: Family = None,
+    knowledge: Annotated[
+        Literal["generic", "family"],
+        typer.Option(
+            metavar="LEVEL",
+            help="What the method knows of the tasks. generic: nothing. family: that they are "
+            "SMEs. The two are ranked apart.",
+        ),
+    ] = "generic",
+    code: CodeLink = None,
+    statement: Statement = "",
+    out_file: Annotated[Path, typer.Option("--out", "-o", help="The ticket's new file.")] = Path(
+        "ticket.json"
+    ),
+    key: KeyFile = DEFAULT_KEY,
+) -> None:
+    """Start a ticket: hidden tasks of a season, for you alone.
+
+    Every ticket counts: instances without answers at its deadline score 1. The file holds the
+    ticket's password. If the command is interrupted, repeat it: it asks for the same ticket.
+
+    Examples:
+
+      sme-leaderboard ticket https://board.example winter --method PPO --submitter "A Lab"
+    """
+    from leaderboard.documents.entry import SignedTicketRequest, TicketRequest
+    from leaderboard.documents.submission import now
+    from leaderboard.web import client
+
+    refuse_existing(out_file)
+    signing_key = SigningKey.read(key)
+    # Kept until the ticket is: a request that was sent and not answered may have started one.
+    request_file = out_file.with_name(f"{out_file.name}.request")
+    if request_file.exists():
+        signed = SignedTicketRequest.read(request_file.read_bytes())
+        err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
+    else:
+        season_digest, board = client.season(url, season)
+        request = TicketRequest.from_dict(
+            {
+                "method": {
+                    "name": method,
+                    "version": method_version,
+                    "family": family or method,
+                    "knowledge": knowledge,
+                },
+                "code": code,
+                "submitter": {"name": submitter, "key": signing_key.public},
+                "created": now(),
+                "statement": statement,
+                "season": season_digest,
+                "nonce": secrets.token_hex(32),
+            }
+        )
+        signed = request.signed(signing_key, board)
+        write_atomically(request_file, signed.to_bytes())
+    started = client.request_ticket(url, season, signed)
+    started.write(out_file)
+    request_file.unlink()
+
+    table = Table(
+        f"ticket {started.ticket} of {started.season}",
+        {"instance": "number", "class": "name", "S": "number", "A": "number", "steps": "number"},
+    )
+    for number, place in enumerate(started.places):
+        setting = place.member.setting
+        sizes = setting.state_dim, setting.action_dim, place.member.budget
+        table.add_row(str(number), place.member.name, *(f"{each:,}" for each in sizes))
+    out().print(table)
+    out().print(
+        f"{escape(str(out_file))}: keep it secret. Answer by {escape(started.deadline)}.",
+        soft_wrap=True,
+    )
+
+
+def answer(
+    url: ServedBoard,
+    ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
+    policy: Annotated[
+        str,
+        typer.Argument(
+            metavar="POLICY",
+            help="A policy as `sme evaluate` takes it. {i} stands for the instance's number.",
+        ),
+    ],
+    instance: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--instance",
+            "-i",
+            help="Only this instance; repeatable. Default: all without answers.",
+        ),
+    ] = None,
+    action_range: Annotated[
+        str | None,
+        typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
+    ] = None,
+    algorithm: Annotated[
+        str | None, typer.Option(help="Class of a .zip that does not tell it.")
+    ] = None,
+) -> None:
+    """Answer the challenges of a ticket with trained policies.
+
+    It ends the steps of each instance that it answers. The last answers end the ticket.
+
+    Examples:
+
+      sme-leaderboard answer https://board.example ticket.json 'runs/{i}/model.zip'
+
+      sme-leaderboard answer https://board.example ticket.json policy.onnx --instance 0
+    """
+    from sme_registry.sealed import Instance, Ticket, actions_in, prepare_policy
+
+    held = Ticket.read(ticket_file)
+    with Instance(url, held) as first:
+        phases = [each.phase for each in first.status().instances]
+    numbers = [i for i, phase in enumerate(phases) if phase != "answered"]
+    if instance is not None:
+        numbers = list(dict.fromkeys(instance))
+    if len(numbers) > 1 and "{i}" not in policy:
+        raise OptionError(
+            f"policy={policy!r}: must contain {{i}}, the instance's number: each task has a policy "
+            "of its own. Or give --instance."
+        )
+    # All are loaded before the first instance's steps end for good.
+    policies = {
+        number: prepare_policy(
+            policy.replace("{i}", str(number)),
+            held.place(number).member.setting,
+            action_range=action_range,
+            algorithm=algorithm,
+        )
+        for number in numbers
+    }
+    with Progress("answering", len(policies), console=err(), unit="instances") as progress:
+        for done, (number, prepared) in enumerate(policies.items(), start=1):
+            with Instance(url, held, number) as hidden:
+                hidden.send_answers(actions_in(hidden.challenge(), prepared, hidden.setting))
+            phases[number] = "answered"
+            progress.update(done)
+    left = sum(phase != "answered" for phase in phases)
+    out().print(f"{left} instances without answers" if left else "The ticket has ended.")
