@@ -28,6 +28,7 @@ _JSON_BYTES = 2**20
 _TYPE = "application/octet-stream"
 
 _log = logging.getLogger(__name__)
+_now, _sleep = time.monotonic, time.sleep
 
 
 class Connection:
@@ -66,7 +67,7 @@ class Connection:
           SealedError: the server refuses it, stays unreachable, or answers with more bytes.
           BudgetSpentError: it is for steps, and the instance has none left.
         """
-        wait, started = _FIRST_WAIT, time.monotonic()
+        wait, started = _FIRST_WAIT, _now()
         while True:
             reused = self._http is not None
             try:
@@ -88,7 +89,7 @@ class Connection:
                     raise kind(code, message)
                 reason = f"{code}: {message}"
             patience = self._patience if self._answered else min(self._patience, _FIRST_PATIENCE)
-            if time.monotonic() + wait > started + patience:
+            if _now() + wait > started + patience:
                 raise SealedError(
                     "unreachable",
                     f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
@@ -96,7 +97,7 @@ class Connection:
                 )
             _log.warning("%s: %.200s Trying again.", self._address.url, reason)
             # Clients that lost the same server do not all come back at the same moment.
-            time.sleep(wait * random.uniform(0.5, 1.0))
+            _sleep(wait * random.uniform(0.5, 1.0))
             wait = min(2 * wait, _LONGEST_WAIT)
 
     def close(self) -> None:

@@ -1,170 +1,99 @@
-"""A server of one ticket that speaks the protocol of `wire`, and fails on demand."""
+"""A board that steps a small season, reached through a relay that fails on demand."""
 
 from __future__ import annotations
 
 import contextlib
+import http.client
 import http.server
-import json
-import re
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from email.message import Message
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 
-from sme_registry.compiled.values import REWARD
-from sme_registry.envs.batch import Batch
-from sme_registry.sealed import (
-    Begun,
-    StepFormat,
-    Steps,
-    Ticket,
-    bearer,
-    pack_table,
-    unpack_table,
-)
-from sme_registry.spec import SMESpec
-from sme_registry.task import materialize
+from leaderboard.documents.keys import SigningKey
+from leaderboard.scoring.sealed import Instance, challenge, instances
+from leaderboard.store import Store
+from sme_registry.envs import SMEVectorEnv
+from sme_registry.sealed import Ticket
+from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealing import MASTER
+from tests.leaderboard.serving import serving
 
-TICKET = Ticket.from_dict(
-    {
-        "season": "winter",
-        "ticket": 7,
-        "token": "ab" * 32,
-        "deadline": "2099-12-01T00:00:00Z",
-        "lanes": 16,
-        "classes": [
-            {
-                "name": "deep",
-                "setting": {"state_dim": 3, "action_dim": 2, "complexity": 5, "horizon": 7},
-                "instances": 2,
-                "budget": 4096,
-            },
-        ],
-    }
-)
-ROWS = 40
-
-
-def spec_of(instance: int) -> SMESpec:
-    """The hidden task of an instance."""
-    return SMESpec.from_dict({**TICKET.place(instance).member.setting.to_dict(), "seed": instance})
-
-
-def challenge_of(instance: int) -> np.ndarray:
-    """The challenge states of an instance."""
-    generator = np.random.default_rng(instance)
-    return generator.random((ROWS, spec_of(instance).state_dim + 2), dtype=np.float32)
-
-
-class Refusal(Exception):
-    """An answer with an error's code."""
-
-    def __init__(self, status: int, code: str) -> None:
-        super().__init__(code)
-        self.status, self.code = status, code
-
-
-class Hidden:
-    """An instance that is stepped: its batch, and the last request with its answer."""
-
-    def __init__(self, instance: int) -> None:
-        self.spec, self.budget = spec_of(instance), TICKET.place(instance).member.budget
-        self.lanes = self.number = 0
-        self.finished = False
-        self.answers: np.ndarray | None = None
-        self.last = b"", b""
-
-    def start(self, lanes: int) -> bytes:
-        if self.lanes not in (0, lanes):
-            raise Refusal(409, "step_conflict")
-        if not self.lanes:
-            self.lanes = lanes
-            self.format = StepFormat(lanes, self.spec.state_dim, self.spec.action_dim)
-            self.batch = Batch(materialize(self.spec), lanes)
-            for lane in range(lanes):
-                self.batch.seed(lane, lane)
-            self.batch.begin(np.arange(lanes), self.batch.observe())
-        return self.format.pack_begun(Begun(self.number, self.batch.observe()))
-
-    def step(self, body: bytes) -> bytes:
-        number, actions = self.format.unpack_request(body)
-        if number == self.number and body == self.last[0]:
-            return self.last[1]
-        if number != self.number + 1:
-            raise Refusal(409, "step_conflict" if number <= self.number else "step_ahead")
-        if self.finished or number * self.lanes > self.budget:
-            raise Refusal(409, "budget_spent")
-        done = self.batch.advance(actions.astype(np.float64))
-        ended = done.terminated | done.truncated
-        last = np.where(ended[:, None], done.observation, 0)
-        observation = done.observation.copy()
-        self.batch.begin(np.flatnonzero(ended), observation)
-        steps = Steps(observation, done.values[REWARD, 0], done.terminated, done.truncated, last)
-        self.number, self.last = number, (body, self.format.pack_steps(steps))
-        return self.last[1]
-
-    def status(self) -> dict[str, Any]:
-        phase = "answered" if self.answers is not None else "answering" if self.finished else None
-        return {
-            "phase": phase or ("stepping" if self.lanes else "waiting"),
-            "lanes": self.lanes or None,
-            "requests": self.number,
-            "used": self.number * self.lanes,
-        }
+SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5, "hidden_width": 8, "horizon": 7}
+CLASSES = [
+    {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096},
+    {"name": "short", "setting": SETTING, "instances": 1, "budget": 5},
+]
+ROWS = 6 * 50
+"""Challenge states of an instance."""
 
 
 @dataclass
 class Server:
-    """What a test sees of the server.
+    """A served season, and one ticket of it.
 
     Attributes:
-      url: its address.
-      hidden: the instances.
-      requests: the methods and paths that arrived.
+      url: of the relay.
+      ticket: the ticket.
+      board: the board, its season and the file of the master.
+      requests: methods and last parts of the paths, as they arrived at the relay.
       faults: what happens to the next requests, one each: "lose request", "lose answer", "cut
         answer", or a status such as "503"; then all is well.
     """
 
-    url: str = ""
-    hidden: list[Hidden] = field(default_factory=lambda: [Hidden(0), Hidden(1)])
+    url: str
+    ticket: Ticket
+    board: Board
+    nonce: str
     requests: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
-    def answer(self, method: str, path: str, headers: Any, body: bytes) -> bytes:
-        """The answer to a request."""
-        if headers["Authorization"] != bearer(TICKET.token):
-            raise Refusal(403, "token_wrong")
-        root = "/board/api/seasons/winter/tickets/7"
-        if (method, path) == ("GET", root):
-            instances = [each.status() for each in self.hidden]
-            return json.dumps(
-                {"ticket": 7, "phase": "running", "deadline": "later", "instances": instances}
-            ).encode()
-        match = re.fullmatch(rf"{root}/instances/(\d+)/(.*)", path)
-        assert match, path
-        instance, action = int(match[1]), f"{method} {match[2]}"
-        hidden = self.hidden[instance]
-        if action.startswith("POST start?lanes="):
-            return hidden.start(int(action.partition("=")[2]))
-        if action == "POST steps":
-            return hidden.step(body)
-        if action == "POST finish":
-            hidden.finished = True
-            return b""
-        if action == "GET challenge":
-            assert hidden.finished
-            return pack_table(challenge_of(instance))
-        assert action == "PUT answers"
-        hidden.answers = unpack_table(body, hidden.spec.action_dim, ROWS)
-        return b""
+    def hidden(self, instance: int) -> Instance:
+        """What is hidden of an instance."""
+        number = str(self.ticket.ticket)
+        return list(instances(self.board.season, MASTER, number, self.nonce))[instance]
+
+    def challenge(self, instance: int) -> np.ndarray:
+        """The challenge states of an instance."""
+        hidden = self.hidden(instance)
+        return challenge(hidden.spec, hidden.protocol)
+
+    def seed(self, instance: int) -> int:
+        """The seed of an instance's first lane."""
+        return int.from_bytes(MASTER.secret("starts", self.hidden(instance).place))
+
+    def local(self, instance: int, lanes: int, action_range: str = "unit") -> SMEVectorEnv:
+        """The hidden task of an instance here, at the start of its first episodes."""
+        hidden = self.hidden(instance)
+        env = SMEVectorEnv(hidden.spec, lanes, action_range=action_range, autoreset_mode="SameStep")
+        env.reset(seed=self.seed(instance))
+        return env
+
+    def answers(self, instance: int) -> np.ndarray:
+        """The answers that the board has."""
+        with Store.open(self.board.path, read_only=True) as store:
+            folder = store.season_folder(self.board.season.digest)
+        return np.load(folder.ticket(self.ticket.ticket) / f"{instance}.npy", allow_pickle=False)
 
 
 @contextlib.contextmanager
-def serving() -> Iterator[Server]:
-    """A server, which runs in a thread of this process."""
-    server = Server()
+def serving_ticket(folder: Path) -> Iterator[Server]:
+    """A board in a folder, served with a relay by threads of this process."""
+    board, key = online_board(folder, classes=CLASSES), SigningKey.generate()
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        ticket, nonce = board.ticket(url, key, 7), f"{7:064x}"
+        with _relay(Server(url, ticket, board, nonce)) as server:
+            yield server
+
+
+@contextlib.contextmanager
+def _relay(server: Server) -> Iterator[Server]:
+    """Let a server be reached through a relay, below the path /board."""
+    behind = urlsplit(server.url).netloc
 
     class Handler(http.server.BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -177,14 +106,9 @@ def serving() -> Iterator[Server]:
             if fault == "lose request":
                 self.close_connection = True
                 return
-            status, answer = 200, b""
-            try:
-                if fault.isdecimal():
-                    raise Refusal(int(fault), "busy")
-                answer = server.answer(self.command, self.path, self.headers, body)
-            except Refusal as refusal:
-                status = refusal.status
-                answer = json.dumps({"code": refusal.code, "message": "no."}).encode()
+            status, answer = int(fault) if fault.isdecimal() else 0, b""
+            if not status:
+                status, answer = forwarded(self.command, self.path, self.headers, body)
             if fault == "lose answer":
                 self.close_connection = True
                 return
@@ -199,6 +123,14 @@ def serving() -> Iterator[Server]:
 
         def log_message(self, *_: object) -> None:
             pass
+
+    def forwarded(method: str, path: str, headers: Message, body: bytes) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection(behind)
+        with contextlib.closing(connection):
+            chosen = {name: headers[name] for name in ("Authorization", "Content-Type")}
+            connection.request(method, path.removeprefix("/board"), body, chosen)
+            answer = connection.getresponse()
+            return answer.status, answer.read()
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as listening:
         listening.daemon_threads = True  # a kept connection's thread waits for its next request

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,22 +13,23 @@ from stable_baselines3.common.monitor import Monitor
 
 from examples import cleanrl_style_ppo as cleanrl
 from sme_registry import sealed
-from sme_registry.errors import BudgetSpentError, OptionError
+from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.sealed.sb3 import SealedVecEnv
 from sme_registry.training.learners import new_learner
-from tests.sealed.server import TICKET, Server, serving, spec_of
+from tests.sealed.server import ROWS, Server, serving_ticket
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
-    with serving() as server:
+def server(tmp_path: Path) -> Iterator[Server]:
+    with serving_ticket(tmp_path) as server:
         yield server
 
 
 def test_an_sb3_batch_is_stepped_as_the_same_task_is_here(server):
-    here, hidden = SMEVecEnv(spec_of(0), 3), SealedVecEnv(server.url, TICKET, 0, 3)
-    here.seed(0)
+    task, seed = server.hidden(0).spec, server.seed(0)
+    here, hidden = SMEVecEnv(task, 3), SealedVecEnv(server.url, server.ticket, 0, 3)
+    here.seed(seed)
     assert hidden.action_space == here.action_space
     assert hidden.observation_space == here.observation_space
     assert np.array_equal(here.reset(), hidden.reset())
@@ -51,28 +53,28 @@ def test_an_sb3_batch_is_stepped_as_the_same_task_is_here(server):
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_this_project_s_trainers_learn_and_their_models_answer(server, algorithm):
-    env = SealedVecEnv(server.url, TICKET, 0, 4)
+    env = SealedVecEnv(server.url, server.ticket, 0, 4)
     settings = {"n_steps": 32, "batch_size": 64} if algorithm == "PPO" else {}
     model = new_learner(algorithm, env, seed=0, steps=256, hyperparameters=settings)
     model.learn(256)
     assert env.instance.number == 64
-    sealed.answer(server.url, TICKET, model, 0)
-    assert server.hidden[0].answers.shape == (40, 2)
-    with pytest.raises(BudgetSpentError):  # once answers are asked for, no more steps are taken
+    sealed.answer(server.url, server.ticket, model, 0)
+    assert server.answers(0).shape == (ROWS, 2)
+    with pytest.raises(SealedError, match="instance_phase"):  # no more steps after the answers
         model.learn(256)
 
 
 def test_sb3_takes_the_single_environment(server):
-    env = Monitor(sealed.make(server.url, TICKET, 1, action_range="symmetric"))
+    env = Monitor(sealed.make(server.url, server.ticket, 1, action_range="symmetric"))
     PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu").learn(64)
-    assert server.hidden[1].number == 64
+    assert env.unwrapped.instance.number == 64
 
 
 def test_a_loop_of_one_file_learns(server, monkeypatch):
     monkeypatch.setattr(cleanrl, "ENVS", 4)
     monkeypatch.setattr(cleanrl, "ROLLOUT", 16)
     torch.manual_seed(0)
-    env = sealed.make_vec(server.url, TICKET, 0, cleanrl.ENVS, action_range="symmetric")
+    env = sealed.make_vec(server.url, server.ticket, 0, cleanrl.ENVS, action_range="symmetric")
     agent = cleanrl.Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
     optimiser = torch.optim.Adam(agent.parameters(), lr=1e-3)
     before = agent.mean_actions(env.reset(seed=0)[0])
@@ -85,4 +87,4 @@ def test_a_loop_of_one_file_learns(server, monkeypatch):
         observations = following
     cleanrl.learn(agent, optimiser, rollout, observations)
     assert not np.array_equal(agent.mean_actions(env.reset()[0]), before)
-    sealed.answer(server.url, TICKET, agent.mean_actions, 0, action_range="symmetric")
+    sealed.answer(server.url, server.ticket, agent.mean_actions, 0, action_range="symmetric")
