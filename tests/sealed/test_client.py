@@ -248,7 +248,7 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
         observations[:] = 0.0  # a policy may write into what it is given
         return actions
 
-    ticket = path if form == "file" else TICKET
+    ticket = path if form == "file" else server.ticket
     for _ in range(2):  # answers may be repeated
         sealed.answer(server.url, ticket, policy, 1, action_range="symmetric")
     assert server.answers(1).shape == (ROWS, 2)
