@@ -30,6 +30,7 @@ CLASSES = [
 ]
 ROWS = 6 * 50
 """Challenge states of an instance."""
+NONCE = 7
 
 
 @dataclass
@@ -38,24 +39,30 @@ class Server:
 
     Attributes:
       url: of the relay.
-      ticket: the ticket.
+      behind: of the board's own server.
       board: the board, its season and the file of the master.
+      ticket: the last one that `start` got.
       requests: methods and last parts of the paths, as they arrived at the relay.
       faults: what happens to the next requests, one each: "lose request", "lose answer", "cut
         answer", or a status such as "503"; then all is well.
     """
 
-    url: str
-    ticket: Ticket
+    behind: str
     board: Board
-    nonce: str
+    url: str = ""
+    ticket: Ticket = field(init=False)
     requests: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+
+    def start(self) -> None:
+        """Get a new ticket, as another entrant."""
+        self.requests, self.faults = [], []
+        self.ticket = self.board.ticket(self.behind, SigningKey.generate(), NONCE)
 
     def hidden(self, instance: int) -> Instance:
         """What is hidden of an instance."""
         number = str(self.ticket.ticket)
-        return list(instances(self.board.season, MASTER, number, self.nonce))[instance]
+        return list(instances(self.board.season, MASTER, number, f"{NONCE:064x}"))[instance]
 
     def challenge(self, instance: int) -> np.ndarray:
         """The challenge states of an instance."""
@@ -81,19 +88,20 @@ class Server:
 
 
 @contextlib.contextmanager
-def serving_ticket(folder: Path) -> Iterator[Server]:
+def serving_season(folder: Path) -> Iterator[Server]:
     """A board in a folder, served with a relay by threads of this process."""
-    board, key = online_board(folder, classes=CLASSES), SigningKey.generate()
+    board = online_board(folder, classes=CLASSES)
     with serving(board.path, season_secrets=[board.secret]) as url:
-        ticket, nonce = board.ticket(url, key, 7), f"{7:064x}"
-        with _relay(Server(url, ticket, board, nonce)) as server:
+        server = Server(url, board)
+        with _relay(server):
+            server.start()
             yield server
 
 
 @contextlib.contextmanager
-def _relay(server: Server) -> Iterator[Server]:
+def _relay(server: Server) -> Iterator[None]:
     """Let a server be reached through a relay, below the path /board."""
-    behind = urlsplit(server.url).netloc
+    behind = urlsplit(server.behind).netloc
 
     class Handler(http.server.BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -138,7 +146,7 @@ def _relay(server: Server) -> Iterator[Server]:
         thread.start()
         server.url = f"http://127.0.0.1:{listening.server_port}/board"
         try:
-            yield server
+            yield
         finally:
             listening.shutdown()
             thread.join()

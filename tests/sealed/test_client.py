@@ -23,7 +23,7 @@ from sme_registry.errors import (
 from sme_registry.sealed import Instance, Ticket, actions_in, connection
 from sme_registry.spec import Setting
 from tests.leaderboard.serving import serving
-from tests.sealed.server import ROWS, Server, serving_ticket
+from tests.sealed.server import ROWS, Server, serving_season
 
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 
@@ -36,10 +36,16 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return waited
 
 
-@pytest.fixture
-def server(tmp_path: Path, waits: list[float]) -> Iterator[Server]:
-    with serving_ticket(tmp_path) as server:
+@pytest.fixture(scope="module")
+def season(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving_season(tmp_path_factory.mktemp("season")) as server:
         yield server
+
+
+@pytest.fixture
+def server(season: Server, waits: list[float]) -> Server:
+    season.start()
+    return season
 
 
 def random_actions(lanes: int, count: int, low: float = 0.0) -> np.ndarray:
@@ -134,7 +140,7 @@ def test_another_process_goes_on_where_one_was_killed(server):
 
 
 def test_a_board_that_is_started_again_goes_on(tmp_path: Path, waits: list[float]):
-    with serving_ticket(tmp_path) as first:
+    with serving_season(tmp_path) as first:
         here, hidden = first.local(0, 2), sealed.make_vec(first.url, first.ticket, 0, 2)
         hidden.reset()
         for actions in random_actions(2, 5):

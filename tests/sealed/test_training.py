@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,13 +16,19 @@ from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.sealed.sb3 import SealedVecEnv
 from sme_registry.training.learners import new_learner
-from tests.sealed.server import ROWS, Server, serving_ticket
+from tests.sealed.server import ROWS, Server, serving_season
+
+
+@pytest.fixture(scope="module")
+def season(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving_season(tmp_path_factory.mktemp("season")) as server:
+        yield server
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with serving_ticket(tmp_path) as server:
-        yield server
+def server(season: Server) -> Server:
+    season.start()
+    return season
 
 
 def test_an_sb3_batch_is_stepped_as_the_same_task_is_here(server):
