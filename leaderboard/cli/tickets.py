@@ -20,6 +20,7 @@ from leaderboard.cli.options import (
     SubmitterName,
 )
 from leaderboard.documents.keys import SigningKey
+from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
 from sme_registry.io import refuse_existing, write_atomically
 from sme_registry.terminal import Progress, Table, err, out
@@ -91,7 +92,11 @@ def ticket(
         )
         signed = request.signed(signing_key, board)
         write_atomically(request_file, signed.to_bytes())
-    started = client.request_ticket(url, season, signed)
+    try:
+        started = client.request_ticket(url, season, signed)
+    except Rejection:  # and so it has started none
+        request_file.unlink()
+        raise
     started.write(out_file)
     request_file.unlink()
 

@@ -1,0 +1,110 @@
+"""The commands of online seasons, as an entrant types them: a ticket, then its answers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from leaderboard.cli import app
+from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.errors import BoardError
+from leaderboard.store import Store
+from leaderboard.web import client
+from sme_registry.sealed import Instance, Ticket
+from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.serving import serving
+
+SEASON = "sealed-online"
+
+
+def command(code: int, *arguments: str | Path) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.fixture
+def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    command(0, "keygen")
+    return online_board(tmp_path)
+
+
+@pytest.fixture
+def url(board: Board) -> Iterator[str]:
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        yield url
+
+
+def start(code: int, url: str, *more: str | Path) -> str:
+    names = "--method", "PPO", "--submitter", "A Lab"
+    return command(code, "ticket", url, SEASON, *names, *more)
+
+
+def policy(observations: np.ndarray) -> np.ndarray:
+    """A policy as `module:function` names it."""
+    return observations[:, :1]
+
+
+def test_a_ticket_is_started_stepped_and_answered(url: str, board: Board) -> None:
+    shown = start(0, url, "--knowledge", "family")
+    assert "keep it secret" in shown
+    ticket = Ticket.read("ticket.json")
+    assert ticket.token not in shown
+    assert os.stat("ticket.json").st_mode & 0o777 == 0o600
+    assert not Path("ticket.json.request").exists()
+    with Store.open(board.path) as store:
+        row = store.ticket(board.season.digest, ticket.ticket)
+        assert store.request_of(row).ticket.method.knowledge == "family"
+    with Instance(url, ticket, 0, 4) as hidden:
+        hidden.begin()
+        hidden.step(np.zeros((4, 1)))
+
+    name = f"{__name__}:policy"
+    assert "must contain {i}" in command(2, "answer", url, "ticket.json", name)
+    shown = command(0, "answer", url, "ticket.json", name, "--instance", "0")
+    assert "1 instances without answers" in shown
+    assert "error:" in command(2, "answer", url, "ticket.json", "runs/{i}/model.zip")
+    assert "has ended" in command(0, "answer", url, "ticket.json", name)  # of the one that is left
+    with Instance(url, ticket) as hidden:
+        assert [each.phase for each in hidden.status().instances] == ["answered", "answered"]
+
+
+def test_an_interrupted_request_gets_the_same_ticket(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = client.request_ticket
+
+    def interrupted(*arguments: object) -> Ticket:
+        request(*arguments)  # type: ignore[arg-type]
+        raise BoardError("the answer was lost")
+
+    monkeypatch.setattr(client, "request_ticket", interrupted)
+    start(2, url)
+    assert not Path("ticket.json").exists()
+    monkeypatch.setattr(client, "request_ticket", request)
+    assert "Repeating ticket.json.request." in start(0, url)
+    assert Ticket.read("ticket.json").ticket == 1
+    assert "already exists" in start(2, url)
+    start(0, url, "--out", "second.json")
+    assert Ticket.read("second.json").ticket == 2
+    assert "ticket_limit" in start(1, url, "--out", "third.json")
+    assert not Path("third.json.request").exists()
+
+
+def test_refusals_have_stable_codes(url: str) -> None:
+    output = command(1, "ticket", url, "summer", "--method", "PPO", "--submitter", "A Lab")
+    assert "season_unknown" in output
+    assert not Path("ticket.json.request").exists()
+    assert "season=" in command(2, "ticket", url, "../x", "--method", "PPO", "--submitter", "A")
+    start(0, url)
+    plain = Ticket.read("ticket.json").to_dict() | {"token": "00" * 32}
+    Ticket.from_dict(plain).write("other.json")
+    assert "token_wrong" in command(1, "answer", url, "other.json", "constant", "-i", "0")
