@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.artefact.answers import Float32 as Float32
-from leaderboard.artefact.answers import read_answers as read_answers
-from leaderboard.artefact.answers import rows_of as rows_of
+from leaderboard.artefact.answers import Float32, rows_of
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master, Place
 from leaderboard.documents.result import RunScore, SealedResult, Stepping

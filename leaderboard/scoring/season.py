@@ -1,4 +1,4 @@
-"""A season's end: which entries count, their scores after the reveal, the ranking, the replay.
+"""A season's end: which entries count, their scores after the reveal, and the rankings.
 
     offline   of each key and method the last entry before the close counts
     online    every ticket of a key and method counts: its runs are those of all of them
@@ -9,9 +9,7 @@ Methods that declare knowledge of the family are ranked apart from those that de
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import NoReturn
+from dataclasses import replace
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.board import RULES
@@ -20,13 +18,9 @@ from leaderboard.documents.master import Master
 from leaderboard.documents.result import Metric, RunScore, SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Knowledge
-from leaderboard.errors import TamperedError
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
-from leaderboard.scoring.publication import published_digests
 from leaderboard.scoring.ranking import RankedRow, ranking
-from leaderboard.scoring.rescore import RESCORED
 from leaderboard.scoring.sealed import groups_of_season, instances, score_run, sealed_result
-from leaderboard.scoring.verify import EXACT, close
 from leaderboard.store import EntryRow, SealedRow, Store
 
 Progress = Callable[[int, int], None]
@@ -35,21 +29,6 @@ KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 """Ranked apart, in this order."""
 
 _ORDER: tuple[str, ...] = KNOWLEDGE
-
-
-@dataclass(frozen=True)
-class SeasonReport:
-    """What was verified of a season.
-
-    Attributes:
-      instances: number whose data sets and challenge states were generated again.
-      entries: number of entries or tickets whose signatures were checked.
-      results: number that were scored again.
-    """
-
-    instances: int
-    entries: int
-    results: int
 
 
 def counting(store: Store, season: Season) -> list[SealedRow]:
@@ -81,7 +60,7 @@ def score_entries(store: Store, name: str, progress: Progress | None = None) -> 
     if season.track == "sealed-online":
         return 0
     for done, row in enumerate(waiting, start=1):
-        store.rank(_scored(store, season, master, row))
+        store.rank(scored_entry(store, season, master, row))
         if progress is not None:
             progress(done, len(waiting))
     return len(waiting)
@@ -99,62 +78,8 @@ def season_rankings(
     }
 
 
-def verify_season(store: Store, name: str, progress: Progress | None = None) -> SeasonReport:
-    """Replay a revealed offline season from its master.
-
-    The store has checked that the master matches the commitment, and each file the log.
-
-    Args:
-      store: the board.
-      name: id or digest of the season.
-      progress: called with the number of instances and entries done, and of all.
-
-    Raises:
-      TamperedError: names the first file that does not follow from the master and the entries.
-      Rejection: `season_unknown`, or `season_not_closed` before the reveal.
-    """
-    season, master = store.season(name), store.revealed_master(name)
-    folder = store.season_folder(season.digest)
-    rows, counted = store.entrants(season.digest), counting(store, season)
-    total, done = len(season.published) + len(rows), 0
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
-    for instance, expected in zip(instances(season, master), season.published, strict=True):
-        if published_digests(instance, master) != expected:
-            _refuse(
-                store,
-                folder.season,
-                f"published: {expected.class_name} {expected.instance}: its data set or challenge "
-                "states do not follow from the master",
-            )
-        advance()
-    results = 0
-    for row in rows:
-        signed = store.entry_of(row)
-        if not signed.is_valid or signed.board != store.document.signatures_for:
-            path = folder.entry(row.entrant.id)
-            _refuse(store, path, "its signature does not match the entrant's key")
-        stored = store.sealed_result(row)
-        if (stored is not None) != (row in counted):
-            _refuse(
-                store,
-                folder.result(row.entrant.id),
-                "must exist for each entry that counts, and for no other",
-            )
-        if stored is not None:
-            _compare(store, stored, _scored(store, season, master, row))
-            results += 1
-        advance()
-    return SeasonReport(len(season.published), len(rows), results)
-
-
-def _scored(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
-    """The result of an offline entry."""
+def scored_entry(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
+    """The result of an offline entry, from its answers."""
     runs: list[RunScore] = []
     versions: dict[str, str] = {}
     answers = store.entry_of(row).entry.answers
@@ -212,31 +137,3 @@ def _all(runs: Iterable[Iterable[RunScore]]) -> list[RunScore]:
 def _method(row: SealedRow) -> tuple[str, str]:
     """What an entry or ticket is of: a key, and a method up to look-alike spelling."""
     return row.entrant.key, skeleton(row.entrant.method)
-
-
-def _compare(store: Store, stored: SealedResult, again: SealedResult) -> None:
-    path = store.season_folder(stored.season).result(stored.subject)
-    for number, (old, new) in enumerate(zip(stored.runs, again.runs, strict=True)):
-        same = (old.class_name, old.artefact) == (new.class_name, new.artefact)
-        pairs = zip(_numbers(old), _numbers(new), strict=True)
-        if not same or any(abs(x - y) > RESCORED * max(1.0, abs(y)) for x, y in pairs):
-            _refuse(store, path, f"runs.{number}: scored again, it differs")
-    follows = sealed_result(
-        store.season(stored.season),
-        stored.subject,
-        stored.runs,
-        stored.versions,
-        store.document.draws,
-        stored.stepping,
-    )
-    if not close(follows.to_dict(), stored.to_dict(), EXACT):
-        _refuse(store, path, "its scores do not follow from its runs")
-
-
-def _numbers(run: RunScore) -> list[float]:
-    metrics = [run.wd_regret, run.ood_regret, run.ood_decay, run.regret_slope, run.similarity_loss]
-    return [*run.normalised_regret, *(run.similarity or ()), *metrics]
-
-
-def _refuse(store: Store, path: Path, message: str) -> NoReturn:
-    raise TamperedError(path.relative_to(store.folder.path).as_posix(), message)

@@ -6,7 +6,7 @@
 Integers and float32 are little-endian, and every record has the same size. The environment is
 deterministic, so its state and the budget used follow from the journal: a killed server continues
 where it was. A record with the number 0 and zeros ends the stepping. What a loss of power, or a
-kill in the middle of a write, leaves of the last record is cut off when the journal is opened.
+kill in the middle of a write, leaves of the last record is ignored, and cut off by the next one.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class Journal:
 
     @classmethod
     def open(cls, path: Path) -> Journal:
-        """The journal of a file, cut to its last whole record.
+        """The journal of a file, up to its last whole record; writes nothing.
 
         Raises:
           TamperedError: the file is no journal.
-          OSError: it does not exist, or cannot be read or cut.
+          OSError: it does not exist, or cannot be read.
         """
         with open_regular(path) as stream:
             header = stream.read(_START)
@@ -167,7 +167,7 @@ class Journal:
             self._torn = False
 
     def _count(self, stream: BinaryIO) -> None:
-        """Count the records, and cut off what follows the last whole one."""
+        """Count the records, up to the last whole one."""
         while not self.ended:
             number, _ = self._record(stream)
             if number not in (self.requests + 1, _END):
@@ -175,8 +175,7 @@ class Journal:
             self.ended = number == _END
             self.requests += not self.ended
             self._size += self._record_size
-        if os.fstat(stream.fileno()).st_size > self._size:
-            os.truncate(self.path, self._size)
+        self._torn = os.fstat(stream.fileno()).st_size > self._size
 
     def _record(self, stream: BinaryIO) -> tuple[int, bytes]:
         """Number and actions of the next record; −1 if it is not whole."""

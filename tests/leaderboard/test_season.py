@@ -23,7 +23,8 @@ from leaderboard.scoring.publication import (
     refuse_large_answers,
 )
 from leaderboard.scoring.sealed import instances
-from leaderboard.scoring.season import counting, score_entries, season_rankings, verify_season
+from leaderboard.scoring.season import counting, score_entries, season_rankings
+from leaderboard.sealed import verify_season
 from leaderboard.store import Store
 from sme_registry import evaluate, materialize
 from sme_registry.datasets import SealedDataset

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.master import Place
 from leaderboard.errors import Rejection
 from leaderboard.scoring.metrics import failed_run
@@ -12,7 +13,6 @@ from leaderboard.scoring.sealed import (
     Instance,
     challenge,
     instances,
-    read_answers,
     score_run,
     sealed_result,
 )

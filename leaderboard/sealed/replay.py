@@ -1,0 +1,143 @@
+"""`verify_season`: everything that follows from a reveal, computed again and compared.
+
+The store has checked each file against the log, and the master against the commitment. What is
+left are the data sets and challenge states, the signatures, and the scores: of offline entries
+from their answers, of tickets also from their journals of actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from leaderboard.documents.master import Master
+from leaderboard.documents.result import RunScore, SealedResult, Stepping
+from leaderboard.documents.season import Season
+from leaderboard.errors import TamperedError
+from leaderboard.scoring.publication import published_digests
+from leaderboard.scoring.rescore import RESCORED
+from leaderboard.scoring.sealed import instances, sealed_result
+from leaderboard.scoring.season import counting, scored_entry
+from leaderboard.scoring.verify import EXACT, close
+from leaderboard.sealed.scores import score_ticket
+from leaderboard.store import SealedRow, Store
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SeasonReport:
+    """What was verified of a season.
+
+    Attributes:
+      instances: number whose data sets and challenge states were generated again.
+      entries: number of entries or tickets whose signatures were checked.
+      results: number that were scored again.
+    """
+
+    instances: int
+    entries: int
+    results: int
+
+
+def verify_season(store: Store, name: str, progress: Progress | None = None) -> SeasonReport:
+    """Replay a revealed season from its master.
+
+    Args:
+      store: the board.
+      name: id or digest of the season.
+      progress: called with the number of instances and entries or tickets done, and of all.
+
+    Raises:
+      TamperedError: names the first file that does not follow from the master and the entries.
+      Rejection: `season_unknown`, or `season_not_closed` before the reveal.
+    """
+    season, master = store.season(name), store.revealed_master(name)
+    folder = store.season_folder(season.digest)
+    rows, counted = store.entrants(season.digest), counting(store, season)
+    total, done = len(season.published) + len(rows), 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    if season.published:
+        for instance, expected in zip(instances(season, master), season.published, strict=True):
+            if published_digests(instance, master) != expected:
+                where = f"published: {expected.class_name} {expected.instance}"
+                message = "its data set or challenge states do not follow from the master"
+                _refuse(store, folder.season, f"{where}: {message}")
+            advance()
+    results = 0
+    for row in rows:
+        _check_signature(store, season, row)
+        stored = store.sealed_result(row)
+        if (stored is not None) != (row in counted):
+            path = folder.result(row.entrant.id)
+            _refuse(store, path, "must exist for each entry that counts, and for no other")
+        if stored is not None:
+            _compare(store, season, stored, _scored(store, season, master, row))
+            results += 1
+        advance()
+    return SeasonReport(len(season.published), len(rows), results)
+
+
+def _check_signature(store: Store, season: Season, row: SealedRow) -> None:
+    folder = store.season_folder(row.season)
+    online = season.track == "sealed-online"
+    signed = store.request_of(row) if online else store.entry_of(row)
+    path = folder.request(row.number) if online else folder.entry(row.entrant.id)
+    if not signed.is_valid or signed.board != store.document.signatures_for:
+        _refuse(store, path, "its signature does not match the entrant's key")
+
+
+def _scored(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
+    if season.track == "sealed-online":
+        return score_ticket(store, season, master, row.number)
+    return scored_entry(store, season, master, row)
+
+
+def _compare(store: Store, season: Season, stored: SealedResult, again: SealedResult) -> None:
+    path = store.season_folder(stored.season).result(stored.subject)
+    if len(stored.runs) != len(again.runs) or len(stored.stepping) != len(again.stepping):
+        _refuse(store, path, "has more or fewer runs than the season has instances")
+    for number, (old, new) in enumerate(zip(stored.runs, again.runs, strict=True)):
+        same = (old.class_name, old.artefact) == (new.class_name, new.artefact)
+        if not same or not _alike(_numbers(old), _numbers(new)):
+            _refuse(store, path, f"runs.{number}: scored again, it differs")
+    for number, (was, now) in enumerate(zip(stored.stepping, again.stepping, strict=True)):
+        if was.steps != now.steps or not _alike(_regrets(was), _regrets(now)):
+            _refuse(store, path, f"stepping.{number}: replayed from its journal, it differs")
+    follows = sealed_result(
+        season,
+        stored.subject,
+        stored.runs,
+        stored.versions,
+        store.document.draws,
+        stored.stepping,
+    )
+    if not close(follows.to_dict(), stored.to_dict(), EXACT):
+        _refuse(store, path, "its scores do not follow from its runs")
+
+
+def _alike(old: list[float], new: list[float]) -> bool:
+    return len(old) == len(new) and all(
+        abs(x - y) <= RESCORED * max(1.0, abs(y)) for x, y in zip(old, new, strict=True)
+    )
+
+
+def _regrets(stepping: Stepping) -> list[float]:
+    return [stepping.normalised_online_regret, *stepping.learning_curve]
+
+
+def _numbers(run: RunScore) -> list[float]:
+    metrics = [run.wd_regret, run.ood_regret, run.ood_decay, run.regret_slope, run.similarity_loss]
+    return [*run.normalised_regret, *(run.similarity or ()), *metrics]
+
+
+def _refuse(store: Store, path: Path, message: str) -> NoReturn:
+    raise TamperedError(path.relative_to(store.folder.path).as_posix(), message)
