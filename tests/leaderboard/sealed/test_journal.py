@@ -57,8 +57,11 @@ def test_a_record_that_never_reached_the_disk_ends_the_journal(tmp_path: Path) -
     with path.open("r+b") as stream:  # as a loss of power leaves a page that was not written
         stream.seek(HEADER + RECORD)
         stream.write(bytes(RECORD - 1))
-    assert Journal.open(path).requests == 1
-    assert path.stat().st_size == HEADER + RECORD
+    journal = Journal.open(path)
+    assert journal.requests == 1
+    journal.append(actions(9))
+    assert contents(Journal.open(path)) == [actions(1), actions(9)]
+    assert path.stat().st_size == HEADER + 2 * RECORD
 
 
 def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path: Path) -> None:
