@@ -204,6 +204,10 @@ class SteppedInstance:
         if phase in ("waiting", "stepping"):
             raise _wrong_phase(phase, "Take all steps, or finish it, before the challenge.")
 
+    def has_stored(self, data: bytes) -> bool:
+        """Whether these are its answers, which a client sends again if the reply was lost."""
+        return self._answered and read_regular(self._answers_path, len(data) + 1) == data
+
     def answer(self, data: bytes) -> bool:
         """Store the answers to the challenge.
 
@@ -221,9 +225,9 @@ class SteppedInstance:
             self._refuse_closed()
             self.refuse_challenge()
             read_answers(data, self._member.setting, self._protocol)
+            if self.has_stored(data):
+                return False
             if self._answered:
-                if read_regular(self._answers_path, len(data) + 1) == data:
-                    return False
                 raise Rejection(
                     "answer_conflict",
                     "answers: others were stored for this instance, and count. Go on with the "

@@ -113,7 +113,9 @@ class Tickets:
 
     def answer_bytes(self, number: int, token: str, instance: int) -> int:
         """The most bytes of an instance's answers, with the password of the ticket."""
-        return self._chosen(number, token, instance).answer_bytes
+        ticket = self.ticket(number)
+        ticket.refuse_token(token)
+        return ticket.instance(instance).answer_bytes
 
     def start(self, number: int, token: str, instance: int, lanes: int) -> bytes:
         """`SteppedInstance.start`, with the password of the ticket."""
@@ -139,8 +141,17 @@ class Tickets:
         return self.ticket(number).challenge(instance)
 
     def answer(self, number: int, token: str, instance: int, data: bytes) -> bool:
-        """`SteppedInstance.answer`, with the password of the ticket."""
-        return self._chosen(number, token, instance).answer(data)
+        """`SteppedInstance.answer`, with the password of the ticket.
+
+        The same answers are confirmed after the ticket's end, too: the last ones are what ends it.
+        """
+        ticket = self.ticket(number)
+        ticket.refuse_token(token)
+        chosen = ticket.instance(instance)
+        if chosen.has_stored(data):
+            return False
+        ticket.refuse_over(self.now)
+        return chosen.answer(data)
 
     def is_ready(self, number: int, instance: int) -> bool:
         """Whether a step of this instance needs no replay, and waits for no other request."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -262,6 +263,29 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
     with Instance(server.url, server.ticket) as first:
         status = first.status()
     assert [each.phase for each in status.instances] == ["waiting", "answered", "waiting"]
+
+
+def test_the_last_answers_may_be_repeated_after_they_have_ended_the_ticket(server):
+    answers = np.zeros((ROWS, 2))
+    for number in range(3):
+        with Instance(server.url, server.ticket, number) as hidden:
+            assert hidden.challenge().shape == (ROWS, 5)
+            hidden.send_answers(answers)
+    with Instance(server.url, server.ticket, 2) as hidden:
+        while not refuses(hidden.challenge):  # until the ticket is scored
+            time.sleep(0.05)
+        hidden.send_answers(answers)
+        with pytest.raises(SealedError, match="ticket_ended"):
+            hidden.send_answers(answers + 1)
+
+
+def refuses(request: Callable[[], object]) -> bool:
+    """Whether the server answers that the ticket has ended."""
+    try:
+        request()
+    except SealedError as error:
+        return error.code == "ticket_ended"
+    return False
 
 
 def test_a_policy_that_cannot_be_used_does_not_end_the_stepping(server):
