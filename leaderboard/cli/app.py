@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from leaderboard.cli import administration, demo, results, submissions, tickets
+from leaderboard.cli import administration, demo, entries, results, seasons, submissions, tickets
 from leaderboard.errors import Rejection, TamperedError
 from sme_registry.errors import SealedError
 from sme_registry.terminal import CommandGroup, application
@@ -50,6 +50,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
     "Seasons": {
         "ticket": tickets.ticket,
         "answer": tickets.answer,
+        "enter": entries.enter,
     },
     "Results": {
         "rank": results.rank,
@@ -69,6 +70,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
 for _panel, _commands in _COMMANDS.items():
     for _name, _command in _commands.items():
         app.command(_name, rich_help_panel=_panel)(_command)
+app.add_typer(seasons.app, name="season", rich_help_panel="Seasons")
 app.command("export", hidden=True)(submissions.export_sb3)  # the name that scripts rely on
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from leaderboard.documents.board import FILE, BoardDocument, Folder, refuse_unscored
+from leaderboard.documents.submission import now
 from sme_registry.errors import OptionError
 from sme_registry.spec import ProtocolFile, SuiteFile, catalogue
 
@@ -166,6 +167,44 @@ Family = Annotated[
 ]
 CodeLink = Annotated[str | None, typer.Option("--code", help="An https link to the code.")]
 Statement = Annotated[str, typer.Option(help="A note for readers of the board.")]
+SealedKnowledge = Annotated[
+    Literal["generic", "family"],
+    typer.Option(
+        metavar="LEVEL",
+        help="What the method knows of the tasks. generic: nothing. family: that they are SMEs. "
+        "The two are ranked apart.",
+    ),
+]
+
+
+def manifest_fields(
+    key: str,
+    *,
+    method: tuple[str, str, str | None, str],
+    submitter: str,
+    code: str | None,
+    statement: str,
+) -> dict[str, Any]:
+    """The fields of a `Manifest`, signed now.
+
+    Args:
+      key: the submitter's public key.
+      method: name, version, family (None for the name) and knowledge.
+      submitter, code, statement: as given.
+    """
+    name, version, family, knowledge = method
+    return {
+        "method": {
+            "name": name,
+            "version": version,
+            "family": family or name,
+            "knowledge": knowledge,
+        },
+        "code": code,
+        "submitter": {"name": submitter, "key": key},
+        "created": now(),
+        "statement": statement,
+    }
 
 
 def find_suite(name: str) -> SuiteFile:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -16,8 +16,10 @@ from leaderboard.cli.options import (
     KeyFile,
     MethodName,
     MethodVersion,
+    SealedKnowledge,
     Statement,
     SubmitterName,
+    manifest_fields,
 )
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
@@ -37,14 +39,7 @@ def ticket(
     submitter: SubmitterName,
     method_version: MethodVersion = "1",
     family: Family = None,
-    knowledge: Annotated[
-        Literal["generic", "family"],
-        typer.Option(
-            metavar="LEVEL",
-            help="What the method knows of the tasks. generic: nothing. family: that they are "
-            "SMEs. The two are ranked apart.",
-        ),
-    ] = "generic",
+    knowledge: SealedKnowledge = "generic",
     code: CodeLink = None,
     statement: Statement = "",
     out_file: Annotated[Path, typer.Option("--out", "-o", help="The ticket's new file.")] = Path(
@@ -62,7 +57,6 @@ def ticket(
       sme-leaderboard ticket https://board.example winter --method PPO --submitter "A Lab"
     """
     from leaderboard.documents.entry import SignedTicketRequest, TicketRequest
-    from leaderboard.documents.submission import now
     from leaderboard.web import client
 
     refuse_existing(out_file)
@@ -76,16 +70,13 @@ def ticket(
         season_digest, board = client.season(url, season)
         request = TicketRequest.from_dict(
             {
-                "method": {
-                    "name": method,
-                    "version": method_version,
-                    "family": family or method,
-                    "knowledge": knowledge,
-                },
-                "code": code,
-                "submitter": {"name": submitter, "key": signing_key.public},
-                "created": now(),
-                "statement": statement,
+                **manifest_fields(
+                    signing_key.public,
+                    method=(method, method_version, family, knowledge),
+                    submitter=submitter,
+                    code=code,
+                    statement=statement,
+                ),
                 "season": season_digest,
                 "nonce": secrets.token_hex(32),
             }

@@ -86,7 +86,7 @@ class SignedEntry(SignedSealed):
     """`entries/<64 hex>.json` of a season, and the entrant's `entry.json`."""
 
     KIND = "entry"
-    COMMAND = "answer"
+    COMMAND = "enter"
 
     entry: Entry
 

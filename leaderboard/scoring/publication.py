@@ -18,10 +18,11 @@ from typing import Any
 from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.master import Master
 from leaderboard.documents.reading import read_regular
-from leaderboard.documents.season import Digests, Hidden, Season, Terms
+from leaderboard.documents.season import MAX_INSTANCES, Digests, Hidden, Season, Terms
 from leaderboard.errors import BoardError
 from leaderboard.scoring.sealed import Instance, challenge, instances
 from sme_registry.datasets import DatasetRecipe, SealedDataset
+from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, to_json
 from sme_registry.sealed import pack_table, table_bytes
 
@@ -61,8 +62,44 @@ def refuse_large_answers(terms: Terms, limit: int) -> None:
             )
 
 
+def read_plan(plan: Any, source: str = "plan") -> Terms:
+    """The terms of a season whose data sets and challenge states are not generated yet.
+
+    Args:
+      plan: the fields of `Terms`, without `published`. `protocol` may be left out for the one in
+        the catalogue that `protocol_name` names.
+      source: what errors call it.
+
+    Returns:
+      The terms, with digests of zeros.
+
+    Raises:
+      SpecError, UnknownNameError: a field is invalid.
+    """
+    fields = dict(plan) if isinstance(plan, dict) else {}
+    name = fields.get("protocol_name")
+    if "protocol" not in fields and isinstance(name, str):
+        fields["protocol"] = resolve_protocol(name).model_copy(update={"seed": 0}).to_dict()
+    if fields.get("track") == "sealed-offline":
+        fields["published"] = _unknown(fields.get("classes"))
+    return Terms.from_dict(fields if fields else plan, source)
+
+
+def _unknown(classes: Any) -> list[dict[str, Any]]:
+    """The list of instances of classes that may be invalid, with digests of zeros."""
+    listed = []
+    for member in classes if isinstance(classes, list) else []:
+        match member:
+            case {"name": name, "instances": int(count)}:
+                listed += [
+                    {"class_name": name, "instance": i, "data": _UNKNOWN, "challenge": _UNKNOWN}
+                    for i in range(min(count, MAX_INSTANCES))
+                ]
+    return listed
+
+
 def create_season(
-    plan: dict[str, Any],
+    plan: Terms,
     master: Master,
     folder: str | os.PathLike[str],
     progress: Progress | None = None,
@@ -70,7 +107,7 @@ def create_season(
     """Generate all that is published of a season, into a new folder.
 
     Args:
-      plan: the fields of `Terms`, without `published`.
+      plan: as `read_plan` returns it.
       master: the season's secret.
       folder: it gets `season.json` and, offline, data sets and challenge states; completely or not
         at all.
@@ -80,20 +117,18 @@ def create_season(
       The season, committed to the master.
 
     Raises:
-      SpecError: a field is invalid.
       BoardError, NameTakenError, OptionError: the folder exists or cannot be written.
       ResourceLimitError, MissingDependencyError: a data set cannot be generated or written.
     """
-    terms = _with_placeholders(plan)
     with build_folder(Path(folder)) as building:
         published = []
-        if terms.track == "sealed-offline":
-            every = list(instances(terms, master))
+        if plan.track == "sealed-offline":
+            every = list(instances(plan, master))
             for done, instance in enumerate(every, start=1):
-                published.append(_publish(instance, terms.id, master, Path(building)))
+                published.append(_publish(instance, plan.id, master, Path(building)))
                 if progress is not None:
                     progress(done, len(every))
-        fields = {**terms.to_dict(), "published": [each.to_dict() for each in published]}
+        fields = {**plan.to_dict(), "published": [each.to_dict() for each in published]}
         season = Terms.from_dict(fields).commit(master)
         (Path(building) / SEASON).write_text(to_json(season.to_dict()))
     return season
@@ -197,21 +232,3 @@ def _file_digest(path: Path, season: Season, hidden: Hidden) -> str:
 
 def _sha256(data: bytes) -> str:
     return "sha256:" + hashlib.sha256(data).hexdigest()
-
-
-def _with_placeholders(plan: dict[str, Any]) -> Terms:
-    """The terms of a plan, with digests that are still unknown."""
-    classes = plan.get("classes")
-    listed = (
-        []
-        if plan.get("track") != "sealed-offline"
-        else [
-            {"class_name": member["name"], "instance": i, "data": _UNKNOWN, "challenge": _UNKNOWN}
-            for member in (classes if isinstance(classes, list) else [])
-            if isinstance(member, dict)
-            and type(member.get("instances")) is int
-            and "name" in member
-            for i in range(min(member["instances"], 1000))
-        ]
-    )
-    return Terms.from_dict({**plan, "published": listed}, "season")

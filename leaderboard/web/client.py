@@ -12,12 +12,12 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from leaderboard.bundle import Bundle
 from leaderboard.documents.board import BoardDocument, hex_of
-from leaderboard.documents.entry import SignedTicketRequest
+from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedWithdrawal
@@ -70,10 +70,7 @@ def submit(
         board = client.board_document().key
         signed = content.signed.for_board(board, key)
         for done, digest in enumerate(digests, start=1):
-            # Also if the board has it: only those who have its bytes may submit it.
-            sign = functools.partial(upload_header, key, digest, board=board)
-            path = f"/api/objects/{hex_of(digest)}"
-            client.request("PUT", path, content.artefact(digest), sign)
+            client.upload(digest, content.artefact(digest), key, board)
             if progress is not None:
                 progress(done, len(digests))
         _, answer = client.request("POST", "/api/submissions", signed.to_bytes())
@@ -151,6 +148,44 @@ def request_ticket(
         raise BoardError(f"{url}: answered with no ticket: {printable(error)}") from None
 
 
+def enter(
+    url: str,
+    season: str,
+    signed: SignedEntry,
+    answers: Mapping[str, bytes],
+    key: SigningKey,
+    progress: Progress | None = None,
+    *,
+    insecure: bool = False,
+) -> str:
+    """Send an entry of a sealed-offline season to a board.
+
+    Args:
+      url, insecure: as for `submit`.
+      season: the season's id.
+      signed: the entry, signed for this board.
+      answers: the files that it names, by their digests.
+      key: the submitter's, to sign the uploads.
+      progress: called with the number of answers on the board and of all.
+
+    Returns:
+      The entry's id.
+
+    Raises:
+      Rejection: the board rejects it.
+      BoardError: the board cannot be reached, or its answer is invalid.
+      OptionError: the URL or the id is invalid.
+    """
+    with _Client(url, insecure=insecure) as client:
+        for done, (digest, data) in enumerate(answers.items(), start=1):
+            client.upload(digest, data, key, signed.board)
+            if progress is not None:
+                progress(done, len(answers))
+        path = f"/api/seasons/{_name(season)}/entries"
+        _, answer = client.request("POST", path, signed.to_bytes())
+    return str(_answer_for(signed.id, answer, url)["id"])
+
+
 def withdraw(
     url: str, id: str, key: SigningKey, reason: str = "", *, insecure: bool = False
 ) -> None:
@@ -203,6 +238,11 @@ class _Client:
             raise BoardError(
                 f"{self._url}: its definition is invalid: {printable(error)}"
             ) from None
+
+    def upload(self, digest: str, data: bytes, key: SigningKey, board: str | None) -> None:
+        """Send an object, also if the board has it: only who has its bytes may submit it."""
+        sign = functools.partial(upload_header, key, digest, board=board)
+        self.request("PUT", f"/api/objects/{hex_of(digest)}", data, sign)
 
     def request(
         self,

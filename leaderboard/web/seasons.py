@@ -1,7 +1,8 @@
-"""`SeasonRoutes`: the sealed-online track over HTTP; `sme_registry.sealed` defines the messages.
+"""`SeasonRoutes`: sealed seasons over HTTP; `sme_registry.sealed` defines the online messages.
 
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
+    POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
     POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again
     GET  /api/seasons/{id}/tickets/{n}                          its status
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/start      present observations
@@ -28,8 +29,9 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from leaderboard import intake
-from leaderboard.documents.entry import SignedTicketRequest
+from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
 from leaderboard.documents.submission import Envelope
+from leaderboard.errors import Rejection
 from leaderboard.sealed import Tickets, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web import limits
@@ -65,6 +67,7 @@ class SeasonRoutes:
         }
         self._threads = CapacityLimiter(_WORKERS)
         self._requests = limits.Turns(_REQUESTS)
+        self._entries = limits.Turns(_REQUESTS)
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -87,6 +90,7 @@ class SeasonRoutes:
             Route(f"{_INSTANCE}/answers", self.answer, methods=["PUT"]),
             Route("/api/seasons", self.get_seasons, methods=["GET"]),
             Route(_SEASON, self.get_season, methods=["GET"]),
+            Route(f"{_SEASON}/entries", self.post_entry, methods=["POST"]),
             Route(f"{_SEASON}/tickets", self.post_ticket, methods=["POST"]),
             Route(_TICKET, self.get_ticket, methods=["GET"]),
         ]
@@ -133,6 +137,26 @@ class SeasonRoutes:
 
         ticket, new = await self._requests.run(start)
         return JSONResponse(ticket.to_dict(), 201 if new else 200)
+
+    async def post_entry(self, request: Request) -> Response:
+        """Store an entry of the offline track, whose answers have been uploaded."""
+        name = request.path_params["season"]
+        text = await limits.read_document(request, "entry")
+
+        def enter() -> tuple[str, bool]:
+            envelope = Envelope.read(text, SignedEntry)
+            signed = envelope.open()
+            digest = self._store.season_row(name).digest
+            if signed.entry.season != digest:
+                raise Rejection(
+                    "season_unknown",
+                    f"season={signed.entry.season}: the entry was sent to the season {digest}. "
+                    "Send it to its own.",
+                )
+            return signed.id, intake.enter(self._store, signed)
+
+        id, new = await self._entries.run(enter)
+        return JSONResponse({"id": id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
         """A ticket's status."""

@@ -1,0 +1,143 @@
+"""The commands of an offline season, as they are typed, on a folder and over HTTP."""
+
+from __future__ import annotations
+
+import json
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.scoring.publication import read_season
+from leaderboard.store import Store
+from sme_registry.sealed import pack_table, unpack_table
+from tests.leaderboard.conftest import linear_onnx, tiny_board
+from tests.leaderboard.sealing import AFTERWARDS, tiny_terms
+from tests.leaderboard.serving import serving
+from tests.leaderboard.test_cli import fails, good
+
+PLAN = "plan.json"
+ENTER = ("--method", "Test", "--submitter", "A Lab")
+
+
+@pytest.fixture(autouse=True)
+def _home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board, a key and the plan of a season."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv(KEY_VARIABLE, str(tmp_path / "my.key"))
+    SigningKey.generate().write("my.key")
+    tiny_board(tmp_path / "board").close()
+    fields = tiny_terms(id="autumn").to_dict()
+    del fields["published"]
+    Path(PLAN).write_text(json.dumps(fields))
+
+
+@pytest.fixture
+def season() -> Path:
+    good("season", "new", "board", PLAN)
+    good("season", "publish", "board", "autumn")
+    return Path("autumn")
+
+
+def later(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("sealed", "log"):
+        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+
+
+def facts(*arguments: str) -> Any:
+    return json.loads(good("season", *arguments, "--json"))
+
+
+def test_a_season_is_played_from_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = good("season", "new", "board", PLAN)
+    secret = Path("board.autumn.master")
+    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    assert Master.read(secret).raw.hex() not in printed
+    season = read_season("autumn")
+    assert season.commitment in printed
+    assert season.is_committed_to(Master.read(secret))
+    assert "already exists" in fails(2, "season", "new", "board", PLAN)
+    assert Master.read(secret)
+
+    good("season", "publish", "board", "autumn")
+    [announced] = facts("show", "board")
+    assert (announced["state"], announced["commitment"]) == ("open", season.commitment)
+    answers = np.full((300, 1), 0.25, np.float32)
+    Path("deep-0.npy").write_bytes(pack_table(answers))
+    id = good("enter", "board", "autumn", "{name}.npy", "--failed", "deep-1", *ENTER).strip()
+    assert "season_not_closed" in fails(1, "season", "close", "board", "autumn")
+    assert "season_not_closed" in fails(1, "season", "reveal", "board", "autumn")
+    assert "season_not_closed" in fails(1, "season", "verify", "board", "autumn")
+    assert facts("verify", "board", "autumn", "--published", "autumn")["published"] == 2
+
+    later(monkeypatch)
+    assert "log entry 2" in good("season", "close", "board", "autumn")
+    Master(bytes(32)).write("other.master")
+    wrong = fails(1, "season", "reveal", "board", "autumn", "--secret", "other.master")
+    assert "reveal_mismatch" in wrong
+    assert "1 entry scored" in good("season", "reveal", "board", "autumn")
+    assert "0 entries scored" in good("season", "reveal", "board", "autumn")
+    report = facts("verify", "board", "autumn", "--published", "autumn")
+    assert (report["instances"], report["entries"], report["results"]) == (2, 1, 1)
+    shown = facts("show", "board", "autumn")
+    assert shown["state"] == "revealed"
+    [row] = shown["ranking"]["generic"]
+    assert (row["id"], row["ranks"]) == (id, "1")
+    assert shown["ranking"]["family"] == []
+    assert "Test 1" in good("season", "show", "board", "autumn", "--metric", "ood_regret")
+    assert "revealed" in good("season", "show", "board")
+
+
+def test_a_policy_is_asked_and_stays_at_home(season: Path) -> None:
+    for name in ("deep-0", "deep-1"):
+        Path(f"{name}.npy").write_bytes(pack_table(challenge(season, name)[:, :1]))
+    arrays = good("enter", "board", season, "{name}.npy", *ENTER).strip()
+    Path("deep-0.onnx").write_bytes(linear_onnx(0))
+    asked = good("enter", "board", season, "{name}.onnx", "--failed", "deep-1", *ENTER).strip()
+    with Store.open("board", read_only=True) as store:
+        first, second = store.entrants(read_season(season).digest)
+        [answer, nothing] = store.entry_of(second).entry.answers
+        assert (first.entrant.id, second.entrant.id, nothing) == (arrays, asked, None)
+        assert answer is not None
+        actions = unpack_table(store.objects.read(answer.sha256), 1)
+    expected = np.clip(0.1 * challenge(season, "deep-0").sum(axis=1, keepdims=True), 0, 1)
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+
+
+def challenge(season: Path, name: str) -> np.ndarray:
+    return unpack_table((season / "challenges" / f"{name}.npy").read_bytes(), 4)
+
+
+def test_wrong_arguments_of_an_entry_are_named(season: Path) -> None:
+    assert "must contain {name}" in fails(2, "enter", "board", season, "x.onnx", *ENTER)
+    assert "must be one of deep-0, deep-1" in fails(
+        2, "enter", "board", season, "{name}.npy", "--failed", "deep-2", *ENTER
+    )
+    assert "cannot be read" in fails(2, "enter", "board", season, "missing-{name}.npy", *ENTER)
+
+
+def test_an_entry_is_sent_to_a_served_board(season: Path) -> None:
+    for name in ("deep-0", "deep-1"):
+        Path(f"{name}.npy").write_bytes(pack_table(np.full((300, 1), 0.5, np.float32)))
+    Path("bad-deep-0.npy").write_bytes(pack_table(np.full((299, 1), 0.5, np.float32)))
+    with serving(Path("board")) as url:
+        id = good("enter", url, season, "{name}.npy", *ENTER).strip()
+        bad = ("enter", url, season, "bad-{name}.npy", "--failed", "deep-1", *ENTER)
+        assert "answer_shape" in fails(1, *bad)
+    with Store.open("board", read_only=True) as store:
+        assert [row.entrant.id for row in store.entrants(read_season(season).digest)] == [id]
+
+
+def test_faults_of_a_plan_are_named(tmp_path: Path) -> None:
+    fields = json.loads(Path(PLAN).read_text())
+    fields["classes"][0]["setting"]["complexity"] = 4
+    Path("shallow.json").write_text(json.dumps(fields))
+    assert "complexity=4: must be at least 5" in fails(2, "season", "new", "board", "shallow.json")
+    assert not list(tmp_path.glob("*.master"))
+    assert "season_unknown" in fails(1, "season", "show", "board", "winter")
