@@ -43,7 +43,6 @@ _TICKET = _SEASON + "/tickets/{ticket:int}"
 _INSTANCE = _TICKET + "/instances/{instance:int}"
 _WORKERS = 4  # threads that replay journals, write answers and compute challenges
 _REQUESTS = 64  # for tickets, checked at the same time
-_BODY_SECONDS = 30.0
 _LARGEST = 2**31
 _TYPE = (b"content-type", b"application/octet-stream")
 _T = TypeVar("_T")
@@ -197,10 +196,7 @@ class SeasonRoutes:
     async def step(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Take the steps of a request; without the objects that other requests get."""
         tickets, where = self.place(scope)
-        chunks = limits.body_chunks(
-            Request(scope, receive), tickets.step_bytes, _BODY_SECONDS, "steps"
-        )
-        body = b"".join([chunk async for chunk in chunks])
+        body = await limits.read_steps(receive, tickets.step_bytes)
         if tickets.is_ready(where.ticket, where.instance):
             answer = tickets.step(*where, body)
         else:
