@@ -1,0 +1,333 @@
+"""Tickets without a server: what is refused, what survives, and what a restart changes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from leaderboard.documents.entry import SignedTicketRequest
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.documents.submission import Envelope
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.intake import start_ticket
+from leaderboard.scoring.sealed import instances
+from leaderboard.sealed import Tickets
+from leaderboard.sealed import tickets as tickets_module
+from leaderboard.sealed.scores import score_ticket
+from leaderboard.store import Store
+from sme_registry.sealed import StepFormat, pack_table, unpack_table
+from tests.leaderboard.sealed.playing import Board, online_board
+
+LANES = 4
+WIRE = StepFormat(LANES, 2, 1)
+KEY = SigningKey.generate()
+ROWS = 6 * 50
+
+
+class Played:
+    """A board whose season is stepped in this process, and one ticket of it."""
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self.store = Store.open(board.path)
+        request = Envelope.read(board.request(KEY).to_bytes(), SignedTicketRequest)
+        self.number, _ = start_ticket(self.store, request, board.season.digest)
+        self.open()
+        self.token = self.tickets.ticket(self.number).document.token
+
+    def open(self) -> None:
+        self.tickets = Tickets(self.store, self.board.secret)
+
+    def restart(self) -> None:
+        """As after a kill: nothing but the files is left."""
+        self.tickets.close()
+        self.open()
+
+    def start(self, lanes: int = LANES, instance: int = 0) -> bytes:
+        return self.tickets.start(self.number, self.token, instance, lanes)
+
+    def step(self, number: int, value: float = 0.3, instance: int = 0) -> bytes:
+        body = WIRE.pack_request(number, np.full((LANES, 1), value, np.float32))
+        return self.tickets.step(self.number, self.token, instance, body)
+
+    def finish(self, instance: int = 0) -> None:
+        self.tickets.finish(self.number, self.token, instance)
+
+    def answer(self, table: Any, instance: int = 0) -> bool:
+        data = table if isinstance(table, bytes) else pack_table(table)
+        return self.tickets.answer(self.number, self.token, instance, data)
+
+    @property
+    def used(self) -> int:
+        return self.tickets.status(self.number, self.token).instances[0].used
+
+
+@pytest.fixture
+def played(tmp_path: Path) -> Iterator[Played]:
+    ready = Played(online_board(tmp_path))
+    yield ready
+    ready.tickets.close()
+    ready.store.close()
+
+
+def refused(code: str, *arguments: Any, **others: Any) -> str:
+    """The message of a refusal with this code."""
+    call, *rest = arguments
+    with pytest.raises(Rejection) as caught:
+        call(*rest, **others)
+    assert caught.value.code == code
+    return caught.value.message
+
+
+def test_a_restart_changes_no_answer(played: Played) -> None:
+    played.start()
+    answers = [played.step(number, number / 10) for number in range(1, 6)]
+    played.restart()
+    begun = WIRE.unpack_begun(played.start())
+    assert begun.number == 5
+    np.testing.assert_array_equal(begun.observation, WIRE.unpack_steps(answers[-1]).observation)
+    assert played.step(5, 0.5) == answers[-1]
+    following = played.step(6)
+    played.restart()
+    assert played.step(6) == following  # without a start
+    assert played.used == 6 * LANES
+
+
+def test_the_same_steps_cost_once_and_others_are_refused(played: Played) -> None:
+    played.start()
+    first = played.step(1)
+    assert played.step(1) == first
+    refused("step_conflict", played.step, 1, 0.4)
+    second = played.step(2)
+    refused("step_conflict", played.step, 1)
+    refused("step_ahead", played.step, 4)
+    refused("step_conflict", played.step, 0)
+    assert played.step(2) == second
+    assert played.used == 2 * LANES
+
+
+def test_the_budget_is_exact(played: Played) -> None:
+    played.start(lanes=4)
+    for number in range(1, 17):
+        last = played.step(number)
+    assert played.used == 64
+    for _ in range(2):
+        assert played.step(16) == last
+        refused("budget_spent", played.step, 17)
+        played.restart()
+    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
+
+
+def test_lanes_that_do_not_divide_the_budget_leave_a_rest(played: Played) -> None:
+    wire = StepFormat(48, 2, 1)
+    played.start(lanes=48)
+    body = wire.pack_request(1, np.zeros((48, 1)))
+    played.tickets.step(played.number, played.token, 0, body)
+    body = wire.pack_request(2, np.zeros((48, 1)))
+    refused("budget_spent", played.tickets.step, played.number, played.token, 0, body)
+
+
+@pytest.mark.parametrize("lanes", [0, 65, 2**40])
+def test_lanes_have_a_range(played: Played, lanes: int) -> None:
+    refused("lanes_invalid", played.start, lanes)
+
+
+def test_an_instance_keeps_its_lanes(played: Played) -> None:
+    played.start(4)
+    refused("start_conflict", played.start, 5)
+    played.restart()
+    refused("start_conflict", played.start, 5)
+    played.start(4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_actions_must_be_finite(played: Played, value: float) -> None:
+    played.start()
+    refused("step_invalid", played.step, 1, value)
+    assert played.used == 0
+
+
+def test_actions_outside_the_cube_are_clipped(played: Played) -> None:
+    played.start()
+    played.start(instance=1)
+    high = played.step(1, 7.0)
+    played.restart()
+    assert played.step(1, 7.0) == high
+    assert played.used == LANES
+
+
+@pytest.mark.parametrize("size", [0, 7, 8, WIRE.request_bytes - 1, WIRE.request_bytes + 1])
+def test_a_step_has_one_size(played: Played, size: int) -> None:
+    played.start()
+    refused(
+        "step_invalid", played.tickets.step, played.number, played.token, 0, b"\1" + bytes(size)[1:]
+    )
+    assert played.used == 0
+
+
+def test_phases_follow_each_other(played: Played) -> None:
+    half = np.full((ROWS, 1), 0.5, np.float32)
+    refused("instance_phase", played.step, 1)
+    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.answer, half)
+    played.start()
+    played.step(1)
+    refused("instance_phase", played.tickets.challenge, played.number, played.token, 0)
+    refused("instance_phase", played.answer, half)
+    played.finish()
+    played.finish()
+    refused("instance_phase", played.step, 2)
+    played.restart()
+    refused("instance_phase", played.step, 2)
+    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
+    assert len(states) == ROWS
+    assert played.answer(half)
+    assert not played.answer(half)
+    refused("answer_conflict", played.answer, half * 0.5)
+    played.restart()
+    assert not played.answer(half)
+    refused("instance_phase", played.start)
+    refused("instance_phase", played.step, 2)
+    played.finish()
+
+
+@pytest.mark.parametrize(
+    ("table", "code"),
+    [
+        (np.full((ROWS - 1, 1), 0.5), "answer_shape"),
+        (np.full((ROWS, 2), 0.5), "answer_shape"),
+        (np.full((ROWS, 1), np.nan), "answer_not_finite"),
+        (b"", "answer_shape"),
+        (pickle.dumps(np.full((ROWS, 1), 0.5)), "answer_shape"),
+        (pack_table(np.full((ROWS, 1), 0.5)) + b"\0", "answer_shape"),
+    ],
+)
+def test_answers_have_one_form(played: Played, table: Any, code: str) -> None:
+    played.finish()
+    refused(code, played.answer, table)
+    assert played.answer(np.full((ROWS, 1), 0.5))
+
+
+def test_a_token_opens_one_ticket(played: Played) -> None:
+    request = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
+    other, _ = start_ticket(played.store, request, played.board.season.digest)
+    for number, token in ((other, played.token), (played.number, ""), (played.number, "é")):
+        refused("token_wrong", played.tickets.start, number, token, 0, 1)
+        refused("token_wrong", played.tickets.status, number, token)
+    refused("ticket_unknown", played.tickets.start, 99, played.token, 0, 1)
+    refused("instance_unknown", played.tickets.start, played.number, played.token, 2, 1)
+
+
+def test_no_two_tickets_share_a_task(played: Played) -> None:
+    seeds = set()
+    for ticket in ("1", "2"):
+        for nonce in ("0" * 64, "1" * 64):
+            master = Master.read(played.board.secret)
+            seeds |= {
+                each.spec.seed for each in instances(played.board.season, master, ticket, nonce)
+            }
+    assert len(seeds) == 8
+
+
+def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
+    played.start()
+    played.step(1)
+    assert played.tickets.over() == []
+    clock = tickets_module.time.time
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
+    assert played.tickets.over() == [played.number]
+    refused("ticket_ended", played.step, 2)
+    refused("ticket_ended", played.start)
+    refused("ticket_ended", played.finish)
+    assert played.tickets.status(played.number, played.token).phase == "ended"
+
+
+def test_a_clock_set_back_extends_no_deadline(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.start()
+    uptime, clock = tickets_module.time.monotonic, tickets_module.time.time
+    monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + 25 * 3600)
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() - 3600)
+    refused("ticket_ended", played.step, 1)
+
+
+def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played) -> None:
+    instance = played.tickets.ticket(played.number).instance(0)
+    played.finish()
+    played.tickets.close_ticket(played.number)
+    refused("ticket_ended", instance.answer, pack_table(np.full((ROWS, 1), 0.5)))
+    assert not instance.answered
+
+
+def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
+    played.start()
+    first = played.step(1)
+
+    def full(handle: int, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    message = refused("storage_full", played.step, 2)
+    assert "No space left on device" in message
+    monkeypatch.undo()
+    assert played.step(1) == first
+    assert played.used == LANES
+    played.step(2)
+
+
+def test_instances_used_long_ago_leave_memory_and_go_on(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 150)
+    played.start()
+    first = [played.step(1, 0.2), played.step(2, 0.9)]
+    played.start(instance=1)
+    ticket = played.tickets.ticket(played.number)
+    assert not ticket.instance(0).is_ready
+    assert ticket.instance(1).is_ready
+    assert played.step(2, 0.9) == first[1]
+    assert not ticket.instance(1).is_ready
+
+
+def test_one_server_steps_a_season(played: Played) -> None:
+    with pytest.raises(BoardError, match="another server steps it"):
+        Tickets(played.store, played.board.secret)
+
+
+def test_a_master_must_be_that_of_a_season(played: Played, tmp_path: Path) -> None:
+    other = Master.generate().write(tmp_path / "other.master")
+    with pytest.raises(BoardError, match="the master of no sealed-online season"):
+        Tickets(played.store, other)
+
+
+def test_what_was_not_answered_scores_one(played: Played) -> None:
+    played.start()
+    played.step(1)
+    played.finish()
+    hidden = next(instances(played.board.season, Master.read(played.board.secret), "1", "0" * 64))
+    states = unpack_table(played.tickets.challenge(played.number, played.token, 0), 4)
+    from sme_registry import materialize
+
+    best = materialize(hidden.spec).optimal_action(states[:, :2])
+    played.answer(best)
+    result = score_ticket(
+        played.store, played.board.season, Master.read(played.board.secret), played.number
+    )
+    assert result.runs[0].wd_regret < 1e-6
+    assert result.runs[1].wd_regret == result.runs[1].ood_decay == 1.0
+    assert [each.steps for each in result.stepping] == [LANES, 0]
+    assert result.stepping[1].normalised_online_regret == 1.0
+    assert all(run.spec is run.evaluation_seed is None for run in result.runs)
+    assert played.store.end_ticket(played.board.season.digest, played.number, result)
+    assert not played.store.end_ticket(played.board.season.digest, played.number, result)
+    played.restart()
+    refused("ticket_ended", played.start)
