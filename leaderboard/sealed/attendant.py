@@ -35,7 +35,7 @@ def attending(tickets: Collection[Tickets]) -> Iterator[None]:
         yield
         return
     stop = threading.Event()
-    attendants = [_Attendant(each) for each in tickets]
+    attendants = [Attendant(each) for each in tickets]
 
     def attend() -> None:
         while not stop.wait(_SECONDS):
@@ -53,8 +53,8 @@ def attending(tickets: Collection[Tickets]) -> Iterator[None]:
             each.stop()
 
 
-class _Attendant:
-    """Of one season."""
+class Attendant:
+    """What a server does for one season beside requests."""
 
     def __init__(self, tickets: Tickets) -> None:
         self._tickets = tickets

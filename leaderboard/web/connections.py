@@ -147,7 +147,7 @@ class _Parser(h11.Connection):
         self._chunks = self._bytes = 0
         self._head = b""
 
-    def send(self, event: h11.Event) -> bytes | None:
+    def send(self, event: Any) -> Any:
         """The bytes of an answer's event; none yet of its head."""
         data = super().send(event)
         if isinstance(event, h11.Response):

@@ -1,0 +1,15 @@
+"""No step is lost or doubled when the server is killed; `benchmarks/sealed_kills.py` has more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.leaderboard.sealed.killing import LANES, step_through_kills
+from tests.leaderboard.sealed.playing import online_board
+from tests.leaderboard.sealing import SETTING
+
+
+def test_entrants_go_on_when_their_server_is_killed(tmp_path: Path) -> None:
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 150 * LANES}
+    board = online_board(tmp_path, classes=[member])
+    step_through_kills(board, tickets=3, requests=150, kills=2)

@@ -1,0 +1,165 @@
+"""Before the reveal nothing that a server writes or answers holds what only the master tells."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.master import Master
+from leaderboard.scoring.sealed import instances
+from leaderboard.sealed import attendant as attendant_module
+from leaderboard.sealed.scores import score_ticket
+from leaderboard.sealed.ticket import RunningTicket
+from leaderboard.store import Store
+from sme_registry import materialize, sealed
+from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.serving import serving
+
+KEY = SigningKey.generate()
+
+
+def secrets_of(board: Board, store: Store) -> list[bytes]:
+    """What must not be found: master, seeds and digests as texts and bytes, the task's numbers."""
+    master = Master.read(board.secret)
+    row = store.ticket(board.season.digest, 1)
+    ticket = RunningTicket(store, board.season, master, row)
+    nonce = store.request_of(row).ticket.nonce
+    texts = [master.raw.hex()]
+    raw = [master.raw]
+    for number, hidden in enumerate(instances(board.season, master, "1", nonce)):
+        start = ticket.start(number)
+        digits = str(hidden.spec.seed)[2:]
+        texts += [digits, str(int(digits, 16)), hidden.spec.digest.removeprefix("sha256:")]
+        texts += [str(start.seed), f"{start.seed:x}", str(hidden.protocol.seed)]
+        raw += [start.seed.to_bytes(32), bytes.fromhex(digits.zfill(64))]
+        task = materialize(hidden.spec)
+        raw += [task.W[0].tobytes(), task.layers[0][0][0].tobytes()]
+        texts += [repr(float(task.W[0, 0])), repr(float(task.layers[0][0][0, 0]))]
+    return [*(text.encode() for text in texts), *raw]
+
+
+def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
+    """The answers to every request of an entrant, and to a refused one of each kind."""
+    tickets = sealed.tickets_path(board.season.id)
+    yield client.post(url + tickets, content=board.request(KEY).to_bytes())
+    ticket = board.ticket(url, KEY)
+    token = {"Authorization": sealed.bearer(ticket.token)}
+    wire = sealed.StepFormat(4, 2, 1)
+
+    def at(action: str) -> str:
+        return url + sealed.instance_path(board.season.id, 1, 0, action)
+
+    def step(number: int, value: float = 0.5) -> httpx.Response:
+        body = wire.pack_request(number, np.full((4, 1), value, np.float32))
+        return client.post(at("steps"), content=body, headers=token)
+
+    yield client.get(f"{url}/api/seasons")
+    yield client.get(f"{url}/api/seasons/{board.season.id}")
+    yield client.get(f"{url}/api/log")
+    yield client.get(url + sealed.ticket_path(board.season.id, 1))
+    yield client.post(at("start?lanes=4"), headers=token)
+    for number in range(1, 17):
+        yield step(number)
+    yield from (step(1), step(18), step(17), step(16, np.nan), step(16, 0.1))
+    yield client.post(at("steps"), content=b"x", headers=token)
+    yield client.post(at("start?lanes=5"), headers=token)
+    yield client.post(at("start?lanes=x"), headers=token)
+    yield client.get(at("challenge"), headers=token)
+    yield client.put(at("answers"), content=b"x", headers=token)
+    answers = sealed.pack_table(np.full((300, 1), 0.5))
+    yield client.put(at("answers"), content=answers, headers=token)
+    yield client.get(url + sealed.ticket_path(board.season.id, 1), headers=token)
+
+
+def test_no_answer_file_or_log_holds_a_secret(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    board = online_board(tmp_path)
+    answered: list[bytes] = []
+
+    def record(answer: httpx.Response) -> None:
+        answered.append(answer.read())
+        answered.extend(b": ".join(header) for header in answer.headers.raw)
+
+    with (
+        caplog.at_level(logging.DEBUG),
+        serving(board.path, season_secrets=[board.secret]) as url,
+        httpx.Client(event_hooks={"response": [record]}) as client,
+    ):
+        statuses = [each.status_code for each in everything(url, board, client)]
+    assert {200, 201, 400, 403, 409, 422} <= set(statuses)
+    assert 500 not in statuses
+    with Store.open(board.path) as store:
+        result = score_ticket(store, board.season, Master.read(board.secret), 1)
+        store.end_ticket(board.season.digest, 1, result)
+        searched = secrets_of(board, store)
+    parts = {f"answer {i}": part for i, part in enumerate(answered)}
+    parts["log"] = caplog.text.encode()
+    files = [path for path in board.path.rglob("*") if path.is_file()]
+    assert {"index.sqlite", "0.journal", "0.npy"} <= {path.name for path in files}
+    parts |= {path.name: path.read_bytes() for path in files}
+    found = [name for name, part in parts.items() for each in searched if each in part]
+    assert found == []
+    assert any(each in board.secret.read_bytes() for each in searched)  # the search can find
+
+
+def test_answers_to_steps_have_one_form(tmp_path: Path) -> None:
+    """The same head and size, whether episodes end or not, in any task."""
+    board = online_board(tmp_path)
+    wire = sealed.StepFormat(4, 2, 1)
+    heads = set()
+    with serving(board.path, season_secrets=[board.secret]) as url, httpx.Client() as client:
+        for nonce in range(2):
+            ticket = board.ticket(url, KEY, nonce)
+            token = {"Authorization": sealed.bearer(ticket.token)}
+
+            def at(action: str, ticket: sealed.Ticket = ticket) -> str:
+                return url + sealed.instance_path(board.season.id, ticket.ticket, 0, action)
+
+            client.post(at("start?lanes=4"), headers=token)
+            for number in range(1, 17):
+                body = wire.pack_request(number, np.full((4, 1), number / 16))
+                answer = client.post(at("steps"), content=body, headers=token)
+                assert len(answer.content) == wire.answer_bytes
+                heads.add(tuple((k, v) for k, v in answer.headers.raw if k.lower() != b"date"))
+    assert len(heads) == 1
+
+
+class Failing:
+    """A season's tickets of which nothing works, and whose errors tell everything."""
+
+    board = secret = Path("none")
+    digest = "sha256:" + "0" * 64
+
+    def sync(self) -> None:
+        raise attendant_module.SMEError("the seed is 0x5eed")
+
+
+def test_a_fault_is_logged_without_its_text(caplog: pytest.LogCaptureFixture) -> None:
+    tickets: Any = Failing()
+    attendant_module.Attendant(tickets).attend()
+    assert "SMEError" in caplog.text
+    assert "5eed" not in caplog.text
+
+
+def test_what_holds_a_secret_shows_none(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        board.ticket(url, KEY)
+    with Store.open(board.path) as store:
+        searched = secrets_of(board, store)
+        master = Master.read(board.secret)
+        ticket = RunningTicket(store, board.season, master, store.ticket(board.season.digest, 1))
+        shown = [repr(each) for each in (master, ticket, ticket.start(0), ticket.hidden(0))]
+        shown += [repr(ticket.instance(0)), repr(ticket.document)]
+    assert not any(each in text.encode() for text in shown for each in searched)
+    with pytest.raises(TypeError, match="pickle"):
+        pickle.dumps(ticket)
