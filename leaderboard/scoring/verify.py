@@ -27,6 +27,7 @@ from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from leaderboard.scoring.rescore import RESCORED, RescoreNote, draw, rescore
 from leaderboard.scoring.score import Progress, agent_names, evaluation_seed
+from leaderboard.scoring.verify_seasons import check_sealed_signatures, count_unlogged_of_seasons
 from leaderboard.store import (
     Index,
     IndexUnusable,
@@ -57,8 +58,9 @@ class VerifyReport:
       log_sequence, log_digest: of the last entry. Keep the digest elsewhere to detect later
         whether the log was cut or rewritten.
       submissions, withdrawals, results, objects: number of each.
-      unlogged: number of submissions and withdrawals whose process died before it logged them;
-        the board does not show them.
+      unlogged: number of submissions and withdrawals, and of documents of seasons, whose process
+        died before it logged them; the board does not show them.
+      seasons, sealed: number of seasons, and of their entries and tickets.
       rows: number of index rows, equal to those of a rebuilt index; 0 if there is no index.
       rescored: number of submissions scored again.
       rescore_seed: of their draw, which repeats it; None if none was scored again.
@@ -78,6 +80,8 @@ class VerifyReport:
     rescored: int = 0
     rescore_seed: int | None = None
     tolerance: float = RESCORED
+    seasons: int = 0
+    sealed: int = 0
     notes: tuple[RescoreNote, ...] = ()
 
 
@@ -123,9 +127,10 @@ def verify(
                 verifier.follow_log()  # entries logged in the meantime
                 verifier.check_numbering()
                 verifier.check_contains(digest)
-                unlogged = verifier.count_unlogged()
+                unlogged = verifier.count_unlogged() + count_unlogged_of_seasons(index)
                 rows = verifier.check_index()
             verifier.check_signatures()
+            seasons, entrants = check_sealed_signatures(index)
             objects = verifier.check_objects()
             results = verifier.check_numbers(store)
             drawn = draw(verifier.scored_ids(), rescore, seed)
@@ -143,6 +148,8 @@ def verify(
         rows=rows,
         rescored=len(drawn),
         rescore_seed=seed if drawn else None,
+        seasons=seasons,
+        sealed=entrants,
         notes=tuple(notes),
     )
 

@@ -19,7 +19,7 @@ from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.aggregation import never_listed, result_of
 from leaderboard.scoring.metrics import run_metrics
-from leaderboard.scoring.verify import VerifyReport, _close, verify
+from leaderboard.scoring.verify import VerifyReport, close, verify
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import LogEntry, Store, digest_of
 from sme_registry.errors import OptionError
@@ -471,6 +471,6 @@ def test_rescoring_detects_forged_runs(board):
 
 def test_a_result_of_an_earlier_version_that_gives_single_runs_an_interval_is_accepted() -> None:
     single = {"value": 0.5, "low": None, "high": None}
-    assert _close(single, {"value": 0.5, "low": 0.5, "high": 0.5}, 1e-12)
-    assert not _close(single, {"value": 0.5, "low": 0.4, "high": 0.6}, 1e-12)
-    assert not _close(single, {"value": 0.6, "low": 0.6, "high": 0.6}, 1e-12)
+    assert close(single, {"value": 0.5, "low": 0.5, "high": 0.5}, 1e-12)
+    assert not close(single, {"value": 0.5, "low": 0.4, "high": 0.6}, 1e-12)
+    assert not close(single, {"value": 0.6, "low": 0.6, "high": 0.6}, 1e-12)

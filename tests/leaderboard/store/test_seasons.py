@@ -14,7 +14,9 @@ from leaderboard.documents.season import Reveal, Season
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.metrics import failed_run
 from leaderboard.scoring.sealed import sealed_result
+from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
+from leaderboard.store.files import write_document
 from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.sealing import (
     AFTERWARDS,
@@ -201,6 +203,41 @@ def test_offline_nothing_is_ranked_before_the_reveal(store, key):
     with pytest.raises(Rejection, match="season_not_closed"):
         store.rank(failed(season, entry.id))
     assert store.head == before
+
+
+def test_an_answer_that_an_entry_names_and_the_board_lost_is_named(store, key, later):
+    play(store, key, later)  # which names an answer that nobody has sent
+    with pytest.raises(TamperedError, match="objects/aa"):
+        verify(store.folder.path)
+
+
+def test_files_of_seasons_that_no_entry_names_are_counted_or_named(store, key):
+    season, request = tiny_season(ONLINE), signed_request(store, tiny_season(ONLINE), key)
+    store.announce(season)
+    store.start_ticket(request)
+    report = verify(store.folder.path)
+    assert (report.seasons, report.sealed, report.unlogged) == (1, 1, 0)
+    folder = store.season_folder(season.digest)
+    journal = folder.ticket(1) / "0.journal"
+    journal.write_bytes(b"actions")
+    write_document(folder.request(2), request)
+    write_document(folder.result(request.id), failed(season, request.id))
+    write_document(folder.reveal, reveal(season))
+    assert verify(store.folder.path).unlogged == 3
+    stray = folder.path / "note.txt"
+    stray.write_text("")
+    with pytest.raises(TamperedError, match=r"note\.txt: is not a file of a board"):
+        verify(store.folder.path)
+
+
+def test_a_request_that_the_board_has_forged_is_named(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    signed = signed_request(store, season, key)
+    forged = signed.model_copy(update={"signature": "0" * 128})
+    store.start_ticket(forged)
+    with pytest.raises(TamperedError, match="does not match the entrant's key"):
+        verify(store.folder.path)
 
 
 def test_an_id_is_one_seasons_and_a_season_ahead(store):
