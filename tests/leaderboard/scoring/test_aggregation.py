@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from leaderboard.documents.board import BoardDocument
 from leaderboard.documents.result import METRICS, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Submission
-from leaderboard.scoring.aggregation import _oracle_like, never_listed, result_of
+from leaderboard.scoring.aggregation import is_oracle_like, never_listed, result_of
 from leaderboard.scoring.metrics import failed_run, run_metrics
 from sme_registry import EvaluationProtocol
 from sme_registry.spec import Suite
@@ -355,7 +355,7 @@ def test_no_interval_of_a_regret_reaches_below_zero() -> None:
         (0.051, 0.051, False, False),
     ],
 )
-def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside(
+def testis_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside(
     wd: float, ood: float, expected: bool, by_rules_1: bool
 ) -> None:
     values = {
@@ -369,16 +369,16 @@ def test_oracle_like_is_little_regret_in_a_region_or_as_little_outside_as_inside
     assert tuple(values) == METRICS
 
     scores = Scores(**estimates, normalised_regret=(estimates["wd_regret"],) * 2)
-    assert _oracle_like(scores, 2) is expected
-    assert _oracle_like(scores, 1) is by_rules_1
+    assert is_oracle_like(scores, 2) is expected
+    assert is_oracle_like(scores, 1) is by_rules_1
 
 
-def test_one_oracle_like_run_marks_a_method() -> None:
+def test_oneis_oracle_like_run_marks_a_method() -> None:
     level = Estimate(value=0.4, low=0.4, high=0.4)
     scores = Scores(**dict.fromkeys(METRICS, level), normalised_regret=(level, level))
     run = failed_run(BOARD.protocol, "two", None)
     near = run.model_copy(update={"wd_regret": 0.005})
 
-    assert not _oracle_like(scores, 2, [run])
-    assert _oracle_like(scores, 2, [run, near])
-    assert not _oracle_like(scores, 1, [run, near])
+    assert not is_oracle_like(scores, 2, [run])
+    assert is_oracle_like(scores, 2, [run, near])
+    assert not is_oracle_like(scores, 1, [run, near])
