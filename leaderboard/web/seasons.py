@@ -216,7 +216,12 @@ class SeasonRoutes:
         found = self._tickets.get(season)
         if found is not None:
             return found
-        self._store.season_row(season)
+        row = self._store.season_row(season)
+        if row.track != "sealed-online":
+            raise Rejection(
+                "season_track",
+                f"season={row.id}: its track is {row.track}: it takes entries, and has no tickets.",
+            )
         raise RequestError(
             "season_not_served", f"season={season}: {HTTP_CODES['season_not_served']}."
         )

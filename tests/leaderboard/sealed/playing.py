@@ -32,14 +32,15 @@ class Board(NamedTuple):
         with Store.open(self.path) as store:
             return signed_request(store, self.season, key, nonce, **fields)
 
+    def send(self, url: str, request: SignedManifest) -> httpx.Response:
+        """What a served board answers to a request for a ticket."""
+        path = url + sealed.tickets_path(self.season.id)
+        return httpx.post(path, content=request.to_bytes(), trust_env=False)
+
     def ticket(self, url: str, key: SigningKey, nonce: int = 0) -> sealed.Ticket:
-        """A ticket that a served board starts."""
-        answer = httpx.post(
-            url + sealed.tickets_path(self.season.id),
-            content=self.request(key, nonce).to_bytes(),
-            trust_env=False,
-        )
-        assert answer.status_code in (200, 201), answer.text
+        """A new ticket of a served board."""
+        answer = self.send(url, self.request(key, nonce))
+        assert answer.status_code == 201, answer.text
         return sealed.Ticket.from_dict(answer.json())
 
 

@@ -49,8 +49,9 @@ def secrets_of(board: Board, store: Store) -> list[bytes]:
 def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
     """The answers to every request of an entrant, and to a refused one of each kind."""
     tickets = sealed.tickets_path(board.season.id)
-    yield client.post(url + tickets, content=board.request(KEY).to_bytes())
-    ticket = board.ticket(url, KEY)
+    started = client.post(url + tickets, content=board.request(KEY).to_bytes())
+    yield started
+    ticket = sealed.Ticket.from_dict(started.json())
     token = {"Authorization": sealed.bearer(ticket.token)}
     wire = sealed.StepFormat(4, 2, 1)
 
@@ -95,8 +96,7 @@ def test_no_answer_file_or_log_holds_a_secret(
         httpx.Client(event_hooks={"response": [record]}) as client,
     ):
         statuses = [each.status_code for each in everything(url, board, client)]
-    assert {200, 201, 400, 403, 409, 422} <= set(statuses)
-    assert 500 not in statuses
+    assert set(statuses) == {200, 201, 400, 403, 409, 422}
     with Store.open(board.path) as store:
         result = score_ticket(store, board.season, Master.read(board.secret), 1)
         store.end_ticket(board.season.digest, 1, result)

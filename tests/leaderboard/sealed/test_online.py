@@ -1,51 +1,185 @@
-"""A ticket from its start to its result, over HTTP, with the client that entrants use."""
+"""Seasons over HTTP, with the client that entrants use, and what follows a ticket that is over."""
 
 from __future__ import annotations
 
-import time
+import multiprocessing
 from pathlib import Path
+from typing import Any
 
+import httpx
 import numpy as np
+import pytest
 
+from leaderboard.documents.entry import TicketRequest
 from leaderboard.documents.keys import SigningKey
-from leaderboard.scoring.sealed import instances
+from leaderboard.sealed import Tickets
+from leaderboard.sealed.attendant import Attendant
 from leaderboard.store import Store
 from sme_registry import sealed
 from tests.leaderboard.sealed.playing import online_board
-from tests.leaderboard.sealing import MASTER
+from tests.leaderboard.sealing import manifest, moment, tiny_season
 from tests.leaderboard.serving import serving
 
+KEY = SigningKey.generate()
+OTHER = SigningKey.generate()
 
-def played(url: str, ticket: sealed.Ticket, number: int, steps: int) -> list[sealed.Steps]:
+
+def played(url: str, ticket: sealed.Ticket, number: int, steps: int) -> None:
     """Random steps on an instance, then the constant ½ as answers."""
     instance = sealed.Instance(url, ticket, number, lanes=4)
     instance.begin()
     random = np.random.default_rng(number)
-    taken = [instance.step(random.random((4, 1), dtype=np.float32)) for _ in range(steps)]
+    for _ in range(steps):
+        instance.step(random.random((4, 1), dtype=np.float32))
     states = instance.challenge()
     instance.send_answers(np.full((len(states), 1), 0.5, np.float32))
     instance.close()
-    return taken
 
 
-def test_a_ticket_is_played_scored_and_logged(tmp_path: Path) -> None:
+def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
     board = online_board(tmp_path)
-    key = SigningKey.generate()
     with serving(board.path, season_secrets=[board.secret]) as url:
-        ticket = board.ticket(url, key)
-        assert ticket == board.ticket(url, key)
+        ticket = board.ticket(url, KEY)
         played(url, ticket, 0, 16)
+        instance = sealed.Instance(url, ticket, 1, lanes=4)
+        assert instance.status().phase == "running"
         played(url, ticket, 1, 5)
-        with Store.open(board.path) as store:
-            deadline = time.monotonic() + 60
-            while (row := store.ticket(board.season.digest, 1)).result is None:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-            result = store.sealed_result(row)
+        assert instance.status().phase == "ended"
+        instance.close()
+    with Store.open(board.path) as store:
+        tickets = Tickets(store, board.secret)
+        attendant = Attendant(tickets)
+        attendant.attend()
+        for process in multiprocessing.active_children():
+            process.join()
+        attendant.attend()
+        assert tickets.over() == []
+        tickets.close()
+        result = store.sealed_result(store.ticket(board.season.digest, 1))
     assert result is not None
     assert [run.wd_regret for run in result.runs] == [1.0, 1.0]
     assert [each.steps for each in result.stepping] == [64, 20]
+
+
+def test_the_same_request_has_the_same_ticket_and_another_one_a_new_ticket(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    request = board.request(KEY)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        first, again = board.send(url, request), board.send(url, request)
+        other = board.send(url, board.request(KEY, 1))
+        limited = board.send(url, board.request(KEY, 2))
+    assert [first.status_code, again.status_code, other.status_code] == [201, 200, 201]
+    assert first.json() == again.json()
+    assert [first.json()["ticket"], other.json()["ticket"]] == [1, 2]
+    assert first.json()["token"] != other.json()["token"]
+    assert (limited.status_code, limited.json()["code"]) == (429, "ticket_limit")
+
+
+@pytest.mark.parametrize(
+    ("changes", "board_key", "status", "code"),
+    [
+        ({"nonce": "0" * 63}, True, 422, "schema"),
+        ({"nonce": "0" * 63 + "G"}, True, 422, "schema"),
+        ({"season": "sha256:" + "0" * 64}, True, 404, "season_unknown"),
+        ({"created": moment(-30)}, True, 403, "stale_time"),
+        ({"created": moment(1)}, True, 403, "stale_time"),
+        ({"submitter": {"name": "the board", "key": KEY.public}}, True, 400, "unsafe_name"),
+        ({}, False, 403, "wrong_board"),
+    ],
+)
+def test_requests_for_tickets_are_checked(
+    tmp_path: Path, changes: dict[str, Any], board_key: bool, status: int, code: str
+) -> None:
+    board = online_board(tmp_path)
+    plain = {**manifest(board.season, KEY), "nonce": "0" * 64, **changes}
+    valid = TicketRequest.from_dict({**plain, "nonce": "0" * 64})
     with Store.open(board.path) as store:
-        nonce = store.request_of(row).ticket.nonce
-    hidden = list(instances(board.season, MASTER, "1", nonce))
-    assert len({each.spec.seed for each in hidden}) == 2
+        signed = valid.signed(KEY, store.document.key if board_key else None)
+    if plain["nonce"] != "0" * 64:
+        request = TicketRequest.model_construct(**{**dict(valid), "nonce": plain["nonce"]})
+        signed = signed.model_copy(
+            update={
+                "ticket": request,
+                "signature": KEY.sign("ticket", request.digest, signed.board),
+            }
+        )
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        answer = board.send(url, signed)
+        assert (answer.status_code, answer.json()["code"]) == (status, code)
+        names = [each["id"] for each in httpx.get(f"{url}/api/seasons").json()["seasons"]]
+    assert names == [board.season.id]
+    with Store.open(board.path) as store:
+        assert store.entrants(board.season.digest) == []
+
+
+def test_a_name_belongs_to_one_key(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        board.ticket(url, KEY)
+        name = {"name": f"Tester {KEY.public[:8]}", "key": OTHER.public}
+        answer = board.send(url, board.request(OTHER, submitter=name))
+    assert (answer.status_code, answer.json()["code"]) == (422, "name_taken")
+
+
+@pytest.mark.parametrize(
+    ("times", "code"),
+    [((moment(0.5), moment(1)), "season_not_open"), ((moment(-1), moment(0.5)), "season_closed")],
+)
+def test_tickets_start_while_the_season_is_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: tuple[str, str], code: str
+) -> None:
+    board = online_board(tmp_path, opens=times[0], closes=times[1])
+    if code == "season_closed":
+        monkeypatch.setattr("leaderboard.store.sealed.now", lambda: moment(0.6))
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        answer = board.send(url, board.request(KEY))
+    assert (answer.status_code, answer.json()["code"]) == (422, code)
+
+
+def test_a_server_without_the_master_steps_nothing(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path) as url:
+        answer = board.send(url, board.request(KEY))
+        unknown = httpx.post(f"{url}/api/seasons/none/tickets", content=b"{}")
+        [listed] = httpx.get(f"{url}/api/seasons").json()["seasons"]
+        season = httpx.get(f"{url}/api/seasons/{board.season.id}").json()
+    assert (answer.status_code, answer.json()["code"]) == (503, "season_not_served")
+    assert (unknown.status_code, unknown.json()["code"]) == (404, "season_unknown")
+    assert not listed["served"]
+    assert season["document"] == board.season.to_dict()
+    assert season["master"] is None
+
+
+def test_large_bodies_and_numbers_are_refused(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with (
+        serving(board.path, season_secrets=[board.secret]) as url,
+        httpx.Client(trust_env=False) as client,
+    ):
+        ticket = board.ticket(url, KEY)
+        token = {"Authorization": sealed.bearer(ticket.token)}
+        at = url + sealed.instance_path(board.season.id, 1, 0, "")
+        client.post(at + "start?lanes=4", headers=token)
+        answers = [
+            client.post(at + "steps", content=bytes(2000), headers=token),
+            client.post(at + "start?lanes=" + "9" * 30, headers=token),
+            client.post(at.replace("/0/", f"/{10**30}/") + "steps", headers=token),
+            client.post(at.replace("/1/", f"/{10**30}/") + "finish", headers=token),
+        ]
+    codes = [(each.status_code, each.json()["code"]) for each in answers]
+    assert codes == [
+        (413, "too_large"),
+        (400, "bad_request"),
+        (404, "instance_unknown"),
+        (404, "ticket_unknown"),
+    ]
+
+
+def test_an_offline_season_starts_no_ticket(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    offline = tiny_season("sealed-offline")
+    with Store.open(board.path) as store:
+        store.announce(offline)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        answer = httpx.post(url + sealed.tickets_path(offline.id), content=b"{}")
+    assert (answer.status_code, answer.json()["code"]) == (422, "season_track")
