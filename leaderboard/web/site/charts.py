@@ -110,13 +110,13 @@ class Bars:
         return f"{_MARGIN + (100 - 2 * _MARGIN) * self._scale.part(value):.2f}%"
 
 
-def sparklines(regrets: Sequence[Sequence[float]]) -> list[Markup]:
-    """Small curves of N_m over the regions, WD first, on one scale."""
+def sparklines(regrets: Sequence[Sequence[float]], label: str = "From WD outward") -> list[Markup]:
+    """Small curves on one scale: of N_m over the regions, WD first, or as the label says."""
     scale = Scale.covering(0.0, 1.0, *itertools.chain.from_iterable(regrets))
-    return [_sparkline(regret, scale) for regret in regrets]
+    return [_sparkline(regret, scale, label) for regret in regrets]
 
 
-def _sparkline(regret: Sequence[float], scale: Scale) -> Markup:
+def _sparkline(regret: Sequence[float], scale: Scale, label: str) -> Markup:
     height = _SPARK_HEIGHT - 6
     step = (_SPARK_WIDTH - 6) / max(1, len(regret) - 1)
     optimal, constant, *ys = [
@@ -126,7 +126,7 @@ def _sparkline(regret: Sequence[float], scale: Scale) -> Markup:
     text = ", ".join(number(value, 2) for value in regret)
     return Markup(
         f'<svg class="spark" viewBox="0 0 {_SPARK_WIDTH:.0f} {_SPARK_HEIGHT:.0f}" role="img" '
-        f'aria-label="From WD outward: {text}">'
+        f'aria-label="{label}: {text}">'
         f'<path class="optimal" d="M0 {optimal}H{_SPARK_WIDTH:.0f}"/>'
         f'<path class="constant" d="M0 {constant}H{_SPARK_WIDTH:.0f}"/>'
         f'<polyline points="{points}"/>'

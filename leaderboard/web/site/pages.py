@@ -5,6 +5,7 @@
     compare.html, board-data.js         comparison of chosen entries, drawn by static/board.js
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
     method.html, suite.html             the formulas; the tasks
+    seasons.html, seasons/<id>.html     sealed seasons, where the board has any
     suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
 
@@ -28,9 +29,10 @@ from leaderboard.documents.result import METRICS, Estimate, Metric, Result
 from leaderboard.documents.submission import SignedSubmission
 from leaderboard.errors import CODES, NotPublishable
 from leaderboard.scoring import ranking
-from leaderboard.store import EntryRow, Store
+from leaderboard.store import EntryRow, SeasonRow, Store
 from leaderboard.web.site import charts, rows
 from leaderboard.web.site.rows import SHORT, TABS
+from leaderboard.web.site.seasons import season_page
 from sme_registry.io import to_json
 from sme_registry.spec import StrictModel
 
@@ -239,6 +241,20 @@ class Pages:
             seeds=self._overview["seeds"],
         )
 
+    def season_list(self) -> str:
+        """The page of all seasons."""
+        return self._render("seasons.html", here="seasons.html", title="Sealed seasons")
+
+    def season(self, id: str) -> str:
+        """The page of a season, before, during and after it.
+
+        Raises:
+          KeyError: there is no such season.
+        """
+        row = self._seasons[id]
+        page = season_page(self.store, row)
+        return self._render("season.html", here="", root="../", title=row.title, page=page)
+
     def data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""
 
@@ -278,6 +294,9 @@ class Pages:
         self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
+        if folder == "seasons":
+            id, _, kind = name.rpartition(".")
+            return self.season(id).encode() if kind == "html" and id in self._seasons else None
         render = None if folder else self._top.get(name)
         return render().encode() if render is not None else None
 
@@ -291,6 +310,7 @@ class Pages:
             if entry.scores is not None or entry.code:
                 yield f"results/{digits}.json"
             yield f"submissions/{digits}.html"
+        yield from (f"seasons/{id}.html" for id in self._seasons)
         yield from self._top
 
     @cached_property
@@ -304,6 +324,7 @@ class Pages:
             "method.html": self.method,
             "suite.html": self.suite,
             "compare.html": self.compare,
+            **({"seasons.html": self.season_list} if self._seasons else {}),
             **{
                 f"{tab.stem}.{kind}": partial(self._export, tab.key, kind)
                 for tab in TABS
@@ -316,6 +337,8 @@ class Pages:
         """A file without scores, while the reference rows wait."""
         if folder == "submissions":
             return self._document(folder, name)
+        if folder == "seasons" and name.removesuffix(".html") in self._seasons:
+            return self.preparation().encode()  # the same scorer scores them
         if folder or name not in self._top:
             return None
         render = self.preparation if name in _NEED_SCORES else self._top[name]
@@ -347,6 +370,10 @@ class Pages:
         if latest is None or latest[0] != id:
             latest = self._latest = id, (self.store.submission(id), self.store.result(id))
         return latest[1]
+
+    @cached_property
+    def _seasons(self) -> dict[str, SeasonRow]:
+        return {row.id: row for row in self.store.seasons()}
 
     @cached_property
     def _by_id(self) -> dict[str, EntryRow]:
@@ -382,6 +409,7 @@ class Pages:
                 "protocol": document.protocol.digest,
             },
             "learned": ranking.LEARNED,
+            "seasons": list(self._seasons.values()),
             "marks": rows.MARKS,
             "address_digits": SHORT,
             "metrics": TABS,
