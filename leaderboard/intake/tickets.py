@@ -9,6 +9,7 @@ from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
 from leaderboard.intake.admission import check_name
+from leaderboard.intake.uploads import check_room
 from leaderboard.store import Store
 
 
@@ -52,4 +53,5 @@ def start_ticket(
     check_time(request.created, moment, store.document.limits.age_days)
     with store.transaction():  # no other entrant can take the name in between
         check_name(store, request.submitter)
+        check_room(store, request.submitter.key, len(signed.to_bytes()))
         return store.start_ticket(signed), True

@@ -122,9 +122,13 @@ class Journal:
           OSError: the disk fails.
         """
         if self._unsynced:
-            self._unsynced = False
-            with self._appending() as handle:
-                os.fdatasync(handle)
+            self._unsynced = False  # before, since steps may follow meanwhile
+            try:
+                with self._appending() as handle:
+                    os.fdatasync(handle)
+            except OSError:
+                self._unsynced = True
+                raise
 
     def actions(self) -> Iterator[npt.NDArray[np.float32]]:
         """The actions of each request in order, `[L, A]` as they arrived."""

@@ -135,6 +135,10 @@ class Tickets:
         """`SteppedInstance.finish`, with the password of the ticket."""
         self._chosen(number, token, instance).finish()
 
+    def refuse_challenge(self, number: int, token: str, instance: int) -> None:
+        """`SteppedInstance.refuse_challenge`, with the password of the ticket."""
+        self._chosen(number, token, instance).refuse_challenge()
+
     def challenge(self, number: int, token: str, instance: int) -> bytes:
         """`RunningTicket.challenge`, with the password of the ticket."""
         self._chosen(number, token, instance)
@@ -170,7 +174,9 @@ class Tickets:
 
     def sync(self) -> None:
         """Make all steps taken survive a loss of power."""
-        for each in list(self._held):
+        with self._lock:
+            held = list(self._held)
+        for each in held:
             with contextlib.suppress(OSError):  # the next steps fail, too, and say so
                 each.sync()
 

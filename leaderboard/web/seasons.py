@@ -41,7 +41,8 @@ from sme_registry import sealed
 _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket:int}"
 _INSTANCE = _TICKET + "/instances/{instance:int}"
-_WORKERS = 4  # threads that replay journals, write answers and compute challenges
+_WORKERS = 4  # threads that replay journals and write answers
+_CHALLENGES = 1  # that are computed at a time: each takes a processor for seconds
 _REQUESTS = 64  # for tickets, checked at the same time
 _LARGEST = 2**31
 _TYPE = (b"content-type", b"application/octet-stream")
@@ -64,7 +65,7 @@ class SeasonRoutes:
         self._tickets = {
             each.season.id: each for each in (Tickets(store, path) for path in secrets)
         }
-        self._threads = CapacityLimiter(_WORKERS)
+        self._threads, self._challenges = CapacityLimiter(_WORKERS), CapacityLimiter(_CHALLENGES)
         self._requests = limits.Turns(_REQUESTS)
         self._entries = limits.Turns(_REQUESTS)
 
@@ -182,7 +183,10 @@ class SeasonRoutes:
     async def challenge(self, request: Request) -> Response:
         """The challenge states of an instance."""
         tickets, where = self.place(request.scope)
-        return _octets(await self._in_thread(lambda: tickets.challenge(*where)))
+        await self._in_thread(lambda: tickets.refuse_challenge(*where))
+        return _octets(
+            await to_thread.run_sync(lambda: tickets.challenge(*where), limiter=self._challenges)
+        )
 
     async def answer(self, request: Request) -> Response:
         """Store the answers to a challenge."""

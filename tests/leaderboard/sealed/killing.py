@@ -45,11 +45,12 @@ class Entrant:
     seen: hashlib._Hash = field(default_factory=hashlib.sha256)
     error: BaseException | None = None
 
-    def play(self, url: str, requests: int) -> None:
-        """Take random steps until so many are answered."""
+    def play(self, url: str, requests: int, together: threading.Barrier) -> None:
+        """Begin, and when all others have begun take random steps until so many are answered."""
         try:
             instance = sealed.Instance(url, self.ticket, 0, lanes=LANES)
             self.seen.update(instance.begin().tobytes())
+            together.wait()
             for actions in actions_of(self.ticket.ticket, requests):
                 for part in instance.step(actions):
                     self.seen.update(part.tobytes())
@@ -124,8 +125,9 @@ def step_through_kills(board: Board, tickets: int, requests: int, kills: int) ->
         entrants = [
             Entrant(board.ticket(url, SigningKey.generate(), number)) for number in range(tickets)
         ]
+        together = threading.Barrier(tickets)
         threads = [
-            threading.Thread(target=each.play, args=(url, requests), daemon=True)
+            threading.Thread(target=each.play, args=(url, requests, together), daemon=True)
             for each in entrants
         ]
         for thread in threads:
