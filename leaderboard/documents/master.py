@@ -95,13 +95,17 @@ class Master:
         message = plain_json([*parts, place.ticket, place.nonce])
         return hmac.new(self.raw, message, hashlib.sha256).digest()
 
-    def seed(self, place: Place) -> str:
-        """The seed of an instance's spec: `0x` and up to 64 hex digits, all 256 bits."""
-        return f"0x{int.from_bytes(self.secret('task', place)):x}"
+    def seed(self, place: Place, purpose: Purpose = "task") -> str:
+        """The seed of an instance's spec, or of its data: `0x` and up to 64 hex digits.
 
-    def number(self, purpose: Purpose, place: Place) -> int:
-        """A secret as a seed of numbers in [0, 2⁵³), for protocols and data sets."""
-        return int.from_bytes(self.secret(purpose, place)[:8]) >> 11
+        All 256 bits: whoever could try every seed would recognise the data set that follows from
+        it, and with its noise the optimum in each row.
+        """
+        return f"0x{int.from_bytes(self.secret(purpose, place)):x}"
+
+    def states_seed(self, place: Place) -> int:
+        """The seed of an instance's challenge states, which are published, in [0, 2⁵³)."""
+        return int.from_bytes(self.secret("states", place)[:8]) >> 11
 
 
 def _no_master(path: str | os.PathLike[str], reason: str) -> BoardError:

@@ -195,7 +195,7 @@ def recipe(instance: Instance, master: Master) -> DatasetRecipe:
             "spec": instance.spec.to_dict(),
             "behaviours": [{"kind": "mixture", "nu": data.nu}],
             "transitions": data.transitions,
-            "seed": master.number("data", instance.place),
+            "seed": master.seed(instance.place, "data"),
         }
     )
 

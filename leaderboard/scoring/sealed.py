@@ -67,7 +67,7 @@ def instances(
         member = hidden.member
         place = Place(terms.id, member.name, hidden.instance, ticket, nonce)
         spec = SMESpec.from_dict({**member.setting.to_dict(), "seed": master.seed(place)})
-        seed = master.number("states", place)
+        seed = master.states_seed(place)
         yield Instance(hidden, place, spec, terms.protocol.model_copy(update={"seed": seed}))
 
 

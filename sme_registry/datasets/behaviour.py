@@ -35,7 +35,7 @@ _AHEAD = 64  # steps whose random numbers an episode reads at once
 _BLOCK = 64  # observations in one call of a user's policy
 
 
-def noise_task(task: Task, seed: int) -> Task:
+def noise_task(task: Task, seed: int | str) -> Task:
     """The task whose optimal policy is ã: of the same shape, drawn from the data's seed."""
     policies = draw.optimal_policies(task.spec.derive(seed=seed), NOISE_STREAM)
     return replace(task, policies=policies)
@@ -64,7 +64,9 @@ class EpisodeStream:
     other episodes. Each lane uses `width` numbers a step, and reads those of `ahead` steps at once.
     """
 
-    def __init__(self, seed: int, name: str, lanes: int, width: int, ahead: int = _AHEAD) -> None:
+    def __init__(
+        self, seed: int | str, name: str, lanes: int, width: int, ahead: int = _AHEAD
+    ) -> None:
         self._seed, self._name = seed, name
         self._generators: list[np.random.Philox | None] = [None] * lanes
         self._drawn = np.zeros((lanes, ahead, width))
@@ -145,7 +147,7 @@ def constant_policy(task: Task) -> BehaviourPolicy:
     return BehaviourPolicy(lambda s, observation: np.full((len(s), task.spec.action_dim), 0.5))
 
 
-def _mixture(task: Task, seed: int, nu: float, name: str, lanes: int) -> BehaviourPolicy:
+def _mixture(task: Task, seed: int | str, nu: float, name: str, lanes: int) -> BehaviourPolicy:
     optimal = OptimalPolicy(task, lanes)
     noise = OptimalPolicy(noise_task(task, seed), lanes) if nu > 0.0 else None
     stream = EpisodeStream(seed, f"{name}/alpha", lanes, 1)

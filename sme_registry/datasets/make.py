@@ -35,7 +35,7 @@ def make_dataset(
     *,
     mix: Sequence[tuple[Any, float]] | None = None,
     transitions: int = 50_000,
-    seed: int = 0,
+    seed: int | str = 0,
     coverage: float | None = None,
     protocol: ProtocolLike = "paper-v1",
     action_range: str | None = None,
@@ -57,7 +57,8 @@ def make_dataset(
         callable, a Stable-Baselines3 model, or the path of its .zip or of an .onnx) and its share
         of the transitions. The shares must add up to 1.
       transitions: N, the exact number; the last episode of each behaviour is truncated.
-      seed: of the starts, each α, ã and random actions, in [0, 2⁵³); independent of the task's.
+      seed: of the starts, each α, ã and random actions; independent of the task's. An integer in
+        [0, 2⁵³), or hexadecimal text such as '0x9f86'.
       coverage: ε in (−1, 0]: keeps only transitions from {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}, so that
         E(s) − ε of a state is its distance from the data.
       protocol: for the evaluation of policies that learn from the data set; stored in its record.

@@ -28,6 +28,7 @@ from sme_registry.spec import (
     TupleOf,
 )
 from sme_registry.spec.document import plain_number
+from sme_registry.spec.sme_spec import Seed
 from sme_registry.spec.validation_errors import short_repr
 
 _TOLERANCE = 1e-9  # of the sum of weights: ten times 0.1 is not 1 in floating point
@@ -88,7 +89,8 @@ class DatasetRecipe(Document):
     transitions: Annotated[
         Integer, Field(ge=1, le=10**9, description="N, rows of the data set")
     ] = 50_000
-    seed: Annotated[Integer, Field(ge=0, lt=2**53, description="of the data, not the task")] = 0
+    # Of the data, not the task: an integer or, where nobody may guess it, hexadecimal text.
+    seed: Seed = 0
     coverage: Annotated[Real | None, Field(gt=-1, le=0, description="ε of the sub-cube")] = None
     # For the evaluation of policies that learn from the data set.
     protocol: EvaluationProtocol = EvaluationProtocol()

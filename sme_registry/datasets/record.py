@@ -20,7 +20,7 @@ class Seeds(StrictModel):
     """Seeds of the task and of the data (starts, α, ã and random actions)."""
 
     task: Seed
-    data: Integer
+    data: Seed
 
 
 class DatasetRecord(StrictModel):

@@ -84,7 +84,13 @@ def test_a_seed_has_256_bits_and_makes_a_spec() -> None:
     seeds = [MASTER.seed(Place("autumn", "deep", i)) for i in range(64)]
     assert max(int(seed, 16).bit_length() for seed in seeds) > 250
     assert SMESpec.from_dict({**SETTING, "seed": seeds[0]}).seed == seeds[0]
-    assert 0 <= MASTER.number("states", Place("autumn", "deep", 0)) < 2**53
+    assert 0 <= MASTER.states_seed(Place("autumn", "deep", 0)) < 2**53
+
+
+def test_the_seed_of_hidden_data_cannot_be_tried_out() -> None:
+    seeds = [MASTER.seed(Place("autumn", "deep", i), "data") for i in range(64)]
+    assert max(int(seed, 16).bit_length() for seed in seeds) > 250
+    assert seeds[0] != MASTER.seed(Place("autumn", "deep", 0))
 
 
 def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path: Path) -> None:
