@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from sme_registry.cli.arguments import DatasetsFolder, Force, Json, Out, changes
 from sme_registry.cli.files import print_training
-from sme_registry.terminal import Progress, Table, err
+from sme_registry.terminal import Progress, Table, err, out
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -85,6 +85,49 @@ def train(
             progress=lambda done, total, note: progress.update(done, note),
         )
     print_training(result, out_folder, [_scores(result.record)], json=json)
+
+
+@app.command()
+def sealed(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="The folder of a sealed data set.")
+    ],
+    out_file: Annotated[Path, typer.Option("--out", "-o", help="The policy's .npz file.")],
+    algorithm: Annotated[str, typer.Option("--algorithm", "-a", help="bc or iql.")] = "iql",
+    steps: Annotated[int, typer.Option("--steps", "-n", help="Gradient steps.")] = 20_000,
+    batch_size: Annotated[int, typer.Option(help="Transitions in each gradient step.")] = 256,
+    seed: Annotated[int, typer.Option(help="Seed of weights and shuffling.")] = 0,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Change a hyperparameter. Repeatable."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Train bc or iql on a sealed data set, whose task is hidden. Nothing is evaluated here.
+
+    `sme-leaderboard enter` sends the policy's answers to the season's board.
+
+    Examples:
+
+      sme offline sealed autumn/datasets/sealed/autumn/deep-0-v0 -o deep-0.npz
+    """
+    from sme_registry.io import refuse_existing
+    from sme_registry.offline import train_sealed
+
+    refuse_existing(out_file, force=force)
+    title = f"training {algorithm.upper()}"
+    with Progress(title, max(1, steps), console=err()) as progress:
+        policy = train_sealed(
+            dataset,
+            algorithm=algorithm,
+            steps=steps,
+            batch_size=batch_size,
+            seed=seed,
+            hyperparameters=changes(set_),
+            progress=lambda done, _: progress.update(done),
+        )
+    policy.save(out_file)
+    out().print(escape(str(out_file)), soft_wrap=True)
 
 
 def _scores(record: Any) -> Table:

@@ -10,6 +10,7 @@ Importing this module does not import PyTorch.
 from sme_registry.evaluation import OfflinePolicy
 from sme_registry.offline.hyperparameters import ALGORITHMS, BCHyperparameters, IQLHyperparameters
 from sme_registry.offline.record import BehaviourQuality, Evaluation, OfflineRecord
+from sme_registry.offline.sealed import train_sealed
 from sme_registry.offline.train import OfflineResult, train_offline
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "OfflineRecord",
     "OfflineResult",
     "train_offline",
+    "train_sealed",
 ]

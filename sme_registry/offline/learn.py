@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from sme_registry.datasets import Transitions
+from sme_registry.datasets import SealedDataset, Transitions
 from sme_registry.errors import PolicyError
 from sme_registry.evaluation.policies.npz import Layer
 from sme_registry.offline.bc import BC
@@ -36,7 +36,7 @@ class Section(NamedTuple):
 
 def learn(
     hyperparameters: Hyperparameters,
-    transitions: Transitions,
+    transitions: Transitions | SealedDataset,
     batch_size: int,
     seed: int,
     evaluate_at: Sequence[int],

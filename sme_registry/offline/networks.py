@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sme_registry.datasets import Transitions
+from sme_registry.datasets import SealedDataset, Transitions
 from sme_registry.evaluation.policies.npz import Layer
 
 
@@ -85,7 +85,10 @@ class Batches:
     """
 
     def __init__(
-        self, transitions: Transitions, batch_size: int, generator: torch.Generator
+        self,
+        transitions: Transitions | SealedDataset,
+        batch_size: int,
+        generator: torch.Generator,
     ) -> None:
         columns = (
             transitions.observations,

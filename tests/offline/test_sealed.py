@@ -1,0 +1,65 @@
+"""Learners on sealed data sets: the same policies as on the same rows with their task."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sme_registry.cli import app
+from sme_registry.datasets import DatasetRecipe, SealedDataset, collect
+from sme_registry.errors import OptionError, UnknownNameError
+from sme_registry.offline import OfflinePolicy, train_offline, train_sealed
+from sme_registry.task import materialize
+from tests.offline.sets import TINY
+
+RECIPE = DatasetRecipe.from_dict(
+    {
+        "spec": TINY.to_dict(),
+        "behaviours": [{"kind": "mixture", "nu": 0.5}],
+        "transitions": 200,
+    }
+)
+SHORT = {"steps": 20, "batch_size": 32, "hyperparameters": {"hidden": [16]}}
+
+
+@pytest.fixture(scope="module")
+def dataset() -> SealedDataset:
+    return SealedDataset.collect(RECIPE)
+
+
+@pytest.mark.parametrize("algorithm", ["bc", "iql"])
+def test_the_policy_is_that_of_the_same_rows_with_their_task(dataset, algorithm) -> None:
+    rows = collect(RECIPE, materialize(TINY))
+    protocol = {"states_per_region": 50}
+    known = train_offline(
+        rows, algorithm=algorithm, spec=TINY, protocol=protocol, evaluations=1, episodes=1, **SHORT
+    ).policy
+    hidden = train_sealed(dataset, algorithm=algorithm, **SHORT)
+    for mine, theirs in zip(hidden.layers, known.layers, strict=True):
+        for one, other in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert "spec_digest" not in hidden.about
+
+
+def test_the_command_writes_a_policy(dataset, tmp_path: Path) -> None:
+    folder = dataset.write("sealed/autumn/deep-0-v0", tmp_path)
+    target = tmp_path / "deep-0.npz"
+    arguments = ["offline", "sealed", str(folder), "-o", str(target), "-n", "20", "--set"]
+    result = CliRunner().invoke(app, [*arguments, "hidden=[16]", "--batch-size", "32"])
+    assert result.exit_code == 0, result.output
+    policy, expected = OfflinePolicy.load(target), train_sealed(dataset, **SHORT)
+    np.testing.assert_array_equal(
+        policy(dataset.observations[:8]), expected(dataset.observations[:8])
+    )
+    again = CliRunner().invoke(app, [*arguments, "hidden=[16]"])
+    assert again.exit_code == 2
+
+
+def test_faults_are_named(dataset) -> None:
+    with pytest.raises(UnknownNameError):
+        train_sealed(dataset, algorithm="ppo")
+    with pytest.raises(OptionError, match="batch_size"):
+        train_sealed(dataset, batch_size=201)
