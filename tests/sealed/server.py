@@ -26,7 +26,7 @@ from tests.leaderboard.serving import serving
 SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5, "hidden_width": 8, "horizon": 7}
 CLASSES = [
     {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096},
-    {"name": "short", "setting": SETTING, "instances": 1, "budget": 5},
+    {"name": "short", "setting": SETTING, "instances": 1, "budget": 9},
 ]
 ROWS = 6 * 50
 """Challenge states of an instance."""

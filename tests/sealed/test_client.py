@@ -174,12 +174,12 @@ def test_the_lanes_of_an_instance_stay_the_same(server):
 def test_a_spent_budget_has_an_error_of_its_own(server):
     hidden = sealed.make_vec(server.url, server.ticket, 2, 2)
     hidden.reset()
-    for _ in range(2):
+    for _ in range(4):
         hidden.step(np.zeros((2, 2)))
     with pytest.raises(BudgetSpentError) as caught:
         hidden.step(np.zeros((2, 2)))
     assert pickle.loads(pickle.dumps(caught.value)).code == "budget_spent"
-    assert hidden.instance.number == 2
+    assert hidden.instance.number == 4
     assert hidden.instance.steps_left == 1
 
 

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
+from typer.testing import CliRunner
 
 from examples import cleanrl_style_ppo as cleanrl
+from leaderboard.cli import app
 from sme_registry import sealed
 from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.sealed.sb3 import SealedVecEnv
 from sme_registry.training.learners import new_learner
 from tests.sealed.server import ROWS, Server, serving_season
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +100,19 @@ def test_a_loop_of_one_file_learns(server, monkeypatch):
     cleanrl.learn(agent, optimiser, rollout, observations)
     assert not np.array_equal(agent.mean_actions(env.reset()[0]), before)
     sealed.answer(server.url, server.ticket, agent.mean_actions, 0, action_range="symmetric")
+
+
+def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    server.ticket.write("ticket.json")
+    page = (ROOT / "docs" / "seasons.md").read_text()
+    [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    exec(compile(block.replace("https://board.example", server.url), "page", "exec"), {})
+    with sealed.Instance(server.url, server.ticket) as first:
+        used = [each.used for each in first.status().instances]
+        assert used == [4096, 4096, 8]
+        [command] = re.findall(r"^sme-leaderboard (answer .*)$", page, re.M)
+        words = shlex.split(command.replace("https://board.example", server.url))
+        result = CliRunner().invoke(app, words)
+        assert result.exit_code == 0, result.output
+        assert first.status().phase == "ended"
