@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from leaderboard.cli.options import (
     DEFAULT_KEY,
+    ActionRange,
     BoardOrUrl,
     CodeLink,
     Family,
@@ -23,6 +24,7 @@ from leaderboard.cli.options import (
     board_document,
     is_url,
     manifest_fields,
+    policy_of_each,
 )
 from leaderboard.documents.keys import SigningKey
 from sme_registry.errors import OptionError
@@ -52,10 +54,7 @@ def enter(
         list[str] | None,
         typer.Option(metavar="NAME", help="An instance without a policy; scores 1. Repeatable."),
     ] = None,
-    action_range: Annotated[
-        str | None,
-        typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
-    ] = None,
+    action_range: ActionRange = None,
     code: CodeLink = None,
     statement: Statement = "",
     key: KeyFile = DEFAULT_KEY,
@@ -83,17 +82,14 @@ def enter(
     for name in without:
         if name not in hidden:
             raise OptionError(f"failed={name!r}: must be one of {', '.join(hidden)}.")
-    if len(hidden) > 1 and "{name}" not in policy:
-        raise OptionError(
-            f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
-            f"{next(iter(hidden))}: each task has a policy of its own."
-        )
+    policies = policy_of_each(policy, hidden)
     files: list[bytes | None] = []
     with Progress("answering", len(hidden), console=err(), unit="instances") as progress:
         for done, (name, setting) in enumerate(hidden.items(), start=1):
-            own = policy.replace("{name}", name)
             states = published / "challenges" / f"{name}.npy"
-            files.append(None if name in without else _answers(own, states, setting, action_range))
+            files.append(
+                None if name in without else _answers(policies[name], states, setting, action_range)
+            )
             progress.update(done)
     digests = [None if data is None else _digest(data) for data in files]
     data = {name: each for name, each in zip(digests, files, strict=True) if name and each}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -175,6 +176,26 @@ SealedKnowledge = Annotated[
         "The two are ranked apart.",
     ),
 ]
+
+
+ActionRange = Annotated[
+    str | None,
+    typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
+]
+
+
+def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
+    """The policy of each instance, by its name, which replaces `{name}`.
+
+    Raises:
+      OptionError: there are several instances, and all would have the same policy.
+    """
+    if len(names) > 1 and "{name}" not in policy:
+        raise OptionError(
+            f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
+            f"{next(iter(names))}: each task has a policy of its own."
+        )
+    return {name: policy.replace("{name}", name) for name in names}
 
 
 def manifest_fields(

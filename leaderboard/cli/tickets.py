@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from leaderboard.cli.options import (
     DEFAULT_KEY,
+    ActionRange,
     CodeLink,
     Family,
     KeyFile,
@@ -20,11 +21,11 @@ from leaderboard.cli.options import (
     Statement,
     SubmitterName,
     manifest_fields,
+    policy_of_each,
 )
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
-from sme_registry.errors import OptionError
-from sme_registry.io import refuse_existing, write_atomically
+from sme_registry.io import choice, refuse_existing, write_atomically
 from sme_registry.terminal import Progress, Table, err, out
 
 ServedBoard = Annotated[
@@ -93,12 +94,12 @@ def ticket(
 
     table = Table(
         f"ticket {started.ticket} of {started.season}",
-        {"instance": "number", "class": "name", "S": "number", "A": "number", "steps": "number"},
+        {"number": "number", "instance": "name", "S": "number", "A": "number", "steps": "number"},
     )
     for number, place in enumerate(started.places):
         setting = place.member.setting
         sizes = setting.state_dim, setting.action_dim, place.member.budget
-        table.add_row(str(number), place.member.name, *(f"{each:,}" for each in sizes))
+        table.add_row(str(number), place.name, *(f"{each:,}" for each in sizes))
     out().print(table)
     out().print(
         f"{escape(str(out_file))}: keep it secret. Answer by {escape(started.deadline)}.",
@@ -113,21 +114,20 @@ def answer(
         str,
         typer.Argument(
             metavar="POLICY",
-            help="A policy as `sme evaluate` takes it. {i} stands for the instance's number.",
+            help="A policy as `sme evaluate` takes it. {name} stands for the instance, such as "
+            "deep-0.",
         ),
     ],
     instance: Annotated[
-        list[int] | None,
+        list[str] | None,
         typer.Option(
             "--instance",
             "-i",
+            metavar="NAME",
             help="Only this instance; repeatable. Default: all without answers.",
         ),
     ] = None,
-    action_range: Annotated[
-        str | None,
-        typer.Option(metavar="RANGE", help="unit or symmetric; an SB3 model's own by default."),
-    ] = None,
+    action_range: ActionRange = None,
     algorithm: Annotated[
         str | None, typer.Option(help="Class of a .zip that does not tell it.")
     ] = None,
@@ -138,32 +138,28 @@ def answer(
 
     Examples:
 
-      sme-leaderboard answer https://board.example ticket.json 'runs/{i}/model.zip'
+      sme-leaderboard answer https://board.example ticket.json 'runs/{name}/model.zip'
 
-      sme-leaderboard answer https://board.example ticket.json policy.onnx --instance 0
+      sme-leaderboard answer https://board.example ticket.json policy.onnx --instance deep-0
     """
     from sme_registry.sealed import Instance, Ticket, actions_in, prepare_policy
 
     held = Ticket.read(ticket_file)
+    places = {place.name: number for number, place in enumerate(held.places)}
     with Instance(url, held) as first:
         phases = [each.phase for each in first.status().instances]
-    numbers = [i for i, phase in enumerate(phases) if phase != "answered"]
-    if instance is not None:
-        numbers = list(dict.fromkeys(instance))
-    if len(numbers) > 1 and "{i}" not in policy:
-        raise OptionError(
-            f"policy={policy!r}: must contain {{i}}, the instance's number: each task has a policy "
-            "of its own. Or give --instance."
-        )
+    for name in instance or ():
+        choice("instance", name, places)
+    chosen = instance or [name for name in places if phases[places[name]] != "answered"]
     # All are loaded before the first instance's steps end for good.
     policies = {
-        number: prepare_policy(
-            policy.replace("{i}", str(number)),
-            held.place(number).member.setting,
+        places[name]: prepare_policy(
+            own,
+            held.place(places[name]).member.setting,
             action_range=action_range,
             algorithm=algorithm,
         )
-        for number in numbers
+        for name, own in policy_of_each(policy, chosen).items()
     }
     with Progress("answering", len(policies), console=err(), unit="instances") as progress:
         for done, (number, prepared) in enumerate(policies.items(), start=1):

@@ -24,7 +24,7 @@ from leaderboard.scoring.sealed import Instance, challenge, instances
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
 from sme_registry.io import build_folder, read_json, to_json
-from sme_registry.sealed import pack_table, table_bytes
+from sme_registry.sealed import instance_name, pack_table, table_bytes
 
 Progress = Callable[[int, int], None]
 
@@ -34,7 +34,7 @@ _UNKNOWN = "sha256:" + "0" * 64
 
 def name_of(hidden: Hidden) -> str:
     """The name of an instance in files: its class and its number in it."""
-    return f"{hidden.member.name}-{hidden.instance}"
+    return instance_name(hidden.member.name, hidden.instance)
 
 
 def challenge_path(folder: Path, hidden: Hidden) -> Path:

@@ -19,6 +19,7 @@ from sme_registry.sealed.ticket import (
     Ticket,
     TicketClass,
     TicketStatus,
+    instance_name,
 )
 from sme_registry.sealed.wire import (
     Begun,
@@ -49,6 +50,7 @@ __all__ = [
     "actions_in",
     "answer",
     "bearer",
+    "instance_name",
     "instance_path",
     "make",
     "make_vec",

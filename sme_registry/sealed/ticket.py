@@ -33,11 +33,21 @@ class TicketClass(StrictModel):
     budget: Annotated[Integer, Field(ge=1)]
 
 
+def instance_name(class_name: str, instance: int) -> str:
+    """What files and commands call a hidden instance: its class and its number in it, from 0."""
+    return f"{class_name}-{instance}"
+
+
 class Place(NamedTuple):
     """One hidden instance of a ticket: its class, and its number in it, from 0."""
 
     member: TicketClass
     instance: int
+
+    @property
+    def name(self) -> str:
+        """Such as `deep-0`."""
+        return instance_name(self.member.name, self.instance)
 
 
 class Ticket(StrictModel):

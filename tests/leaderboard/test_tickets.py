@@ -68,10 +68,11 @@ def test_a_ticket_is_started_stepped_and_answered(url: str, board: Board) -> Non
         hidden.step(np.zeros((4, 1)))
 
     name = f"{__name__}:policy"
-    assert "must contain {i}" in command(2, "answer", url, "ticket.json", name)
-    shown = command(0, "answer", url, "ticket.json", name, "--instance", "0")
+    assert "must contain {name}" in command(2, "answer", url, "ticket.json", name)
+    shown = command(0, "answer", url, "ticket.json", name, "--instance", "deep-0")
     assert "1 instances without answers" in shown
-    assert "error:" in command(2, "answer", url, "ticket.json", "runs/{i}/model.zip")
+    assert "error:" in command(2, "answer", url, "ticket.json", "runs/{name}/model.zip")
+    assert "must be 'deep-0' or" in command(2, "answer", url, "ticket.json", name, "-i", "deep-2")
     assert "has ended" in command(0, "answer", url, "ticket.json", name)  # of the one that is left
     with Instance(url, ticket) as hidden:
         assert [each.phase for each in hidden.status().instances] == ["answered", "answered"]
@@ -107,4 +108,4 @@ def test_refusals_have_stable_codes(url: str) -> None:
     start(0, url)
     plain = Ticket.read("ticket.json").to_dict() | {"token": "00" * 32}
     Ticket.from_dict(plain).write("other.json")
-    assert "token_wrong" in command(1, "answer", url, "other.json", "constant", "-i", "0")
+    assert "token_wrong" in command(1, "answer", url, "other.json", "constant", "-i", "deep-0")
