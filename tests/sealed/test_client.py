@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +28,7 @@ from sme_registry.spec import Setting
 from tests.leaderboard.serving import serving
 from tests.sealed.server import ROWS, Server, serving_season
 
+ROOT = Path(__file__).resolve().parents[2]
 WAYS_TO_FAIL = ["lose request", "lose answer", "cut answer", "503", "507"]
 
 
@@ -138,6 +141,43 @@ def test_another_process_goes_on_where_one_was_killed(server):
         assert np.array_equal(local[1].astype(np.float32), remote.reward)
     with pytest.raises(SealedError, match="step_conflict"):  # only one at a time can step it
         killed.step(parts[0])
+
+
+STEPPING = """
+import itertools, sys
+import numpy as np
+from sme_registry import sealed
+
+url, ticket = sys.argv[1:]
+env = sealed.make_vec(url, ticket, 0, 2)
+env.reset()
+for number in itertools.count(env.instance.number + 1):
+    env.step(np.random.default_rng(number).random((2, 2), dtype=np.float32))
+    print(number, flush=True)
+"""
+
+
+def test_a_killed_process_loses_no_step_and_takes_none_twice(server, tmp_path: Path):
+    path = server.ticket.write(tmp_path / "ticket.json")
+    arguments = [sys.executable, "-c", STEPPING, server.url, str(path)]
+    printed = 0
+    for _ in range(2):
+        process = subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        with process:
+            first = int(process.stdout.readline())
+            assert first in (printed + 1, printed + 2)  # the last one may be carried out, unprinted
+            for _ in range(10):
+                printed = int(process.stdout.readline())
+            process.kill()
+            printed = max(printed, *map(int, process.stdout.read().split()), 0)
+    resumed = Instance(server.url, path, 0, 2)
+    observation = resumed.begin()
+    assert resumed.number in (printed, printed + 1)
+    assert resumed.status().instances[0].used == 2 * resumed.number
+    here = server.local(0, 2)
+    for number in range(1, resumed.number + 1):
+        expected = here.step(np.random.default_rng(number).random((2, 2), dtype=np.float32))[0]
+    assert np.array_equal(observation, expected)
 
 
 def test_a_board_that_is_started_again_goes_on(tmp_path: Path, waits: list[float]):
