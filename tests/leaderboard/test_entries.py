@@ -13,12 +13,14 @@ from leaderboard import intake
 from leaderboard.documents.entry import Entry, SignedEntry
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.submission import Envelope
-from leaderboard.errors import Rejection
+from leaderboard.errors import BoardError, Rejection
+from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SpecError
 from sme_registry.sealed import pack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import manifest, moment, signed_entry, tiny_season
+from tests.leaderboard.store.crashing import fill, small_disk
 
 SEASON = tiny_season()
 GOOD = pack_table(np.full((300, 1), 0.5, np.float32))
@@ -126,6 +128,22 @@ def test_a_full_board_loses_nothing(tmp_path: Path, key):
         store.announce(SEASON)
         assert refused(store, entry(store, key, None, None)) == "quota"
         assert store.entrants(SEASON.digest) == []
+
+
+def test_a_full_disk_loses_nothing_and_the_entry_can_be_sent_again(tmp_path: Path, key):
+    with small_disk(tmp_path / "disk", "1000k") as disk:
+        if disk is None:
+            pytest.skip("no file system may be mounted here")
+        with tiny_board(disk / "board") as store:
+            store.announce(SEASON)
+            signed, before = entry(store, key, GOOD, None), store.head
+            fill(disk / "filler", free=0)
+            with pytest.raises(BoardError, match=r"No space left|is full"):
+                send(store, signed, GOOD)
+            assert store.head == before
+            (disk / "filler").unlink()
+            assert send(store, signed, GOOD)
+            assert verify(disk / "board").sealed == 1
 
 
 def test_a_key_sends_so_many_entries_a_day(tmp_path: Path, key):

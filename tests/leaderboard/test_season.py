@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +162,17 @@ def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path: Path) -> 
         with pytest.raises(SMEError):
             create_season(read_plan({**plan(), **fields}), MASTER, tmp_path / "new")
     assert not any(tmp_path.iterdir())
+
+
+def test_the_plan_in_the_documentation_is_one() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "seasons.md").read_text()
+    [text] = re.findall(r"```json\n(.*?)```", page, re.S)
+    terms = read_plan(json.loads(text))
+    assert len(terms.published) == 10
+    online = {**terms.to_dict(), "track": "sealed-online", "ticket_hours": 24, "tickets_per_key": 3}
+    del online["published"]
+    online["classes"][0] |= {"data": None, "budget": 1000}
+    assert read_plan(online).published == ()
 
 
 def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) -> None:

@@ -77,6 +77,16 @@ def small_disk(path: Path, size: str = "1m") -> Iterator[Path | None]:
             subprocess.run(["umount", "-l", path], check=True)
 
 
+def fill(path: Path, free: int) -> None:
+    """Fill a disk but for so many bytes."""
+    with open(path, "wb", buffering=0) as stream:
+        for size in (4096, 1):
+            with contextlib.suppress(OSError):
+                while True:
+                    stream.write(bytes(size))
+        stream.truncate(max(0, stream.tell() - free))
+
+
 def make_read_only(path: Path) -> None:
     """Remount a `small_disk` read-only, also for root."""
     subprocess.run(["mount", "-o", "remount,ro", path], check=True)

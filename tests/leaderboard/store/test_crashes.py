@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import shutil
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
-from tests.leaderboard.store.crashing import crashes_before, small_disk
+from tests.leaderboard.store.crashing import crashes_before, fill, small_disk
 from tests.leaderboard.store.synthetic import synthetic_result
 
 Work = Callable[[Path, SigningKey], object]
@@ -130,7 +129,7 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
         with tiny_board(disk / "board") as store:
             for number in range(28):
                 _, _, before = state(disk / "board")
-                _fill(disk / "filler", free=4096 * number)
+                fill(disk / "filler", free=4096 * number)
                 try:
                     put_submission(store, key, number)
                 except BoardError as error:
@@ -147,13 +146,3 @@ def test_a_full_disk_is_reported_and_leaves_no_partial_file(tmp_path, key):
         with Store.open(disk / "board") as store:
             put_submission(store, key, 999)
         verify(disk / "board")
-
-
-def _fill(path: Path, free: int) -> None:
-    """Fill a disk but for so many bytes."""
-    with open(path, "wb", buffering=0) as stream:
-        for size in (4096, 1):
-            with contextlib.suppress(OSError):
-                while True:
-                    stream.write(bytes(size))
-        stream.truncate(max(0, stream.tell() - free))
