@@ -13,8 +13,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from leaderboard.artefact.answers import Float32, rows_of
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master, Place
@@ -23,6 +21,7 @@ from leaderboard.documents.season import Hidden, Season, Terms
 from leaderboard.scoring.aggregation import Groups, class_score, is_oracle_like, method_scores
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
+from sme_registry.evaluation import evaluation_observations
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
@@ -81,14 +80,7 @@ def challenge(spec: SMESpec, protocol: EvaluationProtocol) -> Float32:
     Returns:
       `[regions · n, S + 2]` observations, region after region; those of WD in [0, 1].
     """
-    shown: list[Float32] = []
-
-    def record(observations: Float32) -> Float32:
-        shown.append(observations)
-        return np.zeros((len(observations), spec.action_dim), np.float32)
-
-    evaluate(record, spec, protocol, action_range="unit", name="challenge")
-    return np.concatenate(shown)
+    return evaluation_observations(spec, protocol)
 
 
 def score_run(

@@ -10,7 +10,12 @@ from sme_registry.evaluation.continual import (
     frozen_after_first,
     reference_regret,
 )
-from sme_registry.evaluation.evaluate import evaluate, evaluate_many, resolve_protocol
+from sme_registry.evaluation.evaluate import (
+    evaluate,
+    evaluate_many,
+    evaluation_observations,
+    resolve_protocol,
+)
 from sme_registry.evaluation.observation import Invariance, LayerProbe, ObservationReport
 from sme_registry.evaluation.policies import (
     OfflinePolicy,
@@ -47,6 +52,7 @@ __all__ = [
     "evaluate",
     "evaluate_many",
     "evaluate_stream",
+    "evaluation_observations",
     "expected_regret",
     "fresh_per_phase",
     "frozen_after_first",

@@ -15,7 +15,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from sme_registry.compiled import Engine, engine
+from sme_registry.envs import arguments
 from sme_registry.errors import PolicyError, SpecError
 from sme_registry.evaluation import references
 from sme_registry.evaluation.accumulators import WHOLE
@@ -27,7 +30,7 @@ from sme_registry.evaluation.observation import (
 )
 from sme_registry.evaluation.policies import Policy, TeamPolicy, as_policy
 from sme_registry.evaluation.region_report import RegionReport
-from sme_registry.evaluation.regions import region_name
+from sme_registry.evaluation.regions import Observations, region_name, states
 from sme_registry.evaluation.report import AgentReport, EvaluationReport
 from sme_registry.evaluation.safety import SafetyReport, SafetyScore
 from sme_registry.io import versions
@@ -129,6 +132,35 @@ def evaluate_many(
         together = _evaluate_together([subjects[index] for index in group], protocol, done)
         reports |= zip(group, together, strict=True)
     return [reports[index] for index in range(len(subjects))]
+
+
+def evaluation_observations(
+    spec_or_id: SpecLike, protocol: ProtocolLike = "paper-v1"
+) -> Observations:
+    """The observations in which `evaluate` asks a policy of a single agent for actions.
+
+    Of a task with distractors, those of the regions: it is asked about other distractors as well.
+
+    Args:
+      spec_or_id, protocol: as in `evaluate`.
+
+    Returns:
+      `[regions · n, O]` float32, region after region.
+
+    Raises:
+      SpecError: the task is for a team, whose agents see observations of their own; or as
+        `evaluate`.
+      UnknownNameError, OptionError, ResourceLimitError: as `evaluate`.
+    """
+    task, protocol = materialize(load_spec(spec_or_id)), resolve_protocol(protocol)
+    arguments.single_agent(task)
+    return np.concatenate(
+        [
+            drawn.observation(drawn.seen(task), task.spec.horizon)
+            for region in range(len(protocol.edges))
+            for drawn in states(protocol, region, task.spec)
+        ]
+    )
 
 
 def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:

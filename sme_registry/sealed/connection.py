@@ -21,7 +21,7 @@ from sme_registry.sealed.wire import bearer
 
 PATIENCE = 900.0
 _FIRST_PATIENCE = 5.0  # a mistyped URL shall not wait for a server that does not exist
-_TIMEOUT = 60.0  # in which a server must accept a connection, or send the next bytes
+_TIMEOUT = 300.0  # to accept a connection, or send more: a restarted server replays all steps
 _FIRST_WAIT, _LONGEST_WAIT = 0.1, 15.0
 _TRANSIENT = frozenset({408, 502, 503, 504, 507})
 _JSON_BYTES = 2**20

@@ -19,7 +19,7 @@ from sme_registry.errors import (
     SpecError,
     UnknownNameError,
 )
-from sme_registry.evaluation import references, regions
+from sme_registry.evaluation import evaluation_observations, references, regions
 from sme_registry.evaluation.references import reference_policy
 from sme_registry.spec import EvaluationProtocol, ProtocolFile
 from tests.evaluation.shown import observations
@@ -44,6 +44,20 @@ def optimal_of(spec):
 @pytest.fixture(scope="module")
 def report():
     return evaluate(linear, SPEC, PROTOCOL)
+
+
+def test_a_policy_is_asked_for_actions_in_the_observations_in_their_order():
+    shown = []
+
+    def record(observations):
+        shown.append(observations)
+        return half(observations)
+
+    protocol = EvaluationProtocol(states_per_region=10_000)  # more than a batch
+    evaluate(record, SPEC, protocol)
+    assert np.array_equal(np.concatenate(shown), evaluation_observations(SPEC, protocol))
+    with pytest.raises(SpecError, match="team"):
+        evaluation_observations("Team2-v1", protocol)
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
