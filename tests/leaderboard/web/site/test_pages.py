@@ -545,6 +545,7 @@ def test_a_folder_that_is_not_writable_is_an_error(board, tmp_path):
         "board/log",
         "board/objects/site",
         "board/results",
+        "board/seasons",
         "board/submissions",
         "board/withdrawals/x",
         "other",
