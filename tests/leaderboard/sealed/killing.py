@@ -98,6 +98,11 @@ class KillableServer:
         assert self._process.stdout is not None
         assert self._process.stdout.readline(), "the server did not start"
 
+    @property
+    def pid(self) -> int:
+        """Of the present process."""
+        return self._process.pid
+
     def kill(self) -> None:
         """End it as a loss of its process would."""
         self._process.send_signal(signal.SIGKILL)
