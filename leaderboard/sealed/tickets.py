@@ -12,7 +12,7 @@ from pathlib import Path
 
 from leaderboard.documents.master import Master
 from leaderboard.documents.season import MAX_LANES, Season
-from leaderboard.errors import BoardError
+from leaderboard.errors import BoardError, Rejection
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
@@ -131,6 +131,17 @@ class Tickets:
         self._hold(chosen)
         return answer
 
+    def quick_step(self, number: int, token: str, instance: int, body: bytes) -> bytes | None:
+        """`step`, which does not block; None where it would, or is refused."""
+        ticket = self._running.get(number)
+        instances = () if ticket is None else ticket.instances
+        if instance >= len(instances) or not instances[instance].is_ready:
+            return None
+        try:
+            return self.step(number, token, instance, body)
+        except Rejection:
+            return None
+
     def finish(self, number: int, token: str, instance: int) -> None:
         """`SteppedInstance.finish`, with the password of the ticket."""
         self._chosen(number, token, instance).finish()
@@ -156,12 +167,6 @@ class Tickets:
             return False
         ticket.refuse_over(self.now)
         return chosen.answer(data)
-
-    def is_ready(self, number: int, instance: int) -> bool:
-        """Whether a step of this instance needs no replay, and waits for no other request."""
-        ticket = self._running.get(number)
-        instances = () if ticket is None else ticket.instances
-        return instance < len(instances) and instances[instance].is_ready
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""

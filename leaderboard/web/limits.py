@@ -208,33 +208,6 @@ async def read_document(request: Request, name: str) -> bytes:
     return bytes(text)
 
 
-async def read_steps(receive: Receive, limit: int) -> bytes:
-    """Read a whole small body like `read_document`, but without what that takes for each request.
-
-    Raises:
-      Rejection: `too_large`.
-      RequestError: `too_slow` or `broken_off`.
-    """
-    body, more = b"", True
-    try:
-        with anyio.fail_after(_DOCUMENT_SECONDS):
-            while more:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    raise RequestError("broken_off", f"steps: {HTTP_CODES['broken_off']}.")
-                body += message.get("body", b"")
-                more = message.get("more_body", False)
-                if len(body) > limit:
-                    raise _too_large("steps", limit)
-    except TimeoutError:
-        raise RequestError("too_slow", f"steps: {HTTP_CODES['too_slow']}.") from None
-    return body
-
-
-def _too_large(name: str, limit: int) -> Rejection:
-    return Rejection("too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one.")
-
-
 async def body_chunks(
     request: Request, limit: int, seconds: float, name: str = "object"
 ) -> AsyncIterator[bytes]:
@@ -265,5 +238,7 @@ async def body_chunks(
             return
         size += len(chunk)
         if size > limit:
-            raise _too_large(name, limit)
+            raise Rejection(
+                "too_large", f"{name}: must be at most {limit:,} bytes. Send a smaller one."
+            )
         yield chunk

@@ -11,22 +11,24 @@
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge  challenge states
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
 
-Steps are answered in the event loop, where they take less time than a thread would; what replays a
-journal, or waits for the disk, runs in threads.
+Steps are answered in the event loop (`QuickSteps`), where they take less time than a thread would;
+what replays a journal, or waits for the disk, runs in threads.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard import intake
 from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
@@ -45,7 +47,13 @@ _WORKERS = 4  # threads that replay journals and write answers
 _CHALLENGES = 1  # that are computed at a time: each takes a processor for seconds
 _REQUESTS = 64  # for tickets, checked at the same time
 _LARGEST = 2**31
-_TYPE = (b"content-type", b"application/octet-stream")
+_BODY_SECONDS = 30.0
+_STEPS = re.compile(r"/api/seasons/([^/]+)/tickets/(\d{1,9})/instances/(\d{1,9})/steps", re.ASCII)
+_STEP_HEADERS = (
+    (b"content-type", b"application/octet-stream"),
+    (b"cache-control", b"no-store"),
+    (b"x-content-type-options", b"nosniff"),
+)
 _T = TypeVar("_T")
 
 
@@ -83,7 +91,7 @@ class SeasonRoutes:
     def routes(self) -> list[Route]:
         """For a Starlette application; steps first, since they come most often."""
         return [
-            Route(f"{_INSTANCE}/steps", _Raw(self.step), methods=["POST"]),
+            Route(f"{_INSTANCE}/steps", self.step, methods=["POST"]),
             Route(f"{_INSTANCE}/start", self.start, methods=["POST"]),
             Route(f"{_INSTANCE}/finish", self.finish, methods=["POST"]),
             Route(f"{_INSTANCE}/challenge", self.challenge, methods=["GET"]),
@@ -197,18 +205,20 @@ class SeasonRoutes:
         new = await self._in_thread(lambda: tickets.answer(*where, data))
         return Response(status_code=201 if new else 200)
 
-    async def step(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Take the steps of a request; without the objects that other requests get."""
-        tickets, where = self.place(scope)
-        body = await limits.read_steps(receive, tickets.step_bytes)
-        if tickets.is_ready(where.ticket, where.instance):
-            answer = tickets.step(*where, body)
-        else:
-            answer = await self._in_thread(lambda: tickets.step(*where, body))
-        length = str(len(answer)).encode()
-        headers = [_TYPE, (b"content-length", length)]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": answer})
+    async def step(self, request: Request) -> Response:
+        """Take the steps of a request."""
+        tickets, where = self.place(request.scope)
+        chunks = limits.body_chunks(request, tickets.step_bytes, _BODY_SECONDS, "steps")
+        body = b"".join([chunk async for chunk in chunks])
+        return _octets(await self._in_thread(lambda: tickets.step(*where, body)))
+
+    def steps_in(self, scope: Scope) -> tuple[Tickets, _Where] | None:
+        """The instance of which a request may take steps; None if it surely does not."""
+        match = _STEPS.fullmatch(scope["path"]) if scope["type"] == "http" else None
+        tickets = self._tickets.get(match[1]) if match else None
+        if match is None or tickets is None:
+            return None
+        return tickets, _Where(int(match[2]), _token(scope), int(match[3]))
 
     def tickets_of(self, season: str) -> Tickets:
         """The tickets of a season that this server steps.
@@ -248,15 +258,48 @@ class _Where(NamedTuple):
     instance: int
 
 
-class _Raw:
-    """An ASGI application from a handler; Starlette gives functions a request, and no `send`."""
+class QuickSteps:
+    """ASGI middleware: answers steps that need no replay before the rest of an application.
 
-    def __init__(self, handler: Callable[[Scope, Receive, Send], Awaitable[None]]) -> None:
-        self._handler = handler
+    Whatever else there is to say about a request, such as why it is refused, the application says.
+    It costs as much processor time as all else in a step.
+
+    Args:
+      app: the application.
+      seasons: its seasons.
+    """
+
+    def __init__(self, app: ASGIApp, seasons: SeasonRoutes) -> None:
+        self._app = app
+        self._seasons = seasons
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        await self._handler(scope, receive, send)
+        steps = self._seasons.steps_in(scope)
+        if steps is None:
+            await self._app(scope, receive, send)
+            return
+        tickets, where = steps
+        first: Message | None = None
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_BODY_SECONDS):
+                first = await receive()
+        if first is not None and first["type"] == "http.request" and not first.get("more_body"):
+            answer = tickets.quick_step(*where, first.get("body", b""))
+            if answer is not None:
+                headers = [*_STEP_HEADERS, (b"content-length", str(len(answer)).encode())]
+                await send({"type": "http.response.start", "status": 200, "headers": headers})
+                await send({"type": "http.response.body", "body": answer})
+                return
+
+        async def receive_again() -> Message:
+            nonlocal first
+            if first is None:
+                return await receive()
+            message, first = first, None
+            return message
+
+        await self._app(scope, receive_again, send)
 
 
 def _small(scope: Scope, name: str) -> int:
