@@ -1,8 +1,8 @@
 """`attending`: what a server does for its seasons beside requests: syncing, ending and scoring.
 
 Every second the journals are synced, and tickets that are over are closed and scored, one at a time
-in a process of its own, so that steps go on. A process that fails is tried again, after a second,
-then after growing pauses of up to five minutes.
+in a process of its own, so that steps go on. A ticket that cannot be scored is tried again after
+all others, first after a second, then after growing pauses of up to five minutes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from leaderboard.documents.master import Master
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.tickets import Tickets
 from leaderboard.store import Store
-from sme_registry.errors import SMEError
 
 _SECONDS = 1.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 1.0, 300.0
@@ -59,19 +58,24 @@ class Attendant:
     def __init__(self, tickets: Tickets) -> None:
         self._tickets = tickets
         self._process: BaseProcess | None = None
-        self._pause, self._paused_until = _FIRST_PAUSE, 0.0
+        self._number = 0  # of the ticket that the process scores
+        self._failed: set[int] = set()
+        self._pause, self._retry_at = _FIRST_PAUSE, 0.0
 
     def attend(self) -> None:
         """Sync the journals, and score the next ticket that is over."""
         try:
             self._tickets.sync()
-            if self._is_scoring() or time.monotonic() < self._paused_until:
+            if self._is_scoring():
                 return
-            for number in self._tickets.over():
-                self._tickets.close_ticket(number)
-                self._process = self._start(number)
-                return
-        except SMEError as error:  # the board is locked, or its disk is full
+            waiting = [number for number in self._tickets.over() if number not in self._failed]
+            if waiting:
+                self._number = waiting[0]
+                self._tickets.close_ticket(self._number)
+                self._process = self._start(self._number)
+            elif time.monotonic() >= self._retry_at:
+                self._failed.clear()
+        except Exception as error:  # the board is locked, or has no memory or files left
             # Nothing but the kind of an error is logged: its text may name what is hidden.
             _log.error("season: cannot be attended to: %s", type(error).__name__)
 
@@ -97,9 +101,10 @@ class Attendant:
         failed = self._process.exitcode != 0
         self._process.close()
         self._process = None
-        if failed:
-            _log.error("season: a ticket could not be scored; the next attempt follows")
-            self._paused_until = time.monotonic() + self._pause
+        if failed:  # others first
+            _log.error("season: a ticket could not be scored; it is tried again")
+            self._failed.add(self._number)
+            self._retry_at = time.monotonic() + self._pause
         self._pause = min(2.0 * self._pause, _LONGEST_PAUSE) if failed else _FIRST_PAUSE
         return False
 

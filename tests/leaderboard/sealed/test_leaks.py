@@ -15,11 +15,11 @@ import pytest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
 from leaderboard.scoring.sealed import instances
-from leaderboard.sealed import attendant as attendant_module
+from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
-from sme_registry import materialize, sealed
+from sme_registry import SMEError, materialize, sealed
 from tests.leaderboard.sealed.playing import Board, online_board
 from tests.leaderboard.serving import serving
 
@@ -140,12 +140,12 @@ class Failing:
     digest = "sha256:" + "0" * 64
 
     def sync(self) -> None:
-        raise attendant_module.SMEError("the seed is 0x5eed")
+        raise SMEError("the seed is 0x5eed")
 
 
 def test_a_fault_is_logged_without_its_text(caplog: pytest.LogCaptureFixture) -> None:
     tickets: Any = Failing()
-    attendant_module.Attendant(tickets).attend()
+    Attendant(tickets).attend()
     assert "SMEError" in caplog.text
     assert "5eed" not in caplog.text
 

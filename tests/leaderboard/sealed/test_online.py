@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import time
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,37 @@ def played(url: str, ticket: sealed.Ticket, number: int, steps: int) -> None:
     instance.close()
 
 
+def attend(attendant: Attendant, times: int) -> None:
+    """Attend to a season so often, each time when the last ticket is scored."""
+    for _ in range(times):
+        attendant.attend()
+        for process in multiprocessing.active_children():
+            process.join()
+
+
+def test_a_ticket_that_cannot_be_scored_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        for nonce in range(2):
+            board.ticket(url, KEY, nonce)
+    clock = time.time
+    monkeypatch.setattr("leaderboard.sealed.tickets.time.time", lambda: clock() + 25 * 3600)
+    with Store.open(board.path) as store:
+        broken = store.season_folder(board.season.digest).ticket(1) / "0.journal"
+        broken.write_bytes(b"no journal")
+        tickets = Tickets(store, board.secret)
+        attendant = Attendant(tickets)
+        attend(attendant, times=3)
+        assert tickets.over() == [1]
+        broken.unlink()
+        monkeypatch.setattr("leaderboard.sealed.attendant.time.monotonic", lambda: 1e9)
+        attend(attendant, times=2)
+        assert tickets.over() == []
+        tickets.close()
+
+
 def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
     board = online_board(tmp_path)
     with serving(board.path, season_secrets=[board.secret]) as url:
@@ -48,11 +80,7 @@ def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
         instance.close()
     with Store.open(board.path) as store:
         tickets = Tickets(store, board.secret)
-        attendant = Attendant(tickets)
-        attendant.attend()
-        for process in multiprocessing.active_children():
-            process.join()
-        attendant.attend()
+        attend(Attendant(tickets), times=2)
         assert tickets.over() == []
         tickets.close()
         result = store.sealed_result(store.ticket(board.season.digest, 1))
