@@ -41,8 +41,8 @@ from leaderboard.web.errors import HTTP_CODES, RequestError
 from sme_registry import sealed
 
 _SEASON = "/api/seasons/{season}"
-_TICKET = _SEASON + "/tickets/{ticket:int}"
-_INSTANCE = _TICKET + "/instances/{instance:int}"
+_TICKET = _SEASON + "/tickets/{ticket}"
+_INSTANCE = _TICKET + "/instances/{instance}"
 _WORKERS = 4  # threads that replay journals and write answers
 _CHALLENGES = 1  # that are computed at a time: each takes a processor for seconds
 _REQUESTS = 64  # for tickets, checked at the same time
@@ -214,7 +214,8 @@ class SeasonRoutes:
 
     def steps_in(self, scope: Scope) -> tuple[Tickets, _Where] | None:
         """The instance of which a request may take steps; None if it surely does not."""
-        match = _STEPS.fullmatch(scope["path"]) if scope["type"] == "http" else None
+        posted = scope["type"] == "http" and scope["method"] == "POST"
+        match = _STEPS.fullmatch(scope["path"]) if posted else None
         tickets = self._tickets.get(match[1]) if match else None
         if match is None or tickets is None:
             return None
@@ -303,8 +304,11 @@ class QuickSteps:
 
 
 def _small(scope: Scope, name: str) -> int:
-    """A number of the path; what no ticket or instance has is a number that none of them has."""
-    return min(int(scope["path_params"][name]), _LARGEST)
+    """A number of the path; of more than nine digits, one that no ticket or instance has."""
+    text: str = scope["path_params"][name]
+    if not (text.isascii() and text.isdigit()):
+        raise RequestError("not_found", f"{HTTP_CODES['not_found']}.")
+    return int(text) if len(text) < 10 else _LARGEST
 
 
 def _token(scope: Scope) -> str:

@@ -193,6 +193,8 @@ def test_large_bodies_and_numbers_are_refused(tmp_path: Path) -> None:
             client.post(at + "start?lanes=" + "9" * 30, headers=token),
             client.post(at.replace("/0/", f"/{10**30}/") + "steps", headers=token),
             client.post(at.replace("/1/", f"/{10**30}/") + "finish", headers=token),
+            client.post(at.replace("/1/", f"/{'9' * 5000}/") + "steps", headers=token),
+            client.post(at.replace("/1/", "/one/") + "steps", headers=token),
         ]
     codes = [(each.status_code, each.json()["code"]) for each in answers]
     assert codes == [
@@ -200,7 +202,25 @@ def test_large_bodies_and_numbers_are_refused(tmp_path: Path) -> None:
         (400, "bad_request"),
         (404, "instance_unknown"),
         (404, "ticket_unknown"),
+        (404, "ticket_unknown"),
+        (404, "not_found"),
     ]
+
+
+def test_steps_are_posted(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with (
+        serving(board.path, season_secrets=[board.secret]) as url,
+        httpx.Client(trust_env=False) as client,
+    ):
+        ticket = board.ticket(url, KEY)
+        token = {"Authorization": sealed.bearer(ticket.token)}
+        at = url + sealed.instance_path(board.season.id, 1, 0, "")
+        client.post(at + "start?lanes=4", headers=token)
+        body = sealed.StepFormat(4, 2, 1).pack_request(1, np.zeros((4, 1)))
+        assert client.put(at + "steps", content=body, headers=token).status_code == 405
+        status = client.get(url + sealed.ticket_path(board.season.id, 1), headers=token).json()
+    assert status["instances"][0]["used"] == 0
 
 
 def test_an_offline_season_starts_no_ticket(tmp_path: Path) -> None:
