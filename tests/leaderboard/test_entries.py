@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from sme_registry.errors import SpecError
 from sme_registry.sealed import pack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import manifest, moment, signed_entry, tiny_season
+from tests.leaderboard.serving import authorization, serving
 from tests.leaderboard.store.crashing import fill, small_disk
 
 SEASON = tiny_season()
@@ -108,6 +110,32 @@ def test_bad_entries_are_refused_with_stable_codes(store, key):
     assert send(store, entry(store, key, None, None, **name))
     name["submitter"]["key"] = other.public
     assert refused(store, entry(store, other, None, None, **name)) == "name_taken"
+
+
+def test_entries_over_http_have_the_same_codes(store, key):
+    signed, digits = entry(store, key, GOOD, None), digest(GOOD)[7:]
+    elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
+    changed = signed.to_bytes().replace(b'"Test"', b'"Best"')
+    with (
+        serving(store.folder.path) as url,
+        httpx.Client(base_url=url, trust_env=False) as client,
+    ):
+
+        def post(season: str, data: bytes) -> tuple[int, str]:
+            answer = client.post(f"/api/seasons/{season}/entries", content=data)
+            return answer.status_code, answer.json().get("code", "")
+
+        assert post(SEASON.id, signed.to_bytes()) == (422, "artefact_missing")
+        header = {"Authorization": authorization(url, key, digest(GOOD))}
+        put = client.put(f"/api/objects/{digits}", content=GOOD, headers=header)
+        assert put.status_code == 201
+        assert post("winter", signed.to_bytes()) == (404, "season_unknown")
+        assert post(SEASON.id, elsewhere.to_bytes()) == (404, "season_unknown")
+        assert post(SEASON.id, changed) == (403, "bad_signature")
+        assert post(SEASON.id, b"{") == (400, "not_json")
+        assert [post(SEASON.id, signed.to_bytes()) for _ in range(2)] == [(201, ""), (200, "")]
+        assert client.get(f"/api/objects/{digits}").status_code == 404  # nobody copies answers
+    assert [row.entrant.id for row in store.entrants(SEASON.digest)] == [signed.id]
 
 
 def test_a_changed_entry_has_no_valid_signature(store, key):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -269,6 +270,33 @@ def test_an_entrants_name_is_nobody_elses(store, key):
         signed_entry(store, season, key, [None, None], submitter={"name": "Ada", "key": key.public})
     )
     assert store.holder_of_name("ADA") == key.public
+
+
+def test_an_entry_and_a_reveal_of_processes_that_die_are_logged_or_not(tmp_path: Path, key, later):
+    season = tiny_season()
+    with tiny_board(tmp_path / "board") as store:
+        store.announce(season)
+        entry = signed_entry(store, season, key, [None, None])
+
+    def after_every_death(work: Callable[[Store], object]) -> Store:
+        def run() -> None:
+            with Store.open(tmp_path / "board") as opened:
+                work(opened)
+
+        call = 0
+        while crashes_before(call, run):
+            call += 1
+        assert call > 3
+        return Store.open(tmp_path / "board", read_only=True)
+
+    with after_every_death(lambda store: store.enter(entry)) as store:
+        assert [row.entrant.id for row in store.entrants(season.digest)] == [entry.id]
+    later()
+    with after_every_death(lambda store: store.reveal(reveal(season))) as store:
+        assert store.revealed_master(season.id) == MASTER
+    with after_every_death(lambda store: store.rank(failed(season, entry.id))) as store:
+        assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
+    assert verify(tmp_path / "board").unlogged == 0
 
 
 def test_a_ticket_started_by_a_process_that_dies_is_started_or_not(tmp_path: Path, key):
