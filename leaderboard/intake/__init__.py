@@ -1,7 +1,7 @@
 """What a board accepts: uploads, submissions, sealed entries, and its own reference rows."""
 
 from leaderboard.intake.admission import admit, receive, submit_bundle
-from leaderboard.intake.entries import enter
+from leaderboard.intake.entries import enter, receive_entry
 from leaderboard.intake.references import submit_references
 from leaderboard.intake.refusals import Refusals
 from leaderboard.intake.tickets import start_ticket
@@ -14,6 +14,7 @@ __all__ = [
     "check_upload",
     "enter",
     "receive",
+    "receive_entry",
     "start_ticket",
     "submit_bundle",
     "submit_references",

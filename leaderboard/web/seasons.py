@@ -76,6 +76,7 @@ class SeasonRoutes:
         self._threads, self._challenges = CapacityLimiter(_WORKERS), CapacityLimiter(_CHALLENGES)
         self._requests = limits.Turns(_REQUESTS)
         self._entries = limits.Turns(_REQUESTS)
+        self._refusals = intake.Refusals()
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -153,15 +154,8 @@ class SeasonRoutes:
 
         def enter() -> tuple[str, bool]:
             envelope = Envelope.read(text, SignedEntry)
-            signed = envelope.open()
-            digest = self._store.season_row(name).digest
-            if signed.entry.season != digest:
-                raise Rejection(
-                    "season_unknown",
-                    f"season={signed.entry.season}: the entry was sent to the season {digest}. "
-                    "Send it to its own.",
-                )
-            return signed.id, intake.enter(self._store, signed)
+            season = self._store.season_row(name).digest
+            return envelope.id, intake.receive_entry(self._store, envelope, season, self._refusals)
 
         id, new = await self._entries.run(enter)
         return JSONResponse({"id": id}, 201 if new else 200)

@@ -112,6 +112,21 @@ def test_bad_entries_are_refused_with_stable_codes(store, key):
     assert refused(store, entry(store, other, None, None, **name)) == "name_taken"
 
 
+def test_refused_entries_of_a_server_count_for_their_key(tmp_path: Path, key):
+    refusals = intake.Refusals()
+    with tiny_board(tmp_path / "small", limits={"submissions_per_day": 2}) as store:
+        store.announce(SEASON)
+        codes = []
+        for note in ("1", "2", "3"):
+            envelope = Envelope.read(
+                entry(store, key, GOOD, None, statement=note).to_bytes(), SignedEntry
+            )
+            with pytest.raises(Rejection) as error:
+                intake.receive_entry(store, envelope, SEASON.digest, refusals)
+            codes.append(error.value.code)
+        assert codes == ["artefact_missing", "artefact_missing", "quota"]
+
+
 def test_entries_over_http_have_the_same_codes(store, key):
     signed, digits = entry(store, key, GOOD, None), digest(GOOD)[7:]
     elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
