@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
+import signal
 import threading
 import time
 from collections.abc import Collection, Iterator
@@ -111,6 +112,7 @@ class Attendant:
 
 def _score(board: Path, season: str, secret: Path, number: int) -> None:
     """Score a ticket and log its result, in a process of its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends it
     try:
         with Store.open(board) as store:
             result = score_ticket(store, store.season(season), Master.read(secret), number)

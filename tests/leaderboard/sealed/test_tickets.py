@@ -284,6 +284,23 @@ def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPat
     played.step(2)
 
 
+def test_answers_that_do_not_fit_the_disk_are_not_stored(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.finish()
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "link", full)
+    half = np.full((ROWS, 1), 0.5)
+    refused("storage_full", played.answer, half)
+    monkeypatch.undo()
+    played.restart()
+    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
+    assert played.answer(half)
+
+
 def test_instances_used_long_ago_leave_memory_and_go_on(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
