@@ -75,13 +75,12 @@ class Connection:
             except ssl.SSLCertVerificationError as error:
                 raise SealedError("unreachable", f"{self._address.url}: {error}.") from None
             except (OSError, http.client.HTTPException) as error:
-                self.close()
                 reason = str(error) or type(error).__name__
                 if reused:  # a server closes connections that have been idle
                     continue
             else:
                 self._answered = True
-                if status == 200 or status == 201:
+                if status in (200, 201):
                     return data
                 code, message = _reason_in(data, status)
                 if status not in _TRANSIENT:
@@ -112,19 +111,22 @@ class Connection:
     def _exchange(self, method: str, path: str, body: bytes, most: int) -> tuple[int, bytes]:
         if self._http is None:
             self._http = self._new()
-        self._http.request(method, self._address.path + path, body, self._headers)
-        with self._http.getresponse() as answer:
-            data = answer.read(max(most, _JSON_BYTES) + 1)
-            if len(data) > max(most, _JSON_BYTES):
-                self.close()
-                raise SealedError(
-                    "wire", f"{self._address.url}: answered with more than {most:,} bytes."
-                )
-            if answer.length:  # `read` does not raise where the connection was lost
-                raise http.client.IncompleteRead(data, answer.length)
-            if answer.will_close:
-                self.close()
-            return answer.status, data
+        try:
+            self._http.request(method, self._address.path + path, body, self._headers)
+            with self._http.getresponse() as answer:
+                data = answer.read(max(most, _JSON_BYTES) + 1)
+                if len(data) > max(most, _JSON_BYTES):
+                    raise SealedError(
+                        "wire", f"{self._address.url}: answered with more than {most:,} bytes."
+                    )
+                if answer.length:  # `read` does not raise where the connection was lost
+                    raise http.client.IncompleteRead(data, answer.length)
+        except BaseException:  # an interrupt, too: the rest of this answer is none to the next
+            self.close()
+            raise
+        if answer.will_close:
+            self.close()
+        return answer.status, data
 
     def _new(self) -> http.client.HTTPConnection:
         """A new connection, through the proxy that the environment names, if there is one."""

@@ -120,7 +120,16 @@ class Instance:
           SealedError: the server refuses it, or gives no answer.
         """
         body = self._format.pack_request(self.number + 1, actions)
-        data = self._request("POST", "steps", body, most=self._format.answer_bytes)
+        try:
+            data = self._request("POST", "steps", body, most=self._format.answer_bytes)
+        except SealedError as error:
+            if error.code not in ("step_conflict", "step_ahead"):
+                raise
+            raise SealedError(
+                error.code,
+                f"{error.message} Call `begin` (of an environment, `reset`) to go on from the "
+                "present observation; no other process may step the instance.",
+            ) from None
         self.number += 1
         return self._format.unpack_steps(data)
 

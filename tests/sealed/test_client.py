@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import pickle
 import subprocess
 import sys
@@ -193,6 +194,26 @@ def test_a_board_that_is_started_again_goes_on(tmp_path: Path, waits: list[float
         assert np.array_equal(resumed.reset()[0], here._batch.observe())
         for actions in random_actions(2, 5):
             assert np.array_equal(here.step(actions)[0], resumed.step(actions)[0])
+
+
+def test_after_an_interrupted_step_a_reset_goes_on(server, monkeypatch):
+    hidden = sealed.make_vec(server.behind, server.ticket, 0, 2)  # the relay is a client, too
+    hidden.reset()
+    first, second, third = random_actions(2, 3)
+    read = http.client.HTTPResponse.read
+
+    def interrupted(*_: object) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(http.client.HTTPResponse, "read", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        hidden.step(first)
+    monkeypatch.setattr(http.client.HTTPResponse, "read", read)
+    with pytest.raises(SealedError, match=r"step_conflict: .* Call `begin` \(.* `reset`\)"):
+        hidden.step(second)
+    here = server.local(0, 2)
+    assert np.array_equal(hidden.reset()[0], here.step(first)[0])
+    assert np.array_equal(hidden.step(third)[0], here.step(third)[0])
 
 
 def test_reset_does_not_cut_an_episode_short(server):
