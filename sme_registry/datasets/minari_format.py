@@ -11,6 +11,7 @@ These are of fixed size, so Minari cannot append steps to an existing episode.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -239,10 +240,11 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
             parts.setdefault(name, []).append(array)
 
     with h5py.File(path, "r") as file:
+        arrays = _Arrays(path)
         for number in range(record.trajectories):
             episode = file[f"episode_{number}"]
-            truncations = _get(episode.id, "truncations")
-            add(**(seen := _visible(episode.id)))
+            truncations = arrays.get(episode.id, "truncations")
+            add(**(seen := arrays.visible(episode.id)))
             add(
                 timeouts=truncations & ~seen["terminations"],
                 episodes=np.full(len(truncations), number, np.int64),
@@ -250,43 +252,112 @@ def read_hdf5(path: Path, record: DatasetRecord) -> Transitions:
             )
             infos = h5py.h5g.open(episode.id, b"infos")
             for info, (before, after) in _position_infos(spec).items():
-                positions = _get(infos, info)
+                positions = arrays.get(infos, info)
                 add(**{before: positions[:-1], after: positions[1:]})
             for info, name in _infos(spec).items():
-                add(**{name: _get(infos, info)[:-1]})
-    return Transitions(**{name: np.concatenate(arrays) for name, arrays in parts.items()})
+                add(**{name: arrays.get(infos, info)[:-1]})
+    return Transitions(**{name: np.concatenate(column) for name, column in parts.items()})
 
 
 def read_visible(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a `main_data.hdf5` that agents see, with the truncations.
 
+    The file may be a stranger's: it is read only as far as it is what `hdf5_content` writes.
+
     Raises:
-      OSError, KeyError, ValueError, RuntimeError: h5py cannot read it, or a part is missing.
+      OSError, KeyError, ValueError, RuntimeError, MemoryError: h5py cannot read it, a part is
+        missing, or not as it is written.
     """
     import h5py
 
+    if not path.is_file():  # a pipe would be waited for
+        raise OSError("no such file")
     with h5py.File(path, "r") as file:
-        episodes = [file[f"episode_{number}"].id for number in range(len(file))]
-        parts = [{**_visible(each), "truncations": _get(each, "truncations")} for each in episodes]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        arrays = _Arrays(path)
+        parts = []
+        for number in range(len(file)):
+            name = f"episode_{number}"
+            _refuse_link(file.id, name)
+            episode = h5py.h5g.open(file.id, name.encode())
+            columns = {
+                **arrays.visible(episode),
+                "truncations": arrays.get(episode, "truncations"),
+            }
+            _refuse_other_columns(name, columns)
+            parts.append(columns)
+    if not parts:
+        raise ValueError("it has no episodes")
+    return {name: np.concatenate([part[name] for part in parts]) for name in _VISIBLE}
 
 
-def _visible(episode: Any) -> dict[str, npt.NDArray[Any]]:
-    """The columns of an episode's group that an agent sees, without truncations."""
-    observations = _get(episode, "observations")
-    return {
-        "observations": observations[:-1],
-        "actions": _get(episode, "actions"),
-        "rewards": _get(episode, "rewards"),
-        "next_observations": observations[1:],
-        "terminations": _get(episode, "terminations"),
-    }
+_VISIBLE = {  # type and number of dimensions
+    "observations": (np.float32, 2),
+    "actions": (np.float32, 2),
+    "rewards": (np.float64, 1),
+    "next_observations": (np.float32, 2),
+    "terminations": (np.bool_, 1),
+    "truncations": (np.bool_, 1),
+}
 
 
-def _get(group: Any, name: str) -> npt.NDArray[Any]:
+def _refuse_other_columns(episode: str, columns: dict[str, npt.NDArray[Any]]) -> None:
+    steps = len(columns["rewards"])
+    for name, (dtype, ndim) in _VISIBLE.items():
+        column = columns[name]
+        if column.dtype != dtype or column.ndim != ndim or len(column) != steps:
+            raise ValueError(
+                f"{episode}: its {name} are {column.dtype} of shape {column.shape}: must be "
+                f"{np.dtype(dtype)} in {ndim} dimensions, of {steps} steps"
+            )
+
+
+def _refuse_link(group: Any, name: str) -> None:
     import h5py
 
-    stored = h5py.h5d.open(group, name.encode())
-    array = np.empty(stored.shape, stored.dtype)
-    stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
-    return array
+    if group.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:  # may lead to other files
+        raise ValueError(f"{name}: is a link")
+
+
+class _Arrays:
+    """Reads the arrays of a file, of which each must lie in the file as plain numbers.
+
+    HDF5 could otherwise take them from any file of this machine (external storage, links), invent
+    them (chunks that were never written), or make pointers of them (texts of variable length).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._left = path.stat().st_size
+
+    def get(self, group: Any, name: str) -> npt.NDArray[Any]:
+        """An array of a group. Raises ValueError if it is not what `hdf5_content` writes."""
+        import h5py
+
+        _refuse_link(group, name)
+        stored = h5py.h5d.open(group, name.encode())
+        plan, dtype, shape = stored.get_create_plist(), stored.dtype, stored.shape
+        size = math.prod(shape) * dtype.itemsize
+        self._left -= size
+        if (
+            dtype.kind not in "biuf"
+            or plan.get_layout() != h5py.h5d.CONTIGUOUS
+            or plan.get_external_count()
+            or stored.get_storage_size() != size
+            or self._left < 0
+        ):
+            raise ValueError(
+                f"{name}: {dtype} of shape {shape} that the file does not hold as such"
+            )
+        array = np.empty(shape, dtype)
+        stored.read(h5py.h5s.ALL, h5py.h5s.ALL, array)
+        return array
+
+    def visible(self, episode: Any) -> dict[str, npt.NDArray[Any]]:
+        """The columns of an episode's group that an agent sees, without truncations."""
+        observations = self.get(episode, "observations")
+        return {
+            "observations": observations[:-1],
+            "actions": self.get(episode, "actions"),
+            "rewards": self.get(episode, "rewards"),
+            "next_observations": observations[1:],
+            "terminations": self.get(episode, "terminations"),
+        }

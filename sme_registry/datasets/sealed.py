@@ -84,7 +84,7 @@ class SealedDataset:
         file = Path(path) / "data" / DATA
         try:
             return cls(**read_visible(file))
-        except (OSError, KeyError, ValueError, RuntimeError) as error:
+        except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
             raise MalformedDocumentError(
                 f"{file}: cannot be read: {str(error).strip(chr(39))}. Download the data set again."
             ) from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import minari
@@ -101,3 +102,78 @@ def test_nothing_is_replaced_and_a_bad_id_or_file_is_named(
     (path / "data" / "main_data.hdf5").write_bytes(b"garbage")
     with pytest.raises(MalformedDocumentError, match="Download the data set again"):
         SealedDataset.read(path)
+
+
+def _external(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", shape=(2, 4), dtype="f4", external=[(str(secret), 0, 32)])
+
+
+def _huge(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", shape=(10**11, 4), dtype="f4", chunks=(1000, 4))
+
+
+def _texts(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", shape=(2,), dtype=h5py.string_dtype())
+
+
+def _unaligned(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=np.zeros((7, 4), "f4"))
+
+
+def _doubles(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=np.zeros((2, 4), "f8"))
+
+
+def _linked(group: h5py.Group, secret: Path) -> None:
+    with h5py.File(secret.with_suffix(".hdf5"), "w") as other:
+        other["private"] = np.ones((2, 4), "f4")
+    group["observations"] = h5py.ExternalLink(str(secret.with_suffix(".hdf5")), "private")
+
+
+def _plain(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=np.zeros((2, 4), "f4"))
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (_external, "observations: float32"),
+        (_huge, "observations: float32"),
+        (_texts, "observations: object"),
+        (_unaligned, "observations are float32"),
+        (_doubles, "observations are float64"),
+        (_linked, "observations: is a link"),
+        (_plain, None),
+    ],
+)
+def test_a_strangers_file_is_read_only_as_it_would_be_written(
+    tmp_path: Path, fault: Any, message: str | None
+) -> None:
+    secret = tmp_path / "private.txt"
+    secret.write_bytes(b"a private file of the entrant ...")
+    (tmp_path / "data").mkdir()
+    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+        group = file.create_group("episode_0")
+        fault(group, secret)
+        group["actions"] = np.zeros((1, 1), "f4")
+        group["rewards"] = np.zeros(1)
+        group["terminations"] = group["truncations"] = np.zeros(1, bool)
+    if message is None:
+        assert len(SealedDataset.read(tmp_path)) == 1
+        return
+    with pytest.raises(MalformedDocumentError, match=message):
+        SealedDataset.read(tmp_path)
+
+
+def test_episodes_that_share_their_bytes_do_not_multiply(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+        group = file.create_group("episode_0")
+        group["observations"] = np.zeros((20_001, 4), "f4")
+        group["actions"] = np.zeros((20_000, 1), "f4")
+        group["rewards"] = np.zeros(20_000)
+        group["terminations"] = group["truncations"] = np.zeros(20_000, bool)
+        for number in range(1, 20):
+            file[f"episode_{number}"] = group
+    with pytest.raises(MalformedDocumentError, match="does not hold"):
+        SealedDataset.read(tmp_path)
