@@ -45,6 +45,7 @@ RULES: Final = 2
 
 FILE = "board.json"
 KEY = "board.key"
+STEPPING = ".stepping"
 MAX_BYTES = 2**20
 """Of board.json; that of the largest suite that fits a board has about a tenth."""
 
@@ -287,6 +288,7 @@ class SeasonFolder:
         tickets/<number>/ticket.json  signed requests of an online season, by the ticket's number
         results/<64 hex>.json         by the id of the entry or request
         reveal.json                   the master, after the close
+        .stepping                     the lock of the server that steps it
 
     Answers of entries are among the board's objects.
 
@@ -301,6 +303,7 @@ class SeasonFolder:
         self.tickets = path / "tickets"
         self.results = path / "results"
         self.reveal = path / "reveal.json"
+        self.stepping = path / STEPPING
 
     def entry(self, id: str) -> Path:
         """The path of an entry, by its id."""

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from leaderboard.documents.board import STEPPING
 from leaderboard.documents.entry import SignedEntry, SignedSealed, SignedTicketRequest
 from leaderboard.errors import TamperedError
 from leaderboard.store import Index, SealedRow, SeasonRow, read_document
@@ -22,8 +23,8 @@ _FILES = (
     rf"({_HEX})/results/({_HEX})\.json",
     rf"({_HEX})/tickets/({_NUMBER})/ticket\.json",
 )
-_OF_TICKETS = rf"{_HEX}/tickets/{_NUMBER}/.+"
-"""Journals and answers, which results follow from and `sealed.verify_season` replays."""
+_OTHERS = rf"{_HEX}/(tickets/{_NUMBER}/.+|{re.escape(STEPPING)})"
+"""Journals and answers, which `sealed.verify_season` replays, and the lock of a server."""
 
 
 def count_unlogged_of_seasons(index: Index) -> int:
@@ -37,7 +38,7 @@ def count_unlogged_of_seasons(index: Index) -> int:
         name = path.relative_to(root).as_posix()
         matches = [re.fullmatch(pattern, name) for pattern in _FILES]
         found = next((match for match in matches if match is not None), None)
-        if found is None and re.fullmatch(_OF_TICKETS, name) is None:
+        if found is None and re.fullmatch(_OTHERS, name) is None:
             raise TamperedError(f"{root.name}/{name}", "is not a file of a board")
         if found is not None and not _is_logged(index, name, *found.groups()):
             unlogged += 1

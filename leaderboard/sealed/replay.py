@@ -7,7 +7,7 @@ from their answers, of tickets also from their journals of actions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -15,7 +15,7 @@ from typing import NoReturn
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Season
-from leaderboard.errors import TamperedError
+from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.publication import published_digests
 from leaderboard.scoring.rescore import RESCORED
 from leaderboard.scoring.sealed import instances, sealed_result
@@ -53,10 +53,12 @@ def verify_season(store: Store, name: str, progress: Progress | None = None) -> 
     Raises:
       TamperedError: names the first file that does not follow from the master and the entries.
       Rejection: `season_unknown`, or `season_not_closed` before the reveal.
+      BoardError: entries are not scored yet.
     """
     season, master = store.season(name), store.revealed_master(name)
     folder = store.season_folder(season.digest)
     rows, counted = store.entrants(season.digest), counting(store, season)
+    _refuse_unscored(season, counted)
     total, done = len(season.published) + len(rows), 0
 
     def advance() -> None:
@@ -76,14 +78,24 @@ def verify_season(store: Store, name: str, progress: Progress | None = None) -> 
     for row in rows:
         _check_signature(store, season, row)
         stored = store.sealed_result(row)
-        if (stored is not None) != (row in counted):
-            path = folder.result(row.entrant.id)
-            _refuse(store, path, "must exist for each entry that counts, and for no other")
         if stored is not None:
+            if row not in counted:
+                path = folder.result(row.entrant.id)
+                _refuse(store, path, "is of an entry that does not count")
             _compare(store, season, stored, _scored(store, season, master, row))
             results += 1
         advance()
     return SeasonReport(len(season.published), len(rows), results)
+
+
+def _refuse_unscored(season: Season, counted: Sequence[SealedRow]) -> None:
+    missing = sum(row.result is None for row in counted)
+    if missing:  # online, no reveal is logged before all results are
+        raise BoardError(
+            f"season={season.id}: {missing} of {len(counted)} entries that count have no result. "
+            "`sme-leaderboard season reveal`, which was interrupted, scores them when it is "
+            "repeated. Then verify again."
+        )
 
 
 def _check_signature(store: Store, season: Season, row: SealedRow) -> None:

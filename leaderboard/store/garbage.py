@@ -88,9 +88,9 @@ def collect_garbage(
 def make_room(store: Store, size: int, *, keep: str = "", older_than: float = 600.0) -> bool:
     """Remove artefacts that no submission names, until `size` more bytes fit onto the board.
 
-    Whoever has no submission on the board loses its uploads first, and then whoever has uploaded
-    nothing for longest. An upload's age is that of its key's last one, so that a key that uploads
-    many artefacts over a slow connection keeps the first of them.
+    Whoever has neither a submission nor an entry on the board loses its uploads first, and then
+    whoever has uploaded nothing for longest. An upload's age is that of its key's last one, so that
+    a key that uploads many artefacts over a slow connection keeps the first of them.
 
     Args:
       store: the board.
@@ -134,7 +134,8 @@ _UNNAMED = """
 SELECT digest, size, upload.key FROM upload
 JOIN (SELECT key, max(time) AS last FROM upload GROUP BY key) AS uploader USING (key)
 WHERE digest NOT IN (SELECT digest FROM object) AND key <> ? AND NOT (last > ? AND last <= ?)
-ORDER BY EXISTS (SELECT 1 FROM entry WHERE entry.key = upload.key), last, time, digest
+ORDER BY EXISTS (SELECT 1 FROM entry WHERE entry.key = upload.key)
+  OR EXISTS (SELECT 1 FROM sealed WHERE sealed.key = upload.key), last, time, digest
 """
 
 

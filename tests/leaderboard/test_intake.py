@@ -26,6 +26,7 @@ from tests.leaderboard.conftest import (
     tiny_board,
     tiny_submission,
 )
+from tests.leaderboard.sealing import signed_entry, tiny_season
 
 Upload = Callable[[str, bytes, float], str]
 ANY_TIME = "2000-01-01T00:00:00Z"
@@ -731,6 +732,21 @@ def test_who_has_a_submission_keeps_uploads_longer(
     with store.transaction() as index:  # documents count, too
         index.connection.execute("UPDATE entry SET bytes = 100")
     assert used > 100
+    upload(key.public, b"1" * 400, 90)
+    upload(A, b"2" * 400, 20)
+    intake.check_upload(store, ME, 200)
+    assert left(store) == {b"1"}
+
+
+def test_who_has_entered_a_season_keeps_uploads_longer(
+    full: tuple[Store, Upload], key: SigningKey
+) -> None:
+    store, upload = full
+    season = tiny_season()
+    store.announce(season)
+    store.enter(signed_entry(store, season, key, [None, None]))
+    with store.transaction() as index:  # documents count, too
+        index.connection.execute("UPDATE sealed SET bytes = 100")
     upload(key.public, b"1" * 400, 90)
     upload(A, b"2" * 400, 20)
     intake.check_upload(store, ME, 200)

@@ -13,6 +13,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import TamperedError
 from leaderboard.scoring.season import season_rankings
+from leaderboard.scoring.verify import verify
 from leaderboard.sealed import verify_season
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
@@ -57,6 +58,7 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed: 
     with Store.open(revealed.path, read_only=True) as store:
         report = verify_season(store, revealed.season.id)
         assert (report.entries, report.results) == (2, 2)
+        assert verify(revealed.path).sealed == 2
         [row] = season_rankings(store, revealed.season, "wd_regret")["generic"]
         results = [store.sealed_result(each) for each in store.entrants(revealed.season.digest)]
     values = [result.scores.wd_regret.value for result in results if result is not None]
