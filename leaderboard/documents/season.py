@@ -46,11 +46,12 @@ class SealedData(StrictModel):
     """The data set of each instance of a class, of a sealed-offline season.
 
     Attributes:
-      nu: ν of the behaviour policy, a mixture of the optimum and a random network.
+      nu: ν of the behaviour policy, a mixture of the optimum and a random network. With 0 the
+        data set's actions would be the optimum.
       transitions: number of rows.
     """
 
-    nu: Annotated[Real, Field(ge=0, le=1)]
+    nu: Annotated[Real, Field(gt=0, le=1)]
     transitions: Annotated[Integer, Field(ge=1, le=10**7)]
 
 
@@ -123,6 +124,7 @@ class Terms(Document):
       ticket_hours: time from the start of a ticket to its deadline; null offline.
       tickets_per_key: the most tickets of one key; null offline.
       published: of each instance in order; empty online.
+      versions: of the organiser's packages, by which data sets are rounded.
     """
 
     schema_version: SchemaVersion = 1
@@ -137,6 +139,7 @@ class Terms(Document):
     ticket_hours: Annotated[Integer | None, Field(ge=1, le=8760)] = None
     tickets_per_key: Annotated[Integer | None, Field(ge=1, le=1000)] = None
     published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
+    versions: Annotated[dict[str, str], Field(default_factory=dict, max_length=16)]
 
     @model_validator(mode="after")
     def _classes_fit(self) -> Self:

@@ -13,7 +13,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.master import Master
@@ -21,9 +21,10 @@ from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_INSTANCES, Digests, Hidden, Season, Terms
 from leaderboard.errors import BoardError
 from leaderboard.scoring.sealed import Instance, challenge, instances
+from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.io import build_folder, read_json, to_json
+from sme_registry.io import build_folder, read_json, to_json, versions
 from sme_registry.sealed import instance_name, pack_table, table_bytes
 
 Progress = Callable[[int, int], None]
@@ -128,10 +129,19 @@ def create_season(
                 published.append(_publish(instance, plan.id, master, Path(building)))
                 if progress is not None:
                     progress(done, len(every))
-        fields = {**plan.to_dict(), "published": [each.to_dict() for each in published]}
+        fields = {
+            **plan.to_dict(),
+            "published": [each.to_dict() for each in published],
+            "versions": _versions(),
+        }
         season = Terms.from_dict(fields).commit(master)
         (Path(building) / SEASON).write_text(to_json(season.to_dict()))
     return season
+
+
+def _versions() -> dict[str, str]:
+    numba = ["numba"] if chosen_backend() == "numba" else []
+    return versions(["numpy", "scipy", *numba])
 
 
 def read_season(folder: str | os.PathLike[str]) -> Season:
@@ -159,26 +169,74 @@ def check_published(
     for done, (hidden, digests) in enumerate(
         zip(season.hidden, season.published, strict=False), start=1
     ):
-        data = SealedDataset.read(dataset_path(folder, season.id, hidden)).digest
+        path = dataset_path(folder, season.id, hidden)
+        data = SealedDataset.read(path)
+        _refuse_other_digest(path, data.digest, digests.data)
+        _refuse_other_sizes(path, data, hidden)
         path = challenge_path(folder, hidden)
-        for name, found, expected in (
-            (dataset_path(folder, season.id, hidden), data, digests.data),
-            (path, _file_digest(path, season, hidden), digests.challenge),
-        ):
-            if found != expected:
-                raise BoardError(
-                    f"{name}: has the digest {found[:19]}…: must be {expected[:19]}…, as in "
-                    f"{SEASON}. Download it again."
-                )
+        _refuse_other_digest(path, _file_digest(path, season, hidden), digests.challenge)
         if progress is not None:
             progress(done, len(season.published))
     return len(season.published)
 
 
-def published_digests(instance: Instance, master: Master) -> Digests:
-    """The digests of an instance's data set and challenge states, generated again."""
+def _refuse_other_digest(path: Path, found: str, expected: str) -> None:
+    if found != expected:
+        raise BoardError(
+            f"{path}: has the digest {found[:19]}…: must be {expected[:19]}…, as in {SEASON}. "
+            "Download it again."
+        )
+
+
+def _refuse_other_sizes(path: Path, data: SealedDataset, hidden: Hidden) -> None:
+    """Refuse a data set that is committed to, but is not what the season's terms promise."""
+    assert hidden.member.data is not None  # the track is offline
+    setting = hidden.member.setting
+    found = (*data.observations.shape, data.actions.shape[1])
+    promised = (hidden.member.data.transitions, setting.state_dim + 2, setting.action_dim)
+    if found != promised:
+        raise BoardError(
+            f"{path}: has {found} rows, observation entries and action channels: must have "
+            f"{promised}, as the terms in {SEASON} say. The organiser must create the season again."
+        )
+
+
+def follows(
+    instance: Instance,
+    master: Master,
+    expected: Digests,
+    folder: str | os.PathLike[str] | None = None,
+) -> Literal["exactly", "within rounding", "no"]:
+    """Whether what was published of an instance is what the master gives when generated again.
+
+    Args:
+      instance: the instance.
+      master: the season's secret.
+      expected: the digests in the season's document.
+      folder: a copy of all that was published, to compare data sets where digests differ: other
+        processors and other versions of NumPy round some rewards otherwise.
+
+    Raises:
+      BoardError: the data set's digest differs and there is no copy, or the copy has another.
+    """
     data, states = _generate(instance, master)
-    return _digests(instance.hidden, data, states)
+    again = _digests(instance.hidden, data, states)
+    if again == expected:
+        return "exactly"
+    if again.challenge != expected.challenge:
+        return "no"
+    name = name_of(instance.hidden)
+    if folder is None:
+        raise BoardError(
+            f"{name}: its data set, generated again on this machine, has the digest "
+            f"{again.data[:19]}…, and the published one {expected.data[:19]}…. Other processors "
+            "and other versions of packages round otherwise. Give the published folder, whose "
+            f"arrays are then compared: --published FOLDER. {SEASON} has the organiser's versions."
+        )
+    path = dataset_path(Path(folder), instance.place.season, instance.hidden)
+    published = SealedDataset.read(path)
+    _refuse_other_digest(path, published.digest, expected.data)
+    return "within rounding" if data.agrees_with(published) else "no"
 
 
 def _generate(instance: Instance, master: Master) -> tuple[SealedDataset, bytes]:

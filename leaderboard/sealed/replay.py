@@ -7,6 +7,7 @@ from their answers, of tickets also from their journals of actions.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from leaderboard.documents.master import Master
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Season
 from leaderboard.errors import BoardError, TamperedError
-from leaderboard.scoring.publication import published_digests
+from leaderboard.scoring.publication import follows
 from leaderboard.scoring.rescore import RESCORED
 from leaderboard.scoring.sealed import instances, sealed_result
 from leaderboard.scoring.season import counting, scored_entry
@@ -33,27 +34,37 @@ class SeasonReport:
 
     Attributes:
       instances: number whose data sets and challenge states were generated again.
+      rounded: of these, the number whose data sets are the published ones within rounding only.
       entries: number of entries or tickets whose signatures were checked.
       results: number that were scored again.
     """
 
     instances: int
+    rounded: int
     entries: int
     results: int
 
 
-def verify_season(store: Store, name: str, progress: Progress | None = None) -> SeasonReport:
+def verify_season(
+    store: Store,
+    name: str,
+    progress: Progress | None = None,
+    published: str | os.PathLike[str] | None = None,
+) -> SeasonReport:
     """Replay a revealed season from its master.
 
     Args:
       store: the board.
       name: id or digest of the season.
       progress: called with the number of instances and entries or tickets done, and of all.
+      published: a copy of the folder that was published, to compare data sets that this machine
+        rounds otherwise than the organiser's.
 
     Raises:
       TamperedError: names the first file that does not follow from the master and the entries.
       Rejection: `season_unknown`, or `season_not_closed` before the reveal.
-      BoardError: entries are not scored yet.
+      BoardError: entries are not scored yet, or a data set has another digest on this machine and
+        there is no copy to compare.
     """
     season, master = store.season(name), store.revealed_master(name)
     folder = store.season_folder(season.digest)
@@ -67,9 +78,12 @@ def verify_season(store: Store, name: str, progress: Progress | None = None) -> 
         if progress is not None:
             progress(done, total)
 
+    rounded = 0
     if season.published:
         for instance, expected in zip(instances(season, master), season.published, strict=True):
-            if published_digests(instance, master) != expected:
+            agreement = follows(instance, master, expected, published)
+            rounded += agreement == "within rounding"
+            if agreement == "no":
                 where = f"published: {expected.class_name} {expected.instance}"
                 message = "its data set or challenge states do not follow from the master"
                 _refuse(store, folder.season, f"{where}: {message}")
@@ -85,7 +99,7 @@ def verify_season(store: Store, name: str, progress: Progress | None = None) -> 
             _compare(store, season, stored, _scored(store, season, master, row))
             results += 1
         advance()
-    return SeasonReport(len(season.published), len(rows), results)
+    return SeasonReport(len(season.published), rounded, len(rows), results)
 
 
 def _refuse_unscored(season: Season, counted: Sequence[SealedRow]) -> None:

@@ -33,6 +33,8 @@ from sme_registry.envs.types import Array, Mask, Observation
 from sme_registry.errors import MalformedDocumentError, NameTakenError
 from sme_registry.task import materialize
 
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class SealedDataset:
@@ -101,6 +103,19 @@ class SealedDataset:
     def digest(self) -> str:
         """`sha256:` and 64 hex digits over the names, types, shapes and bytes of all arrays."""
         return digest_of(self.columns())
+
+    def agrees_with(self, other: Self) -> bool:
+        """Whether the other has the same transitions, up to what machines round differently.
+
+        The same recipe gives rewards that differ by some 1e-14 where NumPy's linear algebra, or
+        the back-end, is another one. Numbers may differ by 1e-6, the rounding of float32; the ends
+        of episodes must be the same.
+        """
+        columns = other.columns()
+        return all(
+            mine.shape == columns[name].shape and np.allclose(mine, columns[name], 0, _ROUNDING)
+            for name, mine in self.columns().items()
+        )
 
     def write(self, dataset_id: str, folder: str | os.PathLike[str]) -> Path:
         """Write the data set in Minari's format, completely or not at all.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +200,7 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
     assert fitted[0].entry.oracle_like
     report = verify_season(store, season.id)
-    assert (report.instances, report.entries, report.results) == (2, 4, 3)
+    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 4, 3)
 
 
 def test_a_score_is_that_of_the_open_board(store, key, published, later) -> None:
@@ -249,8 +251,62 @@ def test_a_replay_finds_scores_and_data_that_do_not_follow(tmp_path: Path, key, 
     with tiny_board(tmp_path / "other") as store:
         false = type(season.terms).from_dict(fields).commit(MASTER)
         monkey_open(store, false)
-        with pytest.raises(TamperedError, match="published: deep 1"):
+        with pytest.raises(BoardError, match="--published FOLDER"):
             verify_season(store, false.id)
+        other = dataset_path(tmp_path / "copy", false.id, list(false.hidden)[1])
+        shutil.copytree(published, tmp_path / "copy")
+        shutil.rmtree(other)
+        shutil.copytree(other.with_name("deep-0-v0"), other)
+        with pytest.raises(TamperedError, match="published: deep 1"):
+            verify_season(store, false.id, published=tmp_path / "copy")
+
+
+def test_another_machines_rounding_is_told_from_other_data(tmp_path, published, later) -> None:
+    """As if the organiser's processor had rounded rewards otherwise than this one."""
+    later()
+    season = read_season(published)
+    folder = tmp_path / "copy"
+    shutil.copytree(published, folder)
+    fields = season.terms.to_dict()
+    for number, (hidden, error) in enumerate(zip(season.hidden, (1e-14, 1e-4), strict=True)):
+        path = dataset_path(folder, season.id, hidden)
+        data = SealedDataset.read(path)
+        data = dataclasses.replace(data, rewards=data.rewards + error)
+        shutil.rmtree(path)
+        data.write(f"sealed/{season.id}/deep-{number}-v0", folder / "datasets")
+        fields["published"][number]["data"] = data.digest
+    for instances_, message in ((1, None), (2, "published: deep 1")):
+        terms = {**fields, "published": fields["published"][:instances_]}
+        terms["classes"][0]["instances"] = instances_
+        rounded = type(season.terms).from_dict(terms).commit(MASTER)
+        with tiny_board(tmp_path / str(instances_)) as store:
+            monkey_open(store, rounded)
+            with pytest.raises(BoardError, match=r"deep-0: .* --published FOLDER"):
+                verify_season(store, season.id)
+            with pytest.raises(BoardError, match="Download it again"):
+                verify_season(store, season.id, published=published)
+            if message is None:
+                report = verify_season(store, season.id, published=folder)
+                assert (report.instances, report.rounded) == (1, 1)
+                continue
+            with pytest.raises(TamperedError, match=message):
+                verify_season(store, season.id, published=folder)
+
+
+def test_a_data_set_of_another_size_than_promised_is_refused(
+    tmp_path: Path, published: Path
+) -> None:
+    season = read_season(published)
+    fields = season.to_dict()
+    fields["classes"][0]["data"]["transitions"] = 301
+    with pytest.raises(BoardError, match=r"has \(300, 4, 1\) .* must have \(301, 4, 1\)"):
+        check_published(Season.from_dict(fields), published)
+
+
+def test_a_season_has_the_versions_that_it_was_generated_with(published: Path) -> None:
+    versions = read_season(published).versions
+    assert versions["numpy"] == np.__version__
+    assert {"sme_registry", "python", "scipy"} <= set(versions)
 
 
 def monkey_open(store: Store, season: Season) -> None:

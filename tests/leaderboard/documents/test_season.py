@@ -49,6 +49,12 @@ def offline(**fields: Any) -> dict[str, Any]:
     return online(**{**own, **fields})
 
 
+def test_a_data_set_of_the_optimum_itself_is_refused() -> None:
+    member = offline()["classes"][0] | {"data": {"nu": 0, "transitions": 100}}
+    with pytest.raises(SpecError, match=r"data\.nu"):
+        Terms.from_dict(offline(classes=[member]))
+
+
 def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term() -> None:
     for fields in (online(), offline()):
         season = Terms.from_dict(fields).commit(MASTER)
