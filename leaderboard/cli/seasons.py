@@ -81,12 +81,18 @@ def new(
 
       sme-leaderboard season new board plan.json --out autumn
     """
-    from leaderboard.scoring.publication import create_season, read_plan, refuse_large_answers
+    from leaderboard.scoring.publication import (
+        create_season,
+        read_plan,
+        refuse_large_answers,
+        refuse_unrankable,
+    )
     from leaderboard.store import Store
 
     fields = read_plan(read_json(plan), str(plan))
     with Store.open(board, read_only=True) as store:
         refuse_large_answers(fields, store.document.limits.artefact_bytes)
+        refuse_unrankable(fields, store.document.runs_to_rank)
     folder = Path(fields.id) if out_folder is None else out_folder
     refuse_existing(folder)
     path = _secret(board, fields.id, secret)
@@ -258,6 +264,8 @@ def show(
 
       sme-leaderboard season show board autumn --metric ood_regret
     """
+    from leaderboard.scoring.ranking import REASONS
+
     with open_board(board) as store:
         if season is None:
             rows = [_facts(store, row) for row in store.seasons()]
@@ -279,17 +287,21 @@ def show(
     for knowledge, entries in rankings.items():
         if not entries:
             continue
-        columns = ("rank", "method", "submitter", "value", "low", "high")
-        table = Table(f"{LABELS[metric]}, knowledge: {knowledge}", dict.fromkeys(columns, "text"))
+        heads = ("rank", "method", "submitter", "value", "low", "high", "methods", "entrants")
+        table = Table(f"{LABELS[metric]}, knowledge: {knowledge}", dict.fromkeys(heads, "text"))
         for entry in entries:
             numbers = (entry[name] for name in ("value", "low", "high"))
             table.add_row(
-                entry["ranks"],
+                entry["ranks"] or REASONS[entry["reason"]],
                 escape(f"{entry['method']} {entry['version']}"),
                 escape(entry["submitter"]),
                 *("" if number is None else fixed(number) for number in numbers),
+                str(entry["methods_of_key"]),
+                str(entry["entrants_of_key"]),
             )
         out().print(table)
+    if any(rankings.values()):
+        out().print("methods, entrants: of the same key in this season.")
 
 
 def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
@@ -312,12 +324,14 @@ def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
 
 
 def _rankings(store: Store, season: Season, metric: Metric) -> dict[str, list[dict[str, Any]]]:
-    from leaderboard.scoring.season import season_rankings
+    from leaderboard.scoring.season import by_key, season_rankings
 
+    keys = by_key(store, season)
     return {
         knowledge: [
             {
                 "ranks": row.ranks,
+                "reason": row.reason,
                 "method": row.entry.method,
                 "version": row.entry.version,
                 "submitter": row.entry.submitter,
@@ -325,6 +339,8 @@ def _rankings(store: Store, season: Season, metric: Metric) -> dict[str, list[di
                 "low": row.value.low,
                 "high": row.value.high,
                 "oracle_like": row.entry.oracle_like,
+                "methods_of_key": keys[row.entry.key].methods,
+                "entrants_of_key": keys[row.entry.key].entrants,
                 "id": row.entry.id,
             }
             for row in rows

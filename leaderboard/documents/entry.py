@@ -14,7 +14,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.season import MAX_INSTANCES
+from leaderboard.documents.season import MAX_OFFLINE_INSTANCES
 from leaderboard.documents.submission import Artefact, Manifest, Method, SignedManifest
 from sme_registry.spec import Digest
 
@@ -47,7 +47,8 @@ class Entry(SealedManifest):
     """
 
     answers: Annotated[
-        tuple[Artefact | None, ...], Field(strict=False, min_length=1, max_length=MAX_INSTANCES)
+        tuple[Artefact | None, ...],
+        Field(strict=False, min_length=1, max_length=MAX_OFFLINE_INSTANCES),
     ]
 
     def signed(self, key: SigningKey, board: str | None = None) -> SignedEntry:

@@ -34,7 +34,10 @@ from sme_registry.spec import (
 
 LEAST_COMPLEXITY = 5
 MAX_INSTANCES = 1000
-"""Of all classes: a ticket, or an entry, has a run on each."""
+"""Of all classes: a ticket has a run on each."""
+
+MAX_OFFLINE_INSTANCES = 400
+"""Of a sealed-offline season: an entry lists an answer of each, in at most 64 KiB."""
 
 MAX_LANES = 256
 """Of an instance that the server steps: the most copies that one request advances."""
@@ -147,12 +150,13 @@ class Terms(Document):
         if len(set(names)) < len(names):
             raise ValueError(f"classes={names}: must have different names. Rename one.")
         count = sum(member.instances for member in self.classes)
-        if count > MAX_INSTANCES:
-            raise ValueError(
-                f"classes: have {count:,} instances: must be at most {MAX_INSTANCES:,} together. "
-                "Use fewer."
-            )
         online = self.track == "sealed-online"
+        most = MAX_INSTANCES if online else MAX_OFFLINE_INSTANCES
+        if count > most:
+            raise ValueError(
+                f"classes: have {count:,} instances: must be at most {most:,} together on the "
+                f"track {self.track}. Use fewer."
+            )
         for member in self.classes:
             for field, wanted in (("budget", online), ("data", not online)):
                 if (getattr(member, field) is not None) != wanted:

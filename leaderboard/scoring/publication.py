@@ -63,6 +63,23 @@ def refuse_large_answers(terms: Terms, limit: int) -> None:
             )
 
 
+def refuse_unrankable(terms: Terms, runs_to_rank: int) -> None:
+    """Refuse a season in which nobody can have the runs that a board's ranks need.
+
+    Raises:
+      BoardError: names the class.
+    """
+    for member in terms.classes:
+        most = member.instances * (terms.tickets_per_key or 1)
+        if most < runs_to_rank:
+            raise BoardError(
+                f"classes.{member.name}: a key has at most {most} runs in it: must be at least "
+                f"{runs_to_rank}, which a rank on this board needs. Use more instances"
+                f"{' or tickets_per_key' if terms.track == 'sealed-online' else ''}, or a board "
+                "for practice."
+            )
+
+
 def read_plan(plan: Any, source: str = "plan") -> Terms:
     """The terms of a season whose data sets and challenge states are not generated yet.
 

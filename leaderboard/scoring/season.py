@@ -1,15 +1,18 @@
 """A season's end: which entries count, their scores after the reveal, and the rankings.
 
-    offline   of each key and method the last entry before the close counts
+    offline   of each key and method the entry before the close that was signed last counts
     online    every ticket of a key and method counts: its runs are those of all of them
 
-Methods that declare knowledge of the family are ranked apart from those that declare none.
+Methods that have ever declared knowledge of the family are ranked apart from those that have not.
+A rank needs the board's `runs_to_rank` runs in each class, over all tickets.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.board import RULES
@@ -28,16 +31,34 @@ Progress = Callable[[int, int], None]
 KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 """Ranked apart, in this order."""
 
-_ORDER: tuple[str, ...] = KNOWLEDGE
-
 
 def counting(store: Store, season: Season) -> list[SealedRow]:
     """The entries or tickets that count, in the log's order."""
     rows = store.entrants(season.digest)
     if season.track == "sealed-online":
         return rows
-    last = {_method(row): row for row in rows if row.entrant.received < season.closes}
+    last: dict[tuple[str, str], SealedRow] = {}
+    for row in rows:
+        other = last.get(_method(row), row)
+        # One that was signed before and delivered later is nobody's last word.
+        if row.entrant.received < season.closes and row.created >= other.created:
+            last[_method(row)] = row
     return sorted(last.values(), key=lambda row: row.number)
+
+
+class OfKey(NamedTuple):
+    """How often a key takes part in a season: who tries often is lucky once."""
+
+    methods: int
+    entrants: int
+
+
+def by_key(store: Store, season: Season) -> dict[str, OfKey]:
+    """The numbers of methods, and of entries or tickets, of each key in a season."""
+    rows = store.entrants(season.digest)
+    methods = Counter(key for key, _ in {_method(row) for row in rows})
+    entrants = Counter(row.entrant.key for row in rows)
+    return {key: OfKey(methods[key], count) for key, count in entrants.items()}
 
 
 def score_entries(store: Store, name: str, progress: Progress | None = None) -> int:
@@ -71,7 +92,14 @@ def season_rankings(
 ) -> dict[Knowledge, list[RankedRow]]:
     """The rankings of a season's methods with results, one for each declared knowledge."""
     rows = [row for row in counting(store, season) if row.result is not None]
-    entries = _methods(store, season, rows)
+    known: dict[tuple[str, str], Knowledge] = {}
+    for row in store.entrants(season.digest):  # whoever has known the family once, knows it
+        if row.entrant.knowledge == "family":
+            known[_method(row)] = "family"
+    entries = [
+        replace(entry, knowledge=known.get(method, "generic"))
+        for method, entry in _methods(store, season, rows).items()
+    ]
     return {
         knowledge: ranking([each for each in entries if each.knowledge == knowledge], metric)
         for knowledge in KNOWLEDGE
@@ -95,13 +123,16 @@ def scored_entry(store: Store, season: Season, master: Master, row: SealedRow) -
     return sealed_result(season, row.entrant.id, runs, versions, store.document.draws)
 
 
-def _methods(store: Store, season: Season, rows: Iterable[SealedRow]) -> list[EntryRow]:
+def _methods(
+    store: Store, season: Season, rows: Iterable[SealedRow]
+) -> dict[tuple[str, str], EntryRow]:
     """A row for each key and method; those of several tickets are scored over all their runs."""
     groups: dict[tuple[str, str], list[SealedRow]] = {}
     for row in rows:
         groups.setdefault(_method(row), []).append(row)
-    entries = []
-    for members in groups.values():
+    entries = {}
+    fewest = min(member.instances for member in season.classes)
+    for method, members in groups.items():
         entrants = [row.entrant for row in members]
         entry = entrants[-1]
         if len(members) > 1:
@@ -111,15 +142,14 @@ def _methods(store: Store, season: Season, rows: Iterable[SealedRow]) -> list[En
             )
             entry = replace(
                 entry,
-                # Whoever has known the family once, knows it.
-                knowledge=max((each.knowledge for each in entrants), key=_ORDER.index),
                 scores=scores,
                 runs=sum(each.runs for each in entrants),
                 policies=sum(each.policies for each in entrants),
                 steps=sum(each.steps for each in entrants),
                 oracle_like=is_oracle_like(scores, RULES, _all(runs)),
             )
-        entries.append(entry)
+        enough = fewest * len(members) >= store.document.runs_to_rank
+        entries[method] = replace(entry, enough_runs=enough)
     return entries
 
 

@@ -8,6 +8,7 @@ from their answers, of tickets also from their journals of actions.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import NoReturn
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Season
+from leaderboard.documents.submission import utc
 from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.publication import follows
 from leaderboard.scoring.rescore import RESCORED
@@ -23,6 +25,7 @@ from leaderboard.scoring.sealed import instances, sealed_result
 from leaderboard.scoring.season import counting, scored_entry
 from leaderboard.scoring.verify import EXACT, close
 from leaderboard.sealed.scores import score_ticket
+from leaderboard.sealed.ticket import deadline
 from leaderboard.store import SealedRow, Store
 
 Progress = Callable[[int, int], None]
@@ -69,6 +72,7 @@ def verify_season(
     season, master = store.season(name), store.revealed_master(name)
     folder = store.season_folder(season.digest)
     rows, counted = store.entrants(season.digest), counting(store, season)
+    _check_rules(store, season, rows)
     _refuse_unscored(season, counted)
     total, done = len(season.published) + len(rows), 0
 
@@ -100,6 +104,28 @@ def verify_season(
             results += 1
         advance()
     return SeasonReport(len(season.published), rounded, len(rows), results)
+
+
+def _check_rules(store: Store, season: Season, rows: Sequence[SealedRow]) -> None:
+    """Check what the terms forbid, and a board of the organiser's own making could have logged."""
+    folder, revealed = store.season_folder(season.digest), store.season_row(season.digest).revealed
+    online = season.track == "sealed-online"
+    own: Counter[str] = Counter()
+    for row in rows:
+        path = folder.request(row.number) if online else folder.entry(row.entrant.id)
+        if not season.opens <= row.entrant.received < season.closes:
+            message = f"was logged at {row.entrant.received}: the season is open from "
+            _refuse(store, path, f"{message}{season.opens} to {season.closes}")
+        own[row.entrant.key] += 1
+        if season.tickets_per_key is not None and own[row.entrant.key] > season.tickets_per_key:
+            _refuse(store, path, f"exceeds the {season.tickets_per_key} tickets of a key")
+        if online and row.entrant.policies < row.entrant.runs and row.result is not None:
+            end = utc(deadline(season, row))
+            if row.finished < end:
+                message = f"was logged at {row.finished}, without all answers: must not be before "
+                _refuse(store, folder.result(row.entrant.id), f"{message}{end}, its deadline")
+    if revealed < season.closes:
+        _refuse(store, folder.reveal, f"was logged at {revealed}, before {season.closes}")
 
 
 def _refuse_unscored(season: Season, counted: Sequence[SealedRow]) -> None:

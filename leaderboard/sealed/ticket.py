@@ -18,6 +18,13 @@ from leaderboard.store import SealedRow, Store
 from sme_registry import sealed
 
 
+def deadline(season: Season, row: SealedRow) -> datetime.datetime:
+    """When a ticket of an online season ends at the latest."""
+    assert season.ticket_hours is not None  # the track is online
+    started = datetime.datetime.fromisoformat(row.entrant.received)
+    return shifted(started, datetime.timedelta(hours=season.ticket_hours))
+
+
 class RunningTicket:
     """One ticket: it runs until all instances are answered, or its deadline has passed.
 
@@ -37,9 +44,7 @@ class RunningTicket:
         self._nonce = store.request_of(row).ticket.nonce
         place = Place(season.id, "", 0, str(row.number), self._nonce)
         self._token = master.secret("token", place).hex()
-        assert season.ticket_hours is not None  # the track is online
-        started = datetime.datetime.fromisoformat(row.entrant.received)
-        self._deadline = shifted(started, datetime.timedelta(hours=season.ticket_hours))
+        self._deadline = deadline(season, row)
         self._ends = self._deadline.timestamp()
         self._closed = row.result is not None
         folder = store.season_folder(row.season).ticket(row.number)

@@ -25,8 +25,6 @@ MOST_HELD_LANES, _FIXED_LANES = 2**17, 128
 Those used longest ago are replayed when they go on.
 """
 
-_LOCK = ".stepping"
-
 
 class Clock:
     """The board's time, which does not go back while the server runs.
@@ -66,7 +64,7 @@ class Tickets:
         self.season = _season_of(store, self.master, secret)
         self.digest = self.season.digest
         folder = store.season_folder(self.digest)
-        lock = file_lock(folder.path / _LOCK)
+        lock = file_lock(folder.stepping)
         if lock is None:
             raise BoardError(
                 f"season={self.season.id}: another server steps it. Stop that one first."

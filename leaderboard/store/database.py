@@ -145,12 +145,22 @@ class Database:
                 self._refresh()
             yield self._connected
 
-    def record(self, event: Event, subject: str, document: StrictModel, path: Path) -> None:
-        """Write a document's file, its log entry and its rows; call it in a transaction."""
+    def record(
+        self,
+        event: Event,
+        subject: str,
+        document: StrictModel,
+        path: Path,
+        time: str | None = None,
+    ) -> None:
+        """Write a document's file, its log entry and its rows; call it in a transaction.
+
+        `time` is the log entry's, if what is allowed depends on it; the clock's by default.
+        """
         key = self.signing_key()
         index = self._connected
         write_document(path, document)
-        index.apply(self._log.append(key, index.head, event, subject, digest_of(document)))
+        index.apply(self._log.append(key, index.head, event, subject, digest_of(document), time))
 
     def signing_key(self) -> SigningKey:
         """The board's key.

@@ -142,22 +142,28 @@ class Log:
         return entry
 
     def append(
-        self, key: SigningKey, head: Head, event: Event, subject: str, document: str
+        self,
+        key: SigningKey,
+        head: Head,
+        event: Event,
+        subject: str,
+        document: str,
+        time: str | None = None,
     ) -> LogEntry:
-        """Write the entry after `head`.
+        """Write the entry after `head`, of a given time or of the clock's.
 
         Raises:
           BoardError: it cannot be written, another process has used its number, or the clock is
             plainly wrong: before the first entry, or ten years after the last.
         """
-        time = now()
+        clock = now()
         if head.sequence >= 0:
-            self._refuse_wrong_clock(time, head)
+            self._refuse_wrong_clock(clock, head)
         fields = {
             "schema_version": 1,
             "sequence": head.sequence + 1,
             "previous": head.digest,
-            "time": time,
+            "time": clock if time is None else time,
             "event": event,
             "subject": subject,
             "document": document,

@@ -98,9 +98,10 @@ class SealedStore(Database):
         with self.transaction() as index:
             if index.seasons.entrant(signed.id) is not None:
                 return False
-            row = self.open_season(signed.entry.season, "sealed-offline")
+            time = self.time
+            row = self.open_season(signed.entry.season, "sealed-offline", time)
             path = self.season_folder(row.digest).entry(signed.id)
-            self.record("entry", signed.id, signed, path)
+            self.record("entry", signed.id, signed, path, time)
         return True
 
     def start_ticket(self, signed: SignedTicketRequest) -> int:
@@ -118,7 +119,8 @@ class SealedStore(Database):
             known = index.seasons.entrant(signed.id)
             if known is not None:
                 return known.number
-            row = self.open_season(signed.ticket.season, "sealed-online")
+            time = self.time
+            row = self.open_season(signed.ticket.season, "sealed-online", time)
             season, key = index.seasons.read(row), signed.ticket.submitter.key
             own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
             assert season.tickets_per_key is not None  # the track is online
@@ -130,7 +132,7 @@ class SealedStore(Database):
                 )
             number = index.seasons.next_number(row.digest)
             path = self.season_folder(row.digest).request(number)
-            self.record("ticket", signed.id, signed, path)
+            self.record("ticket", signed.id, signed, path, time)
         return number
 
     def end_ticket(self, season: str, number: int, result: SealedResult) -> bool:
@@ -174,12 +176,13 @@ class SealedStore(Database):
 
         Raises:
           Rejection: `season_unknown`, `season_not_closed` while entries or tickets are accepted or
-            a ticket runs, or `reveal_mismatch`.
+            a ticket runs, also of another season with this master, or `reveal_mismatch`.
           BoardError: it cannot be written.
         """
         with self.transaction() as index:
-            row = self.season_row(reveal.season)
-            if not index.seasons.read(row).is_committed_to(Master(bytes.fromhex(reveal.master))):
+            time, row = self.time, self.season_row(reveal.season)
+            master = Master(bytes.fromhex(reveal.master))
+            if not index.seasons.read(row).is_committed_to(master):
                 raise Rejection(
                     "reveal_mismatch",
                     f"master: does not match the commitment of the season {row.id}. Give the file "
@@ -187,21 +190,28 @@ class SealedStore(Database):
                 )
             if row.reveal is not None:
                 return False
-            if self.time < row.closes:
-                raise Rejection(
-                    "season_not_closed",
-                    f"season={row.id}: closes at {row.closes}, and it is {self.time}. Its tasks "
-                    "stay secret until then.",
-                )
-            running = [each.number for each in self.entrants(row.digest) if each.result is None]
-            if row.track == "sealed-online" and running:
-                raise Rejection(
-                    "season_not_closed",
-                    f"season={row.id}: {len(running)} tickets run, the first of them number "
-                    f"{running[0]}. Serve the board until their deadlines have passed.",
-                )
-            self.record("revealed", row.digest, reveal, self.season_folder(row.digest).reveal)
+            self._refuse_not_over(row, time)
+            for other in index.seasons.rows():  # their tasks follow from the same secret
+                if other.reveal is None and index.seasons.read(other).is_committed_to(master):
+                    self._refuse_not_over(other, time)
+            path = self.season_folder(row.digest).reveal
+            self.record("revealed", row.digest, reveal, path, time)
         return True
+
+    def _refuse_not_over(self, row: SeasonRow, time: str) -> None:
+        if time < row.closes:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: closes at {row.closes}, and it is {time}. Its tasks stay secret "
+                "until then.",
+            )
+        running = [each.number for each in self.entrants(row.digest) if each.result is None]
+        if row.track == "sealed-online" and running:
+            raise Rejection(
+                "season_not_closed",
+                f"season={row.id}: {len(running)} tickets run, the first of them number "
+                f"{running[0]}. Serve the board until their deadlines have passed.",
+            )
 
     def revealed_master(self, name: str) -> Master:
         """The published master of the season of this id or digest.
@@ -268,14 +278,14 @@ class SealedStore(Database):
         path = self.season_folder(row.season).result(row.entrant.id)
         return read_document(self.folder, path, SealedResult, row.result)
 
-    def open_season(self, name: str, track: SealedTrack) -> SeasonRow:
-        """The season of this id or digest, which must be open and of a track.
+    def open_season(self, name: str, track: SealedTrack, time: str | None = None) -> SeasonRow:
+        """The season of this id or digest, which must be of a track, and open at a time, or now.
 
         Raises:
           Rejection: `season_unknown`, `season_track`, `season_not_open`, `season_closed` or
             `season_revealed`.
         """
-        row = self.season_row(name)
+        row, time = self.season_row(name), time or self.time
         if row.track != track:
             raise Rejection(
                 "season_track",
@@ -284,12 +294,12 @@ class SealedStore(Database):
             )
         if row.reveal is not None:
             raise Rejection("season_revealed", f"season={row.id}: its tasks are public now.")
-        if self.time < row.opens:
+        if time < row.opens:
             raise Rejection(
                 "season_not_open",
-                f"season={row.id}: opens at {row.opens}, and it is {self.time}. Come back then.",
+                f"season={row.id}: opens at {row.opens}, and it is {time}. Come back then.",
             )
-        if self.time >= row.closes:
+        if time >= row.closes:
             raise Rejection("season_closed", f"season={row.id}: closed at {row.closes}.")
         return row
 

@@ -33,7 +33,7 @@ CREATE TABLE season (
 ) STRICT, WITHOUT ROWID;
 CREATE TABLE sealed (
   id TEXT PRIMARY KEY, season TEXT NOT NULL, number INTEGER NOT NULL,
-  sequence INTEGER NOT NULL, received TEXT NOT NULL, document TEXT NOT NULL,
+  sequence INTEGER NOT NULL, received TEXT NOT NULL, created TEXT NOT NULL, document TEXT NOT NULL,
   result TEXT, finished TEXT NOT NULL DEFAULT '',
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
@@ -84,15 +84,18 @@ class SealedRow:
     Attributes:
       season: digest of its season.
       number: 1 for the first of its season, in the log's order.
+      created: when it was signed, as the entrant says.
       document: SHA-256 of its file.
       result: SHA-256 of its result's file; None without one.
       finished: when it got its result; empty likewise.
       entrant: what rankings need of it. Its `received` is when the ticket started, `runs` the
-        number of hidden instances, and `policies` that of answers.
+        number of hidden instances, and `policies` that of answers. `enough_runs` is false:
+        `scoring.season` counts them over all tickets of a method.
     """
 
     season: str
     number: int
+    created: str
     document: str
     result: str | None
     finished: str
@@ -254,6 +257,7 @@ class Seasons:
             "number": self.next_number(season.digest),
             "sequence": entry.sequence,
             "received": entry.time,
+            "created": signed.content.created,
             "document": entry.document,
             "method": method.name,
             "version": method.version,
@@ -327,19 +331,22 @@ _OF_ENTRANT = (
     *("id", "sequence", "received", "method", "version", "family", "knowledge", "submitter", "key"),
     *("code_link", "runs", "steps", "policies", "oracle_like", "scores"),
 )
-_SEALED = f"SELECT season, number, document, result, finished, {', '.join(_OF_ENTRANT)} FROM sealed"
+_SEALED = (
+    f"SELECT season, number, created, document, result, finished, {', '.join(_OF_ENTRANT)} "
+    "FROM sealed"
+)
 
 
 def _sealed(row: tuple[Any, ...]) -> SealedRow:
-    season, number, document, result, finished, *rest = row
+    season, number, created, document, result, finished, *rest = row
     values = dict(zip(_OF_ENTRANT, rest, strict=True))
     scores = values.pop("scores")
     entrant = EntryRow(
         **{**values, "oracle_like": bool(values["oracle_like"])},
         status="waiting" if scores is None else "scored",
         code="",
-        enough_runs=True,
+        enough_runs=False,
         reference=False,
         scores=None if scores is None else scores_of(scores),
     )
-    return SealedRow(season, number, document, result, finished, entrant)
+    return SealedRow(season, number, created, document, result, finished, entrant)

@@ -13,7 +13,8 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.entry import Entry, SignedEntry
 from leaderboard.documents.keys import SigningKey
-from leaderboard.documents.submission import Envelope
+from leaderboard.documents.season import MAX_OFFLINE_INSTANCES
+from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Envelope
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
@@ -158,6 +159,16 @@ def test_a_changed_entry_has_no_valid_signature(store, key):
     assert Envelope.read(text, SignedEntry).open().is_valid
     with pytest.raises(Rejection, match="bad_signature"):
         Envelope.read(text.replace(b'"Test"', b'"Best"'), SignedEntry)
+
+
+def test_the_largest_season_has_entries_that_can_be_sent(store, key):
+    most = MAX_OFFLINE_INSTANCES
+    answers = [{"sha256": f"sha256:{i:064x}", "size": MAX_ARTEFACT_BYTES} for i in range(most)]
+    signed = signed_entry(store, SEASON, key, answers, statement="x" * 2000)
+    assert Envelope.read(signed.to_bytes(), SignedEntry).open() == signed
+    tiny_season(instances=most)
+    with pytest.raises(SpecError, match="must be at most 400 together"):
+        tiny_season(instances=most + 1)
 
 
 def test_no_entry_knows_the_optimum(key):

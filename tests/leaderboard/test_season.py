@@ -26,9 +26,10 @@ from leaderboard.scoring.publication import (
     read_plan,
     read_season,
     refuse_large_answers,
+    refuse_unrankable,
 )
 from leaderboard.scoring.sealed import instances
-from leaderboard.scoring.season import counting, score_entries, season_rankings
+from leaderboard.scoring.season import by_key, counting, score_entries, season_rankings
 from leaderboard.sealed import verify_season
 from leaderboard.store import Store
 from sme_registry import evaluate, materialize
@@ -36,7 +37,7 @@ from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
 from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealing import AFTERWARDS, MASTER, signed_entry, tiny_terms
+from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, signed_entry, tiny_terms
 
 
 def plan(**fields: Any) -> dict[str, Any]:
@@ -159,6 +160,15 @@ def test_answers_must_fit_a_board() -> None:
         refuse_large_answers(tiny_terms(), 1000)
 
 
+def test_somebody_must_be_able_to_have_a_rank() -> None:
+    refuse_unrankable(tiny_terms(), 2)
+    refuse_unrankable(tiny_terms("sealed-online"), 4)
+    with pytest.raises(BoardError, match=r"classes\.deep: a key has at most 2 runs"):
+        refuse_unrankable(tiny_terms(), 3)
+    with pytest.raises(BoardError, match="at most 4 runs in it: must be at least 5"):
+        refuse_unrankable(tiny_terms("sealed-online"), 5)
+
+
 def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path: Path) -> None:
     for fields in ({"classes": None}, {"classes": [{"name": "deep"}]}, {"track": "open"}):
         with pytest.raises(SMEError):
@@ -183,7 +193,10 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     friend = SigningKey.generate()
     enter(store, season, key, optima(season, published), method=method("Best"))
     last = enter(store, season, key, halves(published), method=method("Best"))
-    family = enter(store, season, friend, optima(season, published), method=method("Fit", "family"))
+    old = moment(-2)  # kept back, and delivered when a later one had arrived
+    enter(store, season, key, optima(season, published), method=method("Best"), created=old)
+    enter(store, season, friend, halves(published), method=method("Fit", "family"))
+    family = enter(store, season, friend, optima(season, published), method=method("Fit"))
     failed = enter(store, season, friend, [None, None], method=method("Failed"))
     with pytest.raises(Rejection, match="season_not_closed"):
         score_entries(store, season.id)
@@ -200,7 +213,8 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     assert fitted[0].value.value == pytest.approx(0.0, abs=1e-5)
     assert fitted[0].entry.oracle_like
     report = verify_season(store, season.id)
-    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 4, 3)
+    assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 6, 3)
+    assert by_key(store, season) == {key.public: (1, 3), friend.public: (2, 3)}
 
 
 def test_a_score_is_that_of_the_open_board(store, key, published, later) -> None:
@@ -315,3 +329,15 @@ def monkey_open(store: Store, season: Season) -> None:
     with store.transaction():
         store.record("season", season.digest, season, path.season)
     store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+
+
+def test_a_rank_needs_the_runs_of_the_board(tmp_path: Path, key, published, later) -> None:
+    season = read_season(published)
+    with tiny_board(tmp_path / "board", runs_to_rank=3) as store:
+        store.announce(season)
+        enter(store, season, key, [None, None])
+        later()
+        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        score_entries(store, season.id)
+        [row] = season_rankings(store, season, "wd_regret")["generic"]
+    assert (row.ranks, row.reason) == ("", "too_few_runs")

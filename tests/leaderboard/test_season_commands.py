@@ -89,6 +89,7 @@ def test_a_season_is_played_from_the_command_line(monkeypatch: pytest.MonkeyPatc
     assert shown["state"] == "revealed"
     [row] = shown["ranking"]["generic"]
     assert (row["id"], row["ranks"]) == (id, "1")
+    assert (row["methods_of_key"], row["entrants_of_key"]) == (1, 1)
     assert shown["ranking"]["family"] == []
     assert "Test 1" in good("season", "show", "board", "autumn", "--metric", "ood_regret")
     assert "revealed" in good("season", "show", "board")

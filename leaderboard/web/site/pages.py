@@ -253,7 +253,14 @@ class Pages:
         """
         row = self._seasons[id]
         page = season_page(self.store, row)
-        return self._render("season.html", here="", root="../", title=row.title, page=page)
+        return self._render(
+            "season.html",
+            here="",
+            root="../",
+            title=row.title,
+            page=page,
+            reasons=ranking.REASONS,
+        )
 
     def data_js(self) -> str:
         """`board-data.js`: the data of the comparison. A script, since `file:` forbids `fetch`."""

@@ -11,7 +11,7 @@ from leaderboard.documents.result import SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Knowledge
 from leaderboard.scoring.ranking import RankedRow
-from leaderboard.scoring.season import counting, season_rankings
+from leaderboard.scoring.season import OfKey, by_key, counting, season_rankings
 from leaderboard.store import SealedRow, SeasonRow, Store
 from leaderboard.web.site import charts
 
@@ -41,6 +41,7 @@ class SeasonPage:
 
     Attributes:
       rankings: by declared knowledge, of methods with results.
+      keys: how often each key takes part.
       master: 64 hex digits after the reveal; empty before.
     """
 
@@ -48,6 +49,7 @@ class SeasonPage:
     season: Season
     entrants: list[EntrantRow]
     rankings: dict[Knowledge, list[RankedRow]]
+    keys: dict[str, OfKey]
     master: str
 
     @property
@@ -78,6 +80,7 @@ def season_page(store: Store, row: SeasonRow) -> SeasonPage:
         season=season,
         entrants=entrants,
         rankings=season_rankings(store, season, "wd_regret"),
+        keys=by_key(store, season),
         master=store.revealed_master(row.digest).raw.hex() if row.reveal else "",
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from leaderboard.documents.board import SeasonFolder
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import TamperedError
@@ -17,9 +18,10 @@ from leaderboard.scoring.verify import verify
 from leaderboard.sealed import verify_season
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
+from leaderboard.store.log import Log
 from sme_registry import sealed
 from tests.leaderboard.sealed.playing import Board, online_board
-from tests.leaderboard.sealing import AFTERWARDS, MASTER
+from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, signed_request
 from tests.leaderboard.serving import serving
 
 
@@ -100,3 +102,71 @@ def test_a_learning_curve_that_no_journal_has_is_found(
         pytest.raises(TamperedError, match=r"stepping\.0: replayed from its journal"),
     ):
         verify_season(store, revealed.season.id)
+
+
+def logged(monkeypatch: pytest.MonkeyPatch, time: str, store: Store, *record: Any) -> None:
+    """Log something that a board must refuse, at a time, as an organiser's own board may do."""
+    monkeypatch.setattr("leaderboard.store.log.now", lambda: time)
+    with store.transaction():
+        store.record(*record)
+
+
+@pytest.mark.parametrize("days", [-2, 2])
+def test_a_ticket_of_a_season_that_is_not_open_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey, days: float
+) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        monkeypatch.setattr(Log, "_refuse_wrong_clock", lambda *_: None)
+        folder = store.season_folder(board.season.digest)
+        request = signed_request(store, board.season, key)
+        path = folder.request(1)
+        logged(monkeypatch, moment(days), store, "ticket", request.id, request, path)
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=r"tickets/1/ticket\.json: was logged at"):
+            verify_season(store, board.season.id)
+
+
+def test_more_tickets_than_a_key_may_have_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
+) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        for number in (1, 2, 3):
+            request = signed_request(store, board.season, key, number)
+            path = folder.request(number)
+            logged(monkeypatch, moment(0), store, "ticket", request.id, request, path)
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=r"tickets/3/ticket\.json: exceeds the 2 tickets"):
+            verify_season(store, board.season.id)
+
+
+def test_a_ticket_that_ended_early_without_all_answers_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
+) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        store.start_ticket(signed_request(store, board.season, key))
+        store.end_ticket(board.season.digest, 1, score_ticket(store, board.season, MASTER, 1))
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match="without all answers: must not be before"):
+            verify_season(store, board.season.id)
+
+
+def test_a_reveal_before_the_close_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        logged(monkeypatch, moment(0), store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=r"reveal\.json: was logged at"):
+            verify_season(store, board.season.id)
+
+
+def reveal(board: Board, folder: SeasonFolder) -> tuple[Any, ...]:
+    """What `Database.record` needs to log the reveal of a season."""
+    document = Reveal(season=board.season.digest, master=MASTER.raw.hex())
+    return "revealed", board.season.digest, document, folder.reveal

@@ -195,6 +195,26 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
         store.start_ticket(signed_request(store, season, key, 2))
 
 
+def test_no_reveal_tells_the_tasks_of_another_season_that_is_not_over(store, key, later):
+    short, long = tiny_season(), tiny_season(id="long", closes=moment(9))
+    store.announce(short)
+    store.announce(long)
+    later()
+    with pytest.raises(Rejection, match="season_not_closed: season=long: closes at"):
+        store.reveal(reveal(short))
+    assert store.season_row(short.id).reveal is None
+
+
+def test_what_is_allowed_and_what_is_logged_are_of_the_same_moment(store, key, monkeypatch):
+    """The close may pass while an entry's file is being written."""
+    season = tiny_season()
+    store.announce(season)
+    monkeypatch.setattr("leaderboard.store.log.now", lambda: AFTERWARDS)
+    store.enter(signed_entry(store, season, key, [None, None]))
+    [row] = store.entrants(season.digest)
+    assert row.entrant.received < season.closes
+
+
 def test_offline_nothing_is_ranked_before_the_reveal(store, key):
     season = tiny_season()
     store.announce(season)

@@ -77,6 +77,8 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     assert MASTER.raw.hex() in after.words
     generic, family = (after.words.index(f"Methods {text}") for text in ("without", "that know"))
     assert generic < after.words.index("Mine generic") < family < after.words.index("Mine family")
+    assert after.words.count("Methods of its key") == 2
+    assert after.words.count("too few runs") == 2  # of the ten that this board needs
 
 
 def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
