@@ -28,7 +28,7 @@ from sme_registry.terminal import (
 )
 
 if TYPE_CHECKING:
-    from leaderboard.documents.season import Season
+    from leaderboard.documents.season import Season, Terms
     from leaderboard.store import SeasonRow, Store
 
 SeasonId = Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")]
@@ -95,6 +95,7 @@ def new(
         refuse_unrankable(fields, store.document.runs_to_rank)
     folder = Path(fields.id) if out_folder is None else out_folder
     refuse_existing(folder)
+    _warn_of_easy_classes(fields)
     path = _secret(board, fields.id, secret)
     # First: a season whose master is lost cannot be revealed, and the reverse does no harm.
     master = Master.generate()
@@ -302,6 +303,22 @@ def show(
         out().print(table)
     if any(rankings.values()):
         out().print("methods, entrants: of the same key in this season.")
+
+
+def _warn_of_easy_classes(terms: Terms) -> None:
+    from leaderboard.scoring.tables import EASY, table_regret
+
+    for member in terms.classes:
+        rows = member.data.transitions if member.data else member.budget or 0
+        regret = table_regret(member.setting, rows)
+        if regret < EASY:
+            err().print(
+                f"Warning: classes.{member.name}: a table of the nearest states, without any "
+                f"learning, has a normalised regret N₀ of about {fixed(regret)}: should be "
+                f"{EASY} or more, or ranks tell little. Use more state channels than "
+                f"{member.setting.state_dim}.",
+                soft_wrap=True,
+            )
 
 
 def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:

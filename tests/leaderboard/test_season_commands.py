@@ -19,7 +19,7 @@ from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import linear_onnx, tiny_board
 from tests.leaderboard.sealing import AFTERWARDS, tiny_terms
 from tests.leaderboard.serving import serving
-from tests.leaderboard.test_cli import fails, good
+from tests.leaderboard.test_cli import board_command, fails, good
 
 PLAN = "plan.json"
 ENTER = ("--method", "Test", "--submitter", "A Lab")
@@ -93,6 +93,17 @@ def test_a_season_is_played_from_the_command_line(monkeypatch: pytest.MonkeyPatc
     assert shown["ranking"]["family"] == []
     assert "Test 1" in good("season", "show", "board", "autumn", "--metric", "ood_regret")
     assert "revealed" in good("season", "show", "board")
+
+
+def test_a_class_that_a_table_solves_is_warned_of() -> None:
+    fields = json.loads(Path(PLAN).read_text())
+    for state_dim, warned in ((2, True), (8, False)):
+        fields["id"] = f"s{state_dim}"
+        fields["classes"][0]["setting"]["state_dim"] = state_dim
+        Path(PLAN).write_text(json.dumps(fields))
+        made = board_command("season", "new", "board", PLAN)
+        assert made.exit_code == 0
+        assert ("Warning: classes.deep: a table of the nearest states" in made.stderr) == warned
 
 
 def test_a_policy_is_asked_and_stays_at_home(season: Path) -> None:
