@@ -9,8 +9,8 @@ import datetime
 from collections.abc import Sequence
 
 from leaderboard.artefact.answers import read_answers
-from leaderboard.documents.checks import check_board, check_names, check_time
-from leaderboard.documents.entry import SignedEntry
+from leaderboard.documents.checks import check_board, check_names, check_time, skeleton
+from leaderboard.documents.entry import Entry, SignedEntry
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Artefact, Envelope
 from leaderboard.errors import Rejection
@@ -97,10 +97,24 @@ def enter(
     with store.transaction():  # no other entrant can take the name, nor `gc` an answer in between
         check_name(store, entry.submitter)
         check_daily_quota(store, key, moment, refused)
+        _check_newest(store, season, entry)
         check_room(store, key, len(signed.to_bytes()))
         for answer in given:
             check_stored(store, key, answer)
         return store.enter(signed)
+
+
+def _check_newest(store: Store, season: Season, entry: Entry) -> None:
+    """Refuse an entry that would not count, as its key has signed a later one of its method."""
+    own = entry.submitter.key, skeleton(entry.method.name)
+    for row in store.entrants(season.digest):
+        if row.method == own and row.created > entry.created:
+            raise Rejection(
+                "stale_time",
+                f"created={entry.created}: entry {row.number} of the same key and method was "
+                f"signed later, at {row.created}. The one signed last counts: check your clock, "
+                "and sign this one again.",
+            )
 
 
 def _check_answers(

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.board import RULES
-from leaderboard.documents.checks import skeleton
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import Metric, RunScore, SealedResult
 from leaderboard.documents.season import Season
@@ -39,10 +38,10 @@ def counting(store: Store, season: Season) -> list[SealedRow]:
         return rows
     last: dict[tuple[str, str], SealedRow] = {}
     for row in rows:
-        other = last.get(_method(row), row)
+        other = last.get(row.method, row)
         # One that was signed before and delivered later is nobody's last word.
         if row.entrant.received < season.closes and row.created >= other.created:
-            last[_method(row)] = row
+            last[row.method] = row
     return sorted(last.values(), key=lambda row: row.number)
 
 
@@ -56,7 +55,7 @@ class OfKey(NamedTuple):
 def by_key(store: Store, season: Season) -> dict[str, OfKey]:
     """The numbers of methods, and of entries or tickets, of each key in a season."""
     rows = store.entrants(season.digest)
-    methods = Counter(key for key, _ in {_method(row) for row in rows})
+    methods = Counter(key for key, _ in {row.method for row in rows})
     entrants = Counter(row.entrant.key for row in rows)
     return {key: OfKey(methods[key], count) for key, count in entrants.items()}
 
@@ -95,7 +94,7 @@ def season_rankings(
     known: dict[tuple[str, str], Knowledge] = {}
     for row in store.entrants(season.digest):  # whoever has known the family once, knows it
         if row.entrant.knowledge == "family":
-            known[_method(row)] = "family"
+            known[row.method] = "family"
     entries = [
         replace(entry, knowledge=known.get(method, "generic"))
         for method, entry in _methods(store, season, rows).items()
@@ -129,7 +128,7 @@ def _methods(
     """A row for each key and method; those of several tickets are scored over all their runs."""
     groups: dict[tuple[str, str], list[SealedRow]] = {}
     for row in rows:
-        groups.setdefault(_method(row), []).append(row)
+        groups.setdefault(row.method, []).append(row)
     entries = {}
     fewest = min(member.instances for member in season.classes)
     for method, members in groups.items():
@@ -162,8 +161,3 @@ def _results(store: Store, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:
 
 def _all(runs: Iterable[Iterable[RunScore]]) -> list[RunScore]:
     return [run for each in runs for run in each]
-
-
-def _method(row: SealedRow) -> tuple[str, str]:
-    """What an entry or ticket is of: a key, and a method up to look-alike spelling."""
-    return row.entrant.key, skeleton(row.entrant.method)

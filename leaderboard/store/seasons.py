@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from leaderboard.documents.board import Folder, SeasonFolder
+from leaderboard.documents.checks import skeleton
 from leaderboard.documents.entry import SignedEntry, SignedSealed, SignedTicketRequest
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import SealedResult
@@ -100,6 +101,11 @@ class SealedRow:
     result: str | None
     finished: str
     entrant: EntryRow
+
+    @property
+    def method(self) -> tuple[str, str]:
+        """What it is of: a key, and a method up to look-alike spelling."""
+        return self.entrant.key, skeleton(self.entrant.method)
 
 
 class Seasons:

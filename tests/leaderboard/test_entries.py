@@ -113,6 +113,16 @@ def test_bad_entries_are_refused_with_stable_codes(store, key):
     assert refused(store, entry(store, other, None, None, **name)) == "name_taken"
 
 
+def test_an_entry_that_was_signed_before_one_of_its_method_is_refused(store, key):
+    assert send(store, entry(store, key, None, None, created=moment(-1)))
+    older = {"created": moment(-2)}
+    assert refused(store, entry(store, key, None, None, **older)) == "stale_time"
+    alike = {"method": {"name": "tesT", "version": "2", "family": "x", "knowledge": "generic"}}
+    assert refused(store, entry(store, key, None, None, **older, **alike)) == "stale_time"
+    other = {"method": {"name": "Rest", "version": "1", "family": "x", "knowledge": "generic"}}
+    assert send(store, entry(store, key, None, None, **older, **other))
+
+
 def test_refused_entries_of_a_server_count_for_their_key(tmp_path: Path, key):
     refusals = intake.Refusals()
     with tiny_board(tmp_path / "small", limits={"submissions_per_day": 2}) as store:
