@@ -42,7 +42,7 @@ CODES = {
     "reveal_mismatch": "the master does not match the season's commitment",
     "ticket_unknown": "the season has no ticket of this number",
     "ticket_ended": "the ticket's deadline has passed, or all of it is answered",
-    "ticket_limit": "the key has started as many tickets as the season allows",
+    "ticket_limit": "as many tickets of the key, or of all keys, were started as the season allows",
     "token_wrong": "the request does not have the ticket's token",
     "instance_unknown": "the ticket has no instance of this number",
     "instance_phase": "the instance is not started yet, still stepped, or answered",

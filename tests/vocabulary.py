@@ -218,6 +218,7 @@ QUANTITIES = {
     "requests": "number of requests for steps",
     "ticket": "number of a ticket in its season",
     "ticket_hours": "time from the start of a ticket to its deadline",
+    "tickets": "most tickets of a season",
     "tickets_per_key": "most tickets of one key",
     "shape": "S, A, L and H to which the tasks of a program are padded",
     "agents": "number of agents",

@@ -63,7 +63,7 @@ def new(
         typer.Argument(
             metavar="PLAN",
             help="JSON with id, title, track, classes, opens, closes, protocol_name and, online, "
-            "ticket_hours and tickets_per_key.",
+            "ticket_hours, tickets and tickets_per_key.",
         ),
     ],
     out_folder: Annotated[

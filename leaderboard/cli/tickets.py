@@ -64,7 +64,8 @@ def ticket(
     signing_key = SigningKey.read(key)
     # Kept until the ticket is: a request that was sent and not answered may have started one.
     request_file = out_file.with_name(f"{out_file.name}.request")
-    if request_file.exists():
+    repeated = request_file.exists()
+    if repeated:
         signed = SignedTicketRequest.read(request_file.read_bytes())
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
@@ -85,9 +86,12 @@ def ticket(
         signed = request.signed(signing_key, board)
         write_atomically(request_file, signed.to_bytes())
     try:
-        started = client.request_ticket(url, season, signed)
-    except Rejection:  # and so it has started none
-        request_file.unlink()
+        started = client.request_ticket(url, season, signed, signing_key)
+    except Rejection as rejection:
+        # Refused is the request, which has started no ticket, or its sender: with another key, or
+        # a wrong clock.
+        if not (repeated and rejection.code in ("bad_signature", "stale_time")):
+            request_file.unlink()
         raise
     started.write(out_file)
     request_file.unlink()

@@ -125,7 +125,7 @@ class Terms(Document):
       protocol_name, protocol: the regions and numbers of the challenge states; its seed is 0, as
         the seed of each instance's states is secret.
       ticket_hours: time from the start of a ticket to its deadline; null offline.
-      tickets_per_key: the most tickets of one key; null offline.
+      tickets, tickets_per_key: the most tickets of the season, and of one key; null offline.
       published: of each instance in order; empty online.
       versions: of the organiser's packages, by which data sets are rounded.
     """
@@ -140,6 +140,7 @@ class Terms(Document):
     protocol_name: Name
     protocol: EvaluationProtocol
     ticket_hours: Annotated[Integer | None, Field(ge=1, le=8760)] = None
+    tickets: Annotated[Integer | None, Field(ge=1, le=100_000)] = None
     tickets_per_key: Annotated[Integer | None, Field(ge=1, le=1000)] = None
     published: Annotated[tuple[Digests, ...], Field(strict=False, max_length=MAX_INSTANCES)] = ()
     versions: Annotated[dict[str, str], Field(default_factory=dict, max_length=16)]
@@ -169,7 +170,7 @@ class Terms(Document):
     @model_validator(mode="after")
     def _track_fits(self) -> Self:
         online = self.track == "sealed-online"
-        for field in ("ticket_hours", "tickets_per_key"):
+        for field in ("ticket_hours", "tickets", "tickets_per_key"):
             if (getattr(self, field) is not None) != online:
                 raise ValueError(
                     f"{field}: must be {'given' if online else 'null'} on the track {self.track}."

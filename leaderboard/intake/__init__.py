@@ -4,7 +4,7 @@ from leaderboard.intake.admission import admit, receive, submit_bundle
 from leaderboard.intake.entries import enter, receive_entry
 from leaderboard.intake.references import submit_references
 from leaderboard.intake.refusals import Refusals
-from leaderboard.intake.tickets import start_ticket
+from leaderboard.intake.tickets import refuse_other_sender, start_ticket
 from leaderboard.intake.uploads import UPLOAD_MINUTES, check_upload, upload_header, uploader
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "enter",
     "receive",
     "receive_entry",
+    "refuse_other_sender",
     "start_ticket",
     "submit_bundle",
     "submit_references",

@@ -1,4 +1,9 @@
-"""Requests for tickets of sealed-online seasons: read, checked, then started in the signed log."""
+"""Requests for tickets of sealed-online seasons: read, checked, then started in the signed log.
+
+The answer to a request has the ticket's password, and a board keeps requests where others may read
+them. So a request is sent with a header `Authorization` as for an upload of the request's id, whose
+signature is at most ten minutes old, and nobody else can repeat it.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +13,31 @@ from leaderboard.documents.checks import check_board, check_names, check_time
 from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
-from leaderboard.intake.admission import check_name
-from leaderboard.intake.uploads import check_room
+from leaderboard.intake.admission import check_daily_quota, check_name
+from leaderboard.intake.uploads import check_room, uploader
 from leaderboard.store import Store
+
+
+def refuse_other_sender(
+    store: Store, envelope: Envelope[SignedTicketRequest], header: str | None
+) -> None:
+    """Reject a request that its own key has not just sent.
+
+    Args:
+      store: the board.
+      envelope: the request.
+      header: the value of `Authorization`; None if there is none.
+
+    Raises:
+      Rejection: `bad_signature`, `wrong_board` or `stale_time`.
+    """
+    sender = uploader(header, envelope.id, board=store.document.key)
+    if sender != envelope.key:
+        raise Rejection(
+            "bad_signature",
+            f"Authorization: is signed by the key {sender[:16]}…: must be by {envelope.key[:16]}…, "
+            "which signed the request. Sign both with one key.",
+        )
 
 
 def start_ticket(
@@ -20,9 +47,6 @@ def start_ticket(
     at: datetime.datetime | None = None,
 ) -> tuple[int, bool]:
     """Start a ticket; the same request starts no second one, and has its number again.
-
-    Whoever has a signed request learns its ticket's password. So no page, and no copy of a board
-    that is made public while tickets run, may contain one.
 
     Args:
       store: the board.
@@ -53,5 +77,6 @@ def start_ticket(
     check_time(request.created, moment, store.document.limits.age_days)
     with store.transaction():  # no other entrant can take the name in between
         check_name(store, request.submitter)
+        check_daily_quota(store, request.submitter.key, moment)
         check_room(store, request.submitter.key, len(signed.to_bytes()))
         return store.start_ticket(signed), True

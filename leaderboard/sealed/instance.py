@@ -18,7 +18,7 @@ from typing import Literal
 from leaderboard.artefact.answers import Float32, read_answers, rows_of
 from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_LANES, SeasonClass
-from leaderboard.errors import Rejection
+from leaderboard.errors import Rejection, TamperedError
 from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, io
@@ -26,6 +26,8 @@ from sme_registry.errors import ActionError, WireError
 from sme_registry.sealed import Begun, InstanceStatus, StepFormat, table_bytes
 
 Phase = Literal["waiting", "stepping", "answering", "answered"]
+_QUICK_PRODUCTS = 2**23
+"""Of weights and lanes, in steps short enough for the event loop: a few milliseconds."""
 
 
 class SteppedInstance:
@@ -89,6 +91,16 @@ class SteppedInstance:
             )
 
     @property
+    def is_played(self) -> bool:
+        """Whether it has steps, answers, or a journal that is none."""
+        with self._lock:
+            try:
+                journal = self._opened()
+            except TamperedError:
+                return True
+            return self._answered or (journal is not None and journal.requests > 0)
+
+    @property
     def lanes(self) -> int:
         """L; 0 before the start."""
         journal = self._opened()
@@ -125,9 +137,18 @@ class SteppedInstance:
         return self._answered
 
     @property
+    def weights(self) -> int:
+        """The number of weights of the task's network, without biases."""
+        setting = self._member.setting
+        S, A, H = setting.state_dim, setting.action_dim, setting.hidden_width
+        return H * (S + (setting.complexity - 2) * H + A)
+
+    @property
     def is_ready(self) -> bool:
-        """Whether the next step needs no replay, and no other request is in progress."""
-        if self._lanes is None or not self._lock.acquire(blocking=False):
+        """Whether the next step is small, needs no replay, and has no other request before it."""
+        if self._lanes is None or self.lanes * self.weights > _QUICK_PRODUCTS:
+            return False
+        if not self._lock.acquire(blocking=False):
             return False
         self._lock.release()
         return True
@@ -182,7 +203,10 @@ class SteppedInstance:
             self._refuse_step(journal, number)
             with _storage():
                 journal.append(raw)
-            self._last = raw, self._format.pack_steps(lanes.step(actions))
+            # Whatever raises between here and the end, such as a lack of memory: the step is taken.
+            self._lanes, form = None, self._format
+            self._last = raw, form.pack_steps(lanes.step(actions))
+            self._lanes = lanes
             return self._last[1]
 
     def finish(self) -> None:
@@ -205,8 +229,16 @@ class SteppedInstance:
             raise _wrong_phase(phase, "Take all steps, or finish it, before the challenge.")
 
     def has_stored(self, data: bytes) -> bool:
-        """Whether these are its answers, which a client sends again if the reply was lost."""
-        return self._answered and read_regular(self._answers_path, len(data) + 1) == data
+        """Whether these are its answers, which a client sends again if the reply was lost.
+
+        Raises:
+          Rejection: `storage_full` if they are, and might not survive a loss of power.
+        """
+        with _storage():
+            if not self._answered or read_regular(self._answers_path, len(data) + 1) != data:
+                return False
+            io.sync_folder(self._answers_path.parent)  # which may have failed the first time
+        return True
 
     def answer(self, data: bytes) -> bool:
         """Store the answers to the challenge.
@@ -233,11 +265,13 @@ class SteppedInstance:
                     "answers: others were stored for this instance, and count. Go on with the "
                     "next instance.",
                 )
-            with _storage(), io.atomic_file(self._answers_path, new=True) as stream:
-                stream.write(data)
-            with _storage():
-                io.sync_folder(self._answers_path.parent)
-            self._answered = True
+            try:
+                with _storage(), io.atomic_file(self._answers_path, new=True) as stream:
+                    stream.write(data)
+                with _storage():
+                    io.sync_folder(self._answers_path.parent)
+            finally:  # the file may be there even if the folder could not be synced
+                self._answered = self._answers_path.exists()
             self.release()
             return True
 

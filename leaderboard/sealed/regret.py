@@ -29,21 +29,26 @@ def measured_steps(start: Start, journal: Journal | None, budget: int) -> Steppi
       budget: steps that could be taken, over all lanes.
     """
     if journal is None:
-        nothing = (1.0,) * min(MOST_PARTS, budget)
-        return Stepping(steps=0, normalised_online_regret=1.0, learning_curve=nothing)
+        return no_steps(budget)
     lanes = Lanes(start, journal.lanes)
     requests = budget // journal.lanes
     parts = min(MOST_PARTS, requests)
-    part_of = np.arange(requests) * parts // requests
     sums = np.zeros((parts, 3))  # regret, that of the constant ½, requests
-    for part, actions in zip(part_of, journal.actions(), strict=False):
+    for request, actions in enumerate(journal.actions()):
         _, regret = lanes.step_with_regret(actions)
-        sums[part] += (*regret, 1.0)
+        sums[request * parts // requests] += (*regret, 1.0)
+    firsts = -(np.arange(parts + 1) * -requests // parts)  # request of each part
     return Stepping(
         steps=journal.steps,
         normalised_online_regret=_ratio(sums.sum(axis=0), requests),
-        learning_curve=tuple(map(_ratio, sums, np.bincount(part_of))),
+        learning_curve=tuple(map(_ratio, sums, np.diff(firsts))),
     )
+
+
+def no_steps(budget: int, lanes: int = 1) -> Stepping:
+    """The regret of an instance that took no steps; `lanes` is 1 before the start."""
+    curve = (1.0,) * min(MOST_PARTS, budget // lanes)
+    return Stepping(steps=0, normalised_online_regret=1.0, learning_curve=curve)
 
 
 def _ratio(sums: Array, possible: int) -> float:

@@ -82,6 +82,11 @@ class RunningTicket:
         """Whether nothing can change any more, at a time in seconds since 1970."""
         return self._closed or now >= self._ends or all(each.answered for each in self.instances)
 
+    @property
+    def is_unplayed(self) -> bool:
+        """Whether it has neither steps nor answers."""
+        return not any(each.is_played for each in self.instances)
+
     def refuse_over(self, now: float) -> None:
         """Raise `Rejection` (`ticket_ended`) if the ticket is over."""
         if self._closed or now >= self._ends:

@@ -8,19 +8,21 @@ import os
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
 
 from leaderboard.documents.master import Master
 from leaderboard.documents.season import MAX_LANES, Season
 from leaderboard.errors import BoardError, Rejection
 from leaderboard.sealed.instance import SteppedInstance
+from leaderboard.sealed.scores import unplayed_result
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from sme_registry.io import file_lock
 from sme_registry.sealed import StepFormat, TicketStatus
 
-MOST_HELD_LANES, _FIXED_LANES = 2**17, 128
-"""In memory, of all instances together, and what each takes besides its lanes.
+MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
+"""In memory, of all instances together; what each takes besides its lanes, and its network.
 
 Those used longest ago are replayed when they go on.
 """
@@ -168,12 +170,36 @@ class Tickets:
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""
-        waiting = [row.number for row in self._store.entrants(self.digest) if row.result is None]
+        waiting = []
+        for row in self._store.entrants(self.digest):
+            if row.result is None:
+                waiting.append(row.number)
+            else:
+                self._running.pop(row.number, None)  # closed, and so its files are final
         return [number for number in waiting if self.ticket(number).is_over(self.now)]
 
     def close_ticket(self, number: int) -> None:
         """Refuse all further requests for a ticket, after those in progress."""
         self.ticket(number).close()
+
+    def end_unplayed(self, numbers: Sequence[int], most: int) -> list[int]:
+        """Log the results of tickets that are over and that nobody has played.
+
+        Args:
+          numbers: of tickets that are over.
+          most: results to log at a time.
+
+        Returns:
+          The numbers of the others.
+        """
+        unplayed = {number for number in numbers if self.ticket(number).is_unplayed}
+        for number in sorted(unplayed)[:most]:
+            ticket = self.ticket(number)
+            ticket.close()
+            if ticket.is_unplayed:  # still: requests were in progress
+                result = unplayed_result(self._store, self.season, ticket)
+                self._store.end_ticket(self.digest, number, result)
+        return [number for number in numbers if number not in unplayed]
 
     def sync(self) -> None:
         """Make all steps taken survive a loss of power."""
@@ -201,7 +227,8 @@ class Tickets:
         freed = []
         with self._lock:
             if instance not in self._held:
-                self._held[instance] = instance.lanes + _FIXED_LANES
+                network = instance.weights // _WEIGHTS_OF_A_LANE
+                self._held[instance] = instance.lanes + _FIXED_LANES + network
                 self._held_lanes += self._held[instance]
             self._held.move_to_end(instance)
             while self._held_lanes > MOST_HELD_LANES:

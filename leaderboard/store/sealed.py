@@ -123,7 +123,8 @@ class SealedStore(Database):
             row = self.open_season(signed.ticket.season, "sealed-online", time)
             season, key = index.seasons.read(row), signed.ticket.submitter.key
             own = sum(each.entrant.key == key for each in index.seasons.entrants(row.digest))
-            assert season.tickets_per_key is not None  # the track is online
+            assert season.tickets is not None  # the track is online
+            assert season.tickets_per_key is not None
             if own >= season.tickets_per_key:
                 raise Rejection(
                     "ticket_limit",
@@ -131,6 +132,12 @@ class SealedStore(Database):
                     f"the season {row.id}. Every one of them counts.",
                 )
             number = index.seasons.next_number(row.digest)
+            if number > season.tickets:
+                raise Rejection(
+                    "ticket_limit",
+                    f"season={row.id}: all of its {season.tickets} tickets were started. Ask the "
+                    "board's owner for another season.",
+                )
             path = self.season_folder(row.digest).request(number)
             self.record("ticket", signed.id, signed, path, time)
         return number

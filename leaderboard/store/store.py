@@ -184,14 +184,16 @@ class Store(SealedStore):
     def holder_of_name(self, name: str) -> str | None:
         """The key that was first to use a submitter's name, or one that looks like it.
 
-        A name is used by an entry that waits or has had scores, and by every entrant of a season:
-        otherwise, policies that are rejected would be enough to occupy names.
+        A name is used by an entry or ticket that waits for its scores, or has had scores of at
+        least one policy or answer: otherwise, policies that are rejected, or tickets that nobody
+        plays, would be enough to occupy names.
         """
         with self.reading() as index:
             rows = index.connection.execute(
                 "SELECT submitter, key FROM (SELECT submitter, key, sequence FROM entry "
                 "WHERE status = 'waiting' OR scores IS NOT NULL "
-                "UNION ALL SELECT submitter, key, sequence FROM sealed) "
+                "UNION ALL SELECT submitter, key, sequence FROM sealed "
+                "WHERE result IS NULL OR policies > 0) "
                 "GROUP BY submitter, key ORDER BY min(sequence)"
             )
             alike = skeleton(name)

@@ -126,7 +126,12 @@ def season(url: str, id: str, *, insecure: bool = False) -> tuple[str, str]:
 
 
 def request_ticket(
-    url: str, season: str, signed: SignedTicketRequest, *, insecure: bool = False
+    url: str,
+    season: str,
+    signed: SignedTicketRequest,
+    key: SigningKey,
+    *,
+    insecure: bool = False,
 ) -> Ticket:
     """Start a ticket, or get the one that this request has started before.
 
@@ -134,14 +139,17 @@ def request_ticket(
       url, insecure: as for `submit`.
       season: the season's id.
       signed: the request, signed for this board.
+      key: the entrant's, which signed it.
 
     Raises:
       Rejection: the board rejects it.
       BoardError: the board cannot be reached, or its answer is invalid.
       OptionError: the URL or the id is invalid.
     """
+    sign = functools.partial(upload_header, key, signed.id, board=signed.board)
     with _Client(url, insecure=insecure) as client:
-        _, answer = client.request("POST", tickets_path(_name(season)), signed.to_bytes())
+        path = tickets_path(_name(season))
+        _, answer = client.request("POST", path, signed.to_bytes(), sign)
     try:
         return Ticket.from_dict(answer, "ticket")
     except SpecError as error:

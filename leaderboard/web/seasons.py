@@ -3,7 +3,8 @@
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
     POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
-    POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again
+    POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again;
+                                                                signed, see `intake.tickets`
     GET  /api/seasons/{id}/tickets/{n}                          its status
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/start      present observations
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
@@ -44,8 +45,7 @@ _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
 _INSTANCE = _TICKET + "/instances/{instance}"
 _WORKERS = 4  # threads that replay journals and write answers
-_CHALLENGES = 1  # that are computed at a time: each takes a processor for seconds
-_REQUESTS = 64  # for tickets, checked at the same time
+_REQUESTS = 64  # of a kind, that wait or run at the same time
 _LARGEST = 2**31
 _BODY_SECONDS = 30.0
 _STEPS = re.compile(r"/api/seasons/([^/]+)/tickets/(\d{1,9})/instances/(\d{1,9})/steps", re.ASCII)
@@ -73,7 +73,8 @@ class SeasonRoutes:
         self._tickets = {
             each.season.id: each for each in (Tickets(store, path) for path in secrets)
         }
-        self._threads, self._challenges = CapacityLimiter(_WORKERS), CapacityLimiter(_CHALLENGES)
+        self._threads = CapacityLimiter(_WORKERS)
+        self._challenges = limits.Turns(_REQUESTS)
         self._requests = limits.Turns(_REQUESTS)
         self._entries = limits.Turns(_REQUESTS)
         self._refusals = intake.Refusals()
@@ -138,9 +139,11 @@ class SeasonRoutes:
         """Start a ticket."""
         tickets = self.tickets_of(request.path_params["season"])
         text = await limits.read_document(request, "ticket")
+        header = request.headers.get("Authorization")
 
         def start() -> tuple[sealed.Ticket, bool]:
             envelope = Envelope.read(text, SignedTicketRequest)
+            intake.refuse_other_sender(self._store, envelope, header)
             number, new = intake.start_ticket(self._store, envelope, tickets.digest)
             return tickets.ticket(number).document, new
 
@@ -152,13 +155,15 @@ class SeasonRoutes:
         name = request.path_params["season"]
         text = await limits.read_document(request, "entry")
 
-        def enter() -> tuple[str, bool]:
-            envelope = Envelope.read(text, SignedEntry)
-            season = self._store.season_row(name).digest
-            return envelope.id, intake.receive_entry(self._store, envelope, season, self._refusals)
+        # Garbage without a valid signature never waits with entries, whose check is longer.
+        envelope = await self._requests.run(lambda: Envelope.read(text, SignedEntry))
 
-        id, new = await self._entries.run(enter)
-        return JSONResponse({"id": id}, 201 if new else 200)
+        def enter() -> bool:
+            season = self._store.season_row(name).digest
+            return intake.receive_entry(self._store, envelope, season, self._refusals)
+
+        new = await self._entries.run(enter, envelope.key)
+        return JSONResponse({"id": envelope.id}, 201 if new else 200)
 
     async def get_ticket(self, request: Request) -> Response:
         """A ticket's status."""
@@ -186,9 +191,8 @@ class SeasonRoutes:
         """The challenge states of an instance."""
         tickets, where = self.place(request.scope)
         await self._in_thread(lambda: tickets.refuse_challenge(*where))
-        return _octets(
-            await to_thread.run_sync(lambda: tickets.challenge(*where), limiter=self._challenges)
-        )
+        owner = f"{tickets.season.id}/{where.ticket}"
+        return _octets(await self._challenges.run(lambda: tickets.challenge(*where), owner))
 
     async def answer(self, request: Request) -> Response:
         """Store the answers to a challenge."""

@@ -57,19 +57,27 @@ def serve(
         client, which counts for the limit on requests by address, and they may open any number of
         connections. From anyone else the header is ignored.
       unsafe_no_sandbox: score without bubblewrap. Submitted policies could then read the files of
-        this account and use the network, so nobody else may be able to submit.
+        this account and use the network, so nobody else may be able to submit. Not with the master
+        of a season, which is one of these files.
       season_secrets: the files of the masters of the sealed-online seasons that are stepped.
 
     Raises:
       BoardError: the folder holds no board, the address cannot be used, bubblewrap, which the
         scorers need, does not work, or a master is of no season of the board.
-      OptionError: the public address, or that of a proxy, is invalid.
+      OptionError: the public address, or that of a proxy, is invalid, or scoring without bubblewrap
+        would let policies read the master of a season.
       MissingDependencyError: FastAPI or uvicorn is not installed.
     """
     if url and not _PUBLIC_URL.fullmatch(url):
         raise OptionError(
             f"url={url!r:.80}: must be http(s)://host[:port][/path]. Give the address at which "
             "others reach the board."
+        )
+    secrets = list(season_secrets)
+    if unsafe_no_sandbox and workers and secrets:
+        raise OptionError(
+            "unsafe_no_sandbox=True: must be False with season_secrets, which submitted policies "
+            "could read. Install bubblewrap, or score no submissions (--workers 0)."
         )
     require_packages("serving a board", {"fastapi": "FastAPI", "uvicorn": "uvicorn"}, "leaderboard")
     import uvicorn
@@ -84,7 +92,7 @@ def serve(
         score_workers=workers,
         url=url.rstrip("/"),
         isolation="process" if unsafe_no_sandbox else "bwrap",
-        season_secrets=season_secrets,
+        season_secrets=secrets,
     )
     config = server_config(app, Connections(limits, proxies))
     with listen(host, port) as listener:

@@ -57,6 +57,7 @@ def tiny_terms(track: str = "sealed-offline", instances: int = 2, **fields: Any)
             "protocol_name": "quick-v1",
             "protocol": EvaluationProtocol(states_per_region=50).to_dict(),
             "ticket_hours": 24 if online else None,
+            "tickets": 100 if online else None,
             "tickets_per_key": 2 if online else None,
             "published": [] if online else published,
             **fields,

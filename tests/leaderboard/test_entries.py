@@ -68,6 +68,15 @@ def test_an_entry_is_stored_once_with_its_answers(store, key):
     assert not store.is_public(digest(GOOD))
 
 
+def test_the_same_answers_are_read_once(store, key, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(
+        "leaderboard.intake.entries.read_answers", lambda data, *_: sizes.append(len(data))
+    )
+    assert send(store, entry(store, key, GOOD, GOOD), GOOD)
+    assert sizes == [len(GOOD)]
+
+
 def test_answers_may_be_uploaded_before(store, key):
     signed = entry(store, key, GOOD, GOOD)
     with pytest.raises(Rejection, match="artefact_missing"):

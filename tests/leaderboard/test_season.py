@@ -181,7 +181,8 @@ def test_the_plan_in_the_documentation_is_one() -> None:
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)
     terms = read_plan(json.loads(text))
     assert len(terms.published) == 10
-    online = {**terms.to_dict(), "track": "sealed-online", "ticket_hours": 24, "tickets_per_key": 3}
+    online = {**terms.to_dict(), "track": "sealed-online", "ticket_hours": 24}
+    online |= {"tickets": 100, "tickets_per_key": 3}
     del online["published"]
     online["classes"][0] |= {"data": None, "budget": 1000}
     assert read_plan(online).published == ()

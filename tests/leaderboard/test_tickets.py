@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from leaderboard.cli import app
 from leaderboard.cli.options import KEY_VARIABLE
+from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.store import Store
 from leaderboard.web import client
@@ -91,6 +92,8 @@ def test_an_interrupted_request_gets_the_same_ticket(
     start(2, url)
     assert not Path("ticket.json").exists()
     monkeypatch.setattr(client, "request_ticket", request)
+    other = SigningKey.generate().write(Path("other.key"))
+    assert "bad_signature" in start(1, url, "--key", other)  # and the request is kept
     assert "Repeating ticket.json.request." in start(0, url)
     assert Ticket.read("ticket.json").ticket == 1
     assert "already exists" in start(2, url)

@@ -31,6 +31,7 @@ def online(**fields: Any) -> dict[str, Any]:
         "protocol_name": "quick-v1",
         "protocol": {},
         "ticket_hours": 24,
+        "tickets": 100,
         "tickets_per_key": 3,
         **fields,
     }
@@ -42,6 +43,7 @@ def offline(**fields: Any) -> dict[str, Any]:
     own = {
         "track": "sealed-offline",
         "ticket_hours": None,
+        "tickets": None,
         "tickets_per_key": None,
         "classes": [{"name": "deep", "setting": SETTING, "instances": 2, "data": data}],
         "published": [{"class_name": "deep", "instance": i, **digests} for i in (0, 1)],

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedManifest
+from leaderboard.intake import upload_header
 from leaderboard.store import Store
 from sme_registry import sealed
 from tests.leaderboard.conftest import tiny_board
@@ -32,14 +33,15 @@ class Board(NamedTuple):
         with Store.open(self.path) as store:
             return signed_request(store, self.season, key, nonce, **fields)
 
-    def send(self, url: str, request: SignedManifest) -> httpx.Response:
-        """What a served board answers to a request for a ticket."""
+    def send(self, url: str, request: SignedManifest, key: SigningKey) -> httpx.Response:
+        """What a served board answers to a request for a ticket that a key sends."""
         path = url + sealed.tickets_path(self.season.id)
-        return httpx.post(path, content=request.to_bytes(), trust_env=False)
+        headers = {"Authorization": upload_header(key, request.id, board=request.board)}
+        return httpx.post(path, content=request.to_bytes(), headers=headers, trust_env=False)
 
     def ticket(self, url: str, key: SigningKey, nonce: int = 0) -> sealed.Ticket:
         """A new ticket of a served board."""
-        answer = self.send(url, self.request(key, nonce))
+        answer = self.send(url, self.request(key, nonce), key)
         assert answer.status_code == 201, answer.text
         return sealed.Ticket.from_dict(answer.json())
 

@@ -48,8 +48,7 @@ def secrets_of(board: Board, store: Store) -> list[bytes]:
 
 def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
     """The answers to every request of an entrant, and to a refused one of each kind."""
-    tickets = sealed.tickets_path(board.season.id)
-    started = client.post(url + tickets, content=board.request(KEY).to_bytes())
+    started = board.send(url, board.request(KEY), KEY)
     yield started
     ticket = sealed.Ticket.from_dict(started.json())
     token = {"Authorization": sealed.bearer(ticket.token)}

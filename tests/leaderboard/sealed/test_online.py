@@ -13,12 +13,14 @@ import pytest
 
 from leaderboard.documents.entry import TicketRequest
 from leaderboard.documents.keys import SigningKey
+from leaderboard.intake import upload_header
 from leaderboard.sealed import Tickets
 from leaderboard.sealed.attendant import Attendant
+from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import sealed
 from tests.leaderboard.sealed.playing import online_board
-from tests.leaderboard.sealing import manifest, moment, tiny_season
+from tests.leaderboard.sealing import MASTER, manifest, moment, tiny_season
 from tests.leaderboard.serving import serving
 
 KEY = SigningKey.generate()
@@ -51,7 +53,10 @@ def test_a_ticket_that_cannot_be_scored_holds_up_no_other(
     board = online_board(tmp_path)
     with serving(board.path, season_secrets=[board.secret]) as url:
         for nonce in range(2):
-            board.ticket(url, KEY, nonce)
+            ticket = board.ticket(url, KEY, nonce)
+            with sealed.Instance(url, ticket, 0, lanes=4) as instance:
+                instance.begin()
+                instance.step(np.zeros((4, 1), np.float32))
     clock = time.time
     monkeypatch.setattr("leaderboard.sealed.tickets.time.time", lambda: clock() + 25 * 3600)
     with Store.open(board.path) as store:
@@ -66,6 +71,68 @@ def test_a_ticket_that_cannot_be_scored_holds_up_no_other(
         attend(attendant, times=2)
         assert tickets.over() == []
         tickets.close()
+
+
+def test_tickets_that_nobody_played_score_one_without_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        for nonce in range(2):
+            ticket = board.ticket(url, KEY, nonce)
+        with sealed.Instance(url, ticket, 0, lanes=48) as instance:
+            instance.begin()
+    clock = time.time
+    monkeypatch.setattr("leaderboard.sealed.tickets.time.time", lambda: clock() + 25 * 3600)
+    monkeypatch.delattr(Attendant, "_start")
+    with Store.open(board.path) as store:
+        tickets = Tickets(store, board.secret)
+        evaluated = [score_ticket(store, board.season, MASTER, number) for number in (1, 2)]
+        Attendant(tickets).attend()
+        assert tickets.over() == []
+        assert [
+            store.sealed_result(row) for row in store.entrants(board.season.digest)
+        ] == evaluated
+        # Nor does such a ticket keep its name from others.
+        assert store.holder_of_name(f"Tester {KEY.public[:8]}") is None
+        tickets.close()
+
+
+def test_a_season_and_a_key_have_only_so_many_tickets(tmp_path: Path) -> None:
+    board = online_board(tmp_path, tickets=1)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        board.ticket(url, KEY)
+        answer = board.send(url, board.request(OTHER), OTHER)
+    assert (answer.status_code, answer.json()["code"]) == (429, "ticket_limit")
+
+
+def test_tickets_count_towards_the_quota_of_a_day(tmp_path: Path) -> None:
+    board = online_board(tmp_path, tickets_per_key=100)
+    with Store.open(board.path) as store:
+        limit = store.document.limits.submissions_per_day
+        for nonce in range(limit):
+            store.start_ticket(board.request(KEY, nonce))
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        answer = board.send(url, board.request(KEY, limit), KEY)
+    assert (answer.status_code, answer.json()["code"]) == (429, "quota")
+
+
+def test_a_request_that_others_read_is_no_password(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    request = board.request(KEY)
+    with (
+        serving(board.path, season_secrets=[board.secret]) as url,
+        httpx.Client(trust_env=False) as client,
+    ):
+        assert board.send(url, request, KEY).status_code == 201
+        path = url + sealed.tickets_path(board.season.id)
+        stored = board.path.glob("seasons/*/tickets/1/ticket.json")
+        without = client.post(path, content=next(stored).read_bytes())
+        stale = upload_header(KEY, request.id, moment(-0.1), board=request.board)
+        late = client.post(path, content=request.to_bytes(), headers={"Authorization": stale})
+        others = board.send(url, request, OTHER)
+    answers = [(each.status_code, each.json()["code"]) for each in (without, late, others)]
+    assert answers == [(403, "bad_signature"), (403, "stale_time"), (403, "bad_signature")]
 
 
 def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
@@ -93,9 +160,9 @@ def test_the_same_request_has_the_same_ticket_and_another_one_a_new_ticket(tmp_p
     board = online_board(tmp_path)
     request = board.request(KEY)
     with serving(board.path, season_secrets=[board.secret]) as url:
-        first, again = board.send(url, request), board.send(url, request)
-        other = board.send(url, board.request(KEY, 1))
-        limited = board.send(url, board.request(KEY, 2))
+        first, again = (board.send(url, request, KEY) for _ in range(2))
+        other = board.send(url, board.request(KEY, 1), KEY)
+        limited = board.send(url, board.request(KEY, 2), KEY)
     assert [first.status_code, again.status_code, other.status_code] == [201, 200, 201]
     assert first.json() == again.json()
     assert [first.json()["ticket"], other.json()["ticket"]] == [1, 2]
@@ -132,7 +199,7 @@ def test_requests_for_tickets_are_checked(
             }
         )
     with serving(board.path, season_secrets=[board.secret]) as url:
-        answer = board.send(url, signed)
+        answer = board.send(url, signed, KEY)
         assert (answer.status_code, answer.json()["code"]) == (status, code)
         names = [each["id"] for each in httpx.get(f"{url}/api/seasons").json()["seasons"]]
     assert names == [board.season.id]
@@ -145,7 +212,7 @@ def test_a_name_belongs_to_one_key(tmp_path: Path) -> None:
     with serving(board.path, season_secrets=[board.secret]) as url:
         board.ticket(url, KEY)
         name = {"name": f"Tester {KEY.public[:8]}", "key": OTHER.public}
-        answer = board.send(url, board.request(OTHER, submitter=name))
+        answer = board.send(url, board.request(OTHER, submitter=name), OTHER)
     assert (answer.status_code, answer.json()["code"]) == (422, "name_taken")
 
 
@@ -160,14 +227,14 @@ def test_tickets_start_while_the_season_is_open(
     if code == "season_closed":
         monkeypatch.setattr("leaderboard.store.sealed.now", lambda: moment(0.6))
     with serving(board.path, season_secrets=[board.secret]) as url:
-        answer = board.send(url, board.request(KEY))
+        answer = board.send(url, board.request(KEY), KEY)
     assert (answer.status_code, answer.json()["code"]) == (422, code)
 
 
 def test_a_server_without_the_master_steps_nothing(tmp_path: Path) -> None:
     board = online_board(tmp_path)
     with serving(board.path) as url:
-        answer = board.send(url, board.request(KEY))
+        answer = board.send(url, board.request(KEY), KEY)
         unknown = httpx.post(f"{url}/api/seasons/none/tickets", content=b"{}")
         [listed] = httpx.get(f"{url}/api/seasons").json()["seasons"]
         season = httpx.get(f"{url}/api/seasons/{board.season.id}").json()

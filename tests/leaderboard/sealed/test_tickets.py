@@ -21,7 +21,9 @@ from leaderboard.intake import start_ticket
 from leaderboard.scoring.sealed import instances
 from leaderboard.sealed import Tickets
 from leaderboard.sealed import tickets as tickets_module
+from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
+from leaderboard.sealed.stepping import Lanes
 from leaderboard.store import Store
 from sme_registry.sealed import StepFormat, pack_table, unpack_table
 from tests.leaderboard.sealed.playing import Board, online_board
@@ -299,6 +301,57 @@ def test_answers_that_do_not_fit_the_disk_are_not_stored(
     played.restart()
     assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
     assert played.answer(half)
+
+
+def test_a_step_that_fails_after_it_was_recorded_is_answered_when_it_is_sent_again(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.start()
+    played.step(1)
+
+    def fails(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Lanes, "step", fails)
+    with pytest.raises(MemoryError):
+        played.step(2)
+    monkeypatch.undo()
+    answers = [played.step(2), played.step(3)]
+    played.restart()
+    assert played.step(3) == answers[1]
+    assert played.used == 3 * LANES
+    assert np.isfinite(WIRE.unpack_steps(answers[0]).observation).all()
+
+
+def test_answers_whose_folder_could_not_be_synced_are_confirmed_when_they_are_sent_again(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.finish()
+
+    def fails(_: Path) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    half = np.full((ROWS, 1), 0.5)
+    monkeypatch.setattr("leaderboard.sealed.instance.io.sync_folder", fails)
+    for _ in range(2):
+        refused("storage_full", played.answer, half)
+    monkeypatch.undo()
+    assert not played.answer(half)
+    assert played.tickets.ticket(played.number).instance(0).answered
+
+
+def test_large_networks_take_more_memory_and_no_time_of_the_event_loop(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SteppedInstance, "weights", 2**20)
+    monkeypatch.setattr(tickets_module, "MOST_HELD_LANES", 2**21 // 100)
+    played.start()
+    assert played.tickets.ticket(played.number).instance(0).is_ready
+    played.start(instance=1)
+    ticket = played.tickets.ticket(played.number)
+    assert [each.is_ready for each in ticket.instances] == [False, True]
+    monkeypatch.setattr(SteppedInstance, "weights", 2**22)
+    assert not ticket.instance(1).is_ready
 
 
 def test_instances_used_long_ago_leave_memory_and_go_on(

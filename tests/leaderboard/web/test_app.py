@@ -314,6 +314,11 @@ def test_a_public_address_is_a_plain_url(store: Store, url: str) -> None:
         serve(store.folder.path, port=0, workers=0, url=url)
 
 
+def test_no_policy_is_scored_where_it_could_read_the_master_of_a_season(store: Store) -> None:
+    with pytest.raises(OptionError, match="unsafe_no_sandbox=True"):
+        serve(store.folder.path, port=0, unsafe_no_sandbox=True, season_secrets=["a.master"])
+
+
 def test_a_browser_gets_a_page_for_an_unknown_address(
     published: tuple[str, dict[str, str]],
 ) -> None:

@@ -20,6 +20,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.store import Store
 from leaderboard.web import client, limits, serve
 from leaderboard.web.connections import Connections
+from sme_registry import sealed
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
 from tests.leaderboard.web.test_client import bundle_of
@@ -117,6 +118,20 @@ def test_the_board_knows_the_clients_of_nginx_and_believes_nobody_else(
         other.get(f"{url}/healthz", timeout=PATIENCE)
         other.get(f"{url}/healthz", headers={"X-Forwarded-For": "203.0.113.7"}, timeout=PATIENCE)
     assert seen == ["127.0.0.2"] * 2
+
+
+def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact() -> None:
+    text = CONFIGURATION.read_text()
+    [location] = re.findall(r"location ~ (\S+) \{[^}]*zone=board_steps", text)
+    assert text.count("zone=board_steps burst") == 1
+    matched = {
+        name
+        for name in ("steps", "start", "challenge", "answers")
+        if re.search(location, sealed.instance_path("autumn", 12, 3, name))
+    }
+    assert matched == {"steps"}
+    assert not re.search(location, sealed.tickets_path("autumn"))
+    assert {int(size) for size in re.findall(r"client_max_body_size (\d+)m;", text)} == {2, 9}
 
 
 def test_silent_and_slow_clients_of_nginx_do_not_reach_the_board(
