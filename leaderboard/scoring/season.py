@@ -10,17 +10,19 @@ A rank needs the board's `runs_to_rank` runs in each class, over all tickets.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master
-from leaderboard.documents.result import Metric, RunScore, SealedResult
+from leaderboard.documents.result import Metric, RunScore, Scores, SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
+from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.ranking import RankedRow, ranking
 from leaderboard.scoring.sealed import groups_of_season, instances, score_run, sealed_result
 from leaderboard.store import EntryRow, SealedRow, Store
@@ -29,6 +31,9 @@ Progress = Callable[[int, int], None]
 
 KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 """Ranked apart, in this order."""
+
+# A bootstrap each, which every page of the season shows. Results never change.
+_TOGETHER: Memo[tuple[Scores, bool]] = Memo(1024)
 
 
 def counting(store: Store, season: Season) -> list[SealedRow]:
@@ -135,9 +140,9 @@ def _methods(
         entrants = [row.entrant for row in members]
         entry = entrants[-1]
         if len(members) > 1:
-            runs = [result.runs for result in _results(store, members)]
-            scores = method_scores(
-                groups_of_season(season, runs), store.document.draws, season.digest
+            scores, oracle_like = _TOGETHER.get(
+                (store.document.draws, *(row.result for row in members)),
+                partial(_score_together, store, season, members),
             )
             entry = replace(
                 entry,
@@ -145,11 +150,19 @@ def _methods(
                 runs=sum(each.runs for each in entrants),
                 policies=sum(each.policies for each in entrants),
                 steps=sum(each.steps for each in entrants),
-                oracle_like=is_oracle_like(scores, RULES, _all(runs)),
+                oracle_like=oracle_like,
             )
         enough = fewest * len(members) >= store.document.runs_to_rank
         entries[method] = replace(entry, enough_runs=enough)
     return entries
+
+
+def _score_together(store: Store, season: Season, rows: Sequence[SealedRow]) -> tuple[Scores, bool]:
+    """The scores of all runs of some tickets, and whether they are oracle-like."""
+    runs = [result.runs for result in _results(store, rows)]
+    groups = groups_of_season(season, runs)
+    scores = method_scores(groups, store.document.draws, season.digest)
+    return scores, is_oracle_like(scores, RULES, _all(runs))
 
 
 def _results(store: Store, rows: Iterable[SealedRow]) -> Iterator[SealedResult]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -10,6 +11,7 @@ from markupsafe import Markup
 from leaderboard.documents.result import SealedResult
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import Knowledge
+from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.ranking import RankedRow
 from leaderboard.scoring.season import OfKey, by_key, counting, season_rankings
 from leaderboard.store import SealedRow, SeasonRow, Store
@@ -63,17 +65,17 @@ def season_page(store: Store, row: SeasonRow) -> SeasonPage:
     season = store.season(row.digest)
     counted = {each.entrant.id for each in counting(store, season)}
     rows = store.entrants(row.digest)
-    results = [store.sealed_result(each) for each in rows]
-    curves = [_mean_curve(result) for result in results]
-    drawn = iter(charts.sparklines([each for each in curves if each], "From the first step"))
+    stepped = [_stepped(store, each) for each in rows]
+    curves = [each.curve for each in stepped if each.curve]
+    drawn = iter(charts.sparklines(curves, "From the first step"))
     entrants = [
         EntrantRow(
             row=each,
             counts=each.entrant.id in counted,
-            online_regret=_online_regret(result),
-            curve=next(drawn) if curve else Markup(""),
+            online_regret=of.regret,
+            curve=next(drawn) if of.curve else Markup(""),
         )
-        for each, result, curve in zip(rows, results, curves, strict=True)
+        for each, of in zip(rows, stepped, strict=True)
     ]
     return SeasonPage(
         row=row,
@@ -83,6 +85,27 @@ def season_page(store: Store, row: SeasonRow) -> SeasonPage:
         keys=by_key(store, season),
         master=store.revealed_master(row.digest).raw.hex() if row.reveal else "",
     )
+
+
+class _Stepped(NamedTuple):
+    """What the table shows of a ticket's steps; nothing offline, and before its end."""
+
+    regret: float | None
+    curve: list[float]
+
+
+_STEPPED: Memo[_Stepped] = Memo(4096)  # results may have megabytes, and never change
+
+
+def _stepped(store: Store, row: SealedRow) -> _Stepped:
+    if row.result is None:
+        return _Stepped(None, [])
+
+    def read() -> _Stepped:
+        result = store.sealed_result(row)
+        return _Stepped(_online_regret(result), _mean_curve(result))
+
+    return _STEPPED.get(row.result, read)
 
 
 def _online_regret(result: SealedResult | None) -> float | None:

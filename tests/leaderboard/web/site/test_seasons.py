@@ -96,6 +96,22 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
     assert sum(label.startswith("From the first step: 1.00") for label in labels) == 1
 
 
+def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch) -> None:
+    board.announce(ONLINE)
+    for number in (1, 2):
+        request = signed_request(board, ONLINE, key, number)
+        board.start_ticket(request)
+        board.end_ticket(ONLINE.digest, number, result(ONLINE, request.id))
+    first = page(board, "seasons/winter.html")
+    assert first.words.count("0.625") == 2
+
+    def read(row: object) -> None:
+        raise AssertionError("it is known")
+
+    monkeypatch.setattr(board, "sealed_result", read)
+    assert page(board, "seasons/winter.html").words == first.words
+
+
 def test_the_site_of_a_board_with_seasons_is_well_formed_and_its_links_work(
     board, key, tmp_path
 ) -> None:
