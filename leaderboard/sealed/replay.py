@@ -119,6 +119,8 @@ def _check_rules(store: Store, season: Season, rows: Sequence[SealedRow]) -> Non
         own[row.entrant.key] += 1
         if season.tickets_per_key is not None and own[row.entrant.key] > season.tickets_per_key:
             _refuse(store, path, f"exceeds the {season.tickets_per_key} tickets of a key")
+        if season.tickets is not None and row.number > season.tickets:
+            _refuse(store, path, f"exceeds the {season.tickets} tickets of the season")
         if online and row.entrant.policies < row.entrant.runs and row.result is not None:
             end = utc(deadline(season, row))
             if row.finished < end:

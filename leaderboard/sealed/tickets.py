@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import math
 import os
 import threading
 import time
@@ -27,6 +28,8 @@ MOST_HELD_LANES, _FIXED_LANES, _WEIGHTS_OF_A_LANE = 2**17, 128, 100
 Those used longest ago are replayed when they go on.
 """
 
+_SURE_SECONDS = 60.0
+
 
 class Clock:
     """The board's time, which does not go back while the server runs.
@@ -38,11 +41,24 @@ class Clock:
     def __init__(self, start: str) -> None:
         first = max(datetime.datetime.fromisoformat(start).timestamp(), time.time())
         self._offset = first - time.monotonic()
+        self._forward_since = math.inf  # uptime
 
     @property
     def now(self) -> float:
         """Seconds since 1970."""
         return max(time.time(), self._offset + time.monotonic())
+
+    @property
+    def sure(self) -> float:
+        """The same for what cannot be undone: a clock set forward counts after a minute."""
+        uptime = time.monotonic()
+        if time.time() - uptime - self._offset < _SURE_SECONDS:
+            self._forward_since = math.inf
+        else:
+            self._forward_since = min(self._forward_since, uptime)
+            if uptime - self._forward_since >= _SURE_SECONDS:
+                self._offset = time.time() - uptime
+        return self._offset + uptime
 
 
 class Tickets:
@@ -170,13 +186,13 @@ class Tickets:
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""
-        waiting = []
+        waiting, now = [], self._clock.sure
         for row in self._store.entrants(self.digest):
             if row.result is None:
                 waiting.append(row.number)
             else:
                 self._running.pop(row.number, None)  # closed, and so its files are final
-        return [number for number in waiting if self.ticket(number).is_over(self.now)]
+        return [number for number in waiting if self.ticket(number).is_over(now)]
 
     def close_ticket(self, number: int) -> None:
         """Refuse all further requests for a ticket, after those in progress."""

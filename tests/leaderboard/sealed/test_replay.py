@@ -142,6 +142,21 @@ def test_more_tickets_than_a_key_may_have_are_found(
             verify_season(store, board.season.id)
 
 
+def test_more_tickets_than_a_season_may_have_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
+) -> None:
+    board = online_board(tmp_path, tickets=1)
+    with Store.open(board.path) as store:
+        folder = store.season_folder(board.season.digest)
+        for number in (1, 2):
+            request = signed_request(store, board.season, key, number)
+            path = folder.request(number)
+            logged(monkeypatch, moment(0), store, "ticket", request.id, request, path)
+        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
+        with pytest.raises(TamperedError, match=r"tickets/2/ticket\.json: exceeds the 1 tickets"):
+            verify_season(store, board.season.id)
+
+
 def test_a_ticket_that_ended_early_without_all_answers_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
 ) -> None:

@@ -245,11 +245,25 @@ def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPa
     assert played.tickets.over() == []
     clock = tickets_module.time.time
     monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
-    assert played.tickets.over() == [played.number]
     refused("ticket_ended", played.step, 2)
     refused("ticket_ended", played.start)
     refused("ticket_ended", played.finish)
     assert played.tickets.status(played.number, played.token).phase == "ended"
+
+
+def test_a_clock_set_forward_ends_tickets_after_a_minute(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uptime, clock = tickets_module.time.monotonic, tickets_module.time.time
+
+    def over(hours: float, passed: float) -> list[int]:
+        monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + passed)
+        monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + hours * 3600 + passed)
+        return played.tickets.over()
+
+    looks = ((25, 0.0), (25, 50.0), (0, 60.0), (25, 70.0), (25, 129.0))
+    assert [over(*look) for look in looks] == [[]] * 5
+    assert over(25, 131.0) == [played.number]
 
 
 def test_a_clock_set_back_extends_no_deadline(
