@@ -251,6 +251,19 @@ def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPa
     assert played.tickets.status(played.number, played.token).phase == "ended"
 
 
+def test_an_altered_request_holds_up_no_other_ticket(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second = played.board.request(KEY, 1)
+    played.store.start_ticket(second)
+    folder = played.store.season_folder(played.board.season.digest)
+    folder.request(played.number).write_bytes(second.to_bytes())
+    clock = tickets_module.time.time
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
+    played.restart()
+    assert played.tickets.over() == [2]
+
+
 def test_a_clock_set_forward_ends_tickets_after_a_minute(
     played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
