@@ -70,10 +70,12 @@ def test_cells_have_limits_and_distractors_and_repeat_to_the_bit(uses: str) -> N
     assert done.report.observation is not None
 
 
-def test_agents_in_jax_refuse_limits_before_they_begin() -> None:
-    spec = SMESpec(state_dim=2, action_dim=1).derive(safety={"tightness": 0.2})
-    with pytest.raises(SpecError, match="tasks in JAX have no safety"):
-        check_task(cell("jax:PPO", spec=spec))
+def test_agents_in_jax_accept_limits_and_refuse_teams_before_they_begin() -> None:
+    spec = SMESpec(state_dim=2, action_dim=1)
+    check_task(cell("jax:PPO", spec=spec.derive(safety={"tightness": 0.2})))
+    team = spec.derive(team={"agents": [{"name": "agent_0", "action_dim": 1}]})
+    with pytest.raises(SpecError, match="uses='jax:PPO': cannot learn a task for 1 agents"):
+        cell("jax:PPO", spec=team)
 
 
 def test_more_noise_makes_worse_data_and_other_cells() -> None:
