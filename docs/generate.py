@@ -69,7 +69,7 @@ def _short(digest: str) -> str:
     return digest[: len("sha256:") + 12]
 
 
-PAGES = {"catalogue.md": catalogue, "leaderboard-codes.md": leaderboard_codes}
+PAGES = {"reference/catalogue.md": catalogue, "reference/leaderboard-codes.md": leaderboard_codes}
 
 if __name__ == "__main__":
     for name, page in PAGES.items():

@@ -27,7 +27,7 @@ try:
     from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
     from ray.tune.registry import register_env
 except ModuleNotFoundError as error:
-    sys.exit(f"{error.name} is not installed. docs/frameworks.md has the command.")
+    sys.exit(f"{error.name} is not installed. docs/guides/frameworks.md has the command.")
 
 ROLLOUT = 2048
 

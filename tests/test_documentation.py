@@ -25,9 +25,14 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 @pytest.mark.parametrize(
     "page",
     [
-        "README.md", "docs/specs.md", "docs/streams.md", "docs/teams.md", "docs/training.md",
-        "docs/datasets.md", "docs/figures.md", "docs/frameworks.md", "docs/retention.md",
-        "docs/safety_and_observation.md",
+        "README.md",
+        *(
+            f"docs/guides/{name}.md"
+            for name in (
+                "specs", "streams", "teams", "training", "datasets", "figures", "frameworks",
+                "retention", "safety_and_observation",
+            )
+        ),
     ],
 )  # fmt: skip
 def test_the_python_of_a_page_runs_from_top_to_bottom(
@@ -47,7 +52,7 @@ def test_the_page_on_own_agents_works_from_training_to_the_board(
     for package in ("torch", "matplotlib", "onnx", "onnxruntime", "nacl"):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "own_agents.md").read_text()
+    page = (ROOT / "docs" / "tutorials" / "own_agents.md").read_text()
     assert "STEPS = 5_000" in page
     namespace: dict[str, Any] = {"__name__": "page"}
     for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S):
@@ -65,7 +70,7 @@ def test_the_page_on_the_leaderboard_leads_from_an_own_suite_to_a_rank(
     for package in ("torch", "onnx", "onnxruntime"):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "leaderboard.md").read_text()
+    page = (ROOT / "docs" / "guides" / "leaderboard.md").read_text()
     (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)
     commands = re.findall(r"^(sme|sme-leaderboard) (.*)$", block, re.M)
     assert len(commands) == 8
@@ -132,7 +137,7 @@ def test_the_table_of_fields_has_every_field_and_its_default() -> None:
 
 
 def test_the_table_of_safety_and_observation_has_every_field() -> None:
-    page = (ROOT / "docs" / "safety_and_observation.md").read_text()
+    page = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
     documented = re.findall(r"^\| `((?:safety|observation)\.\w+)` \|", page, re.M)
     kinds = {"safety": SafetySpec, "observation": ObservationSpec}
     fields = [f"{name}.{field}" for name, kind in kinds.items() for field in kind.model_fields]
@@ -142,7 +147,7 @@ def test_the_table_of_safety_and_observation_has_every_field() -> None:
 def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> None:
     from sme_registry.cli import app as sme
 
-    page = (ROOT / "docs" / "safety_and_observation.md").read_text()
+    page = (ROOT / "docs" / "guides" / "safety_and_observation.md").read_text()
     block = page.split("## One task from spec to agent")[1]
     command = block.split("```")[1].replace("\\\n", "").splitlines()[1]
     arguments = shlex.split(command)[1:]
@@ -157,7 +162,7 @@ def test_the_checks_of_the_page_are_those_of_a_certificate(tmp_path: Path) -> No
 
 
 def specs_page() -> str:
-    return (ROOT / "docs" / "specs.md").read_text()
+    return (ROOT / "docs" / "guides" / "specs.md").read_text()
 
 
 def number(text: str) -> float | str:

@@ -50,7 +50,8 @@ def test_ppo_of_a_framework_lowers_the_exact_regret(example: Path) -> None:
     """Where the framework is missing, the example says so in one line."""
     done = run(example, "--steps", "4096")
     print(done.stdout)  # for `make frameworks`
-    if re.fullmatch(r"\S+ is not installed. docs/frameworks.md has the command.\n", done.stderr):
+    missing = r"\S+ is not installed. docs/guides/frameworks.md has the command.\n"
+    if re.fullmatch(missing, done.stderr):
         pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr
     exploring = [float(value) for value in re.findall(r"exploring: regret (\S+)", done.stdout)]

@@ -170,7 +170,7 @@ class _Inspection:
             _refuse(
                 "onnx_op",
                 f"op_type={operator!r}",
-                "must be an operator of a feed-forward network (see docs/own_agents.md)",
+                "must be an operator of a feed-forward network (see docs/tutorials/own_agents.md)",
                 "Export the deterministic actor alone with `sme_registry.export_onnx`, which "
                 "removes what it can and says how to rewrite the rest",
             )

@@ -238,7 +238,7 @@ def serve(
     """Serve the board: its pages, and an API that accepts submissions, and score them.
 
     By default only this machine can reach it. Put an HTTPS proxy in front of it for others; see
-    docs/deployment.md. Scoring needs bubblewrap (apt install bubblewrap).
+    docs/guides/deployment.md. Scoring needs bubblewrap (apt install bubblewrap).
 
     Examples:
 

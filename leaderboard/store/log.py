@@ -186,7 +186,7 @@ class Log:
             return
         raise BoardError(
             f"clock={time}: is {fault}. Nothing was changed. Set the machine's clock, then try "
-            'again; docs/leaderboard.md, "A wrong clock", has the rest.'
+            'again; docs/guides/leaderboard.md, "A wrong clock", has the rest.'
         )
 
 

@@ -47,7 +47,7 @@ def serve(
     Args:
       path: the board's folder.
       host: address to listen on; put an HTTPS proxy in front of any but the loopback, as in
-        docs/deployment.md.
+        docs/guides/deployment.md.
       port: 0 for any free port.
       workers: number of scorer processes; 0 for none.
       announce: called with the board's URL once it listens.

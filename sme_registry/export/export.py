@@ -85,8 +85,8 @@ def export_onnx(
         warnings.warn(
             f"{written}: has the operators {', '.join(refused)}, which boards do not accept; "
             "evaluations do. To submit it, export the feed-forward actor alone, and write it with "
-            "`@`, slices, `split(n, -1)`, `cat` and `view(-1, n)`. docs/own_agents.md says which "
-            "operators pass.",
+            "`@`, slices, `split(n, -1)`, `cat` and `view(-1, n)`. "
+            "docs/tutorials/own_agents.md says which operators pass.",
             stacklevel=2,
         )
     return written

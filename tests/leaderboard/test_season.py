@@ -177,7 +177,7 @@ def test_a_plan_with_a_fault_is_refused_and_leaves_no_folder(tmp_path: Path) -> 
 
 
 def test_the_plan_in_the_documentation_is_one() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "seasons.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "guides" / "seasons.md").read_text()
     [text] = re.findall(r"```json\n(.*?)```", page, re.S)
     terms = read_plan(json.loads(text))
     assert len(terms.published) == 10

@@ -322,7 +322,7 @@ def signed_runs(board, count, **changes):
 
 def test_the_most_runs_of_a_submission_fit_and_a_tenth_more_do_not():
     most = most_runs(BOARD)
-    assert most == pytest.approx(200, abs=20)  # as docs/leaderboard.md says
+    assert most == pytest.approx(200, abs=20)  # as docs/guides/leaderboard.md says
     assert len(signed_runs(BOARD, most)) <= MAX_BYTES < len(signed_runs(BOARD, most + most // 10))
 
 
