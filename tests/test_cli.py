@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
 
 import sme_registry
 from sme_registry import EvaluationReport, SMESpec, StreamSpec, load, save
-from sme_registry.cli import app
 from sme_registry.evaluation import StreamReport
 from sme_registry.spec import (
     EnvFile,
@@ -29,6 +27,7 @@ from sme_registry.spec import (
     catalogue,
 )
 from sme_registry.task.certify import certify
+from tests.commands import good, refused, sme
 
 SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
 KINDS = (EnvFile, StreamFile, SuiteFile, ProtocolFile, StudyFile)
@@ -36,25 +35,6 @@ COMMANDS = [
     *("list", "show", "new", "suite", "validate", "certify"),
     *("evaluate", "train", "diagnose", "study", "demo"),
 ]
-
-
-def sme(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def good(*arguments: str | Path) -> Result:
-    result = sme(*arguments)
-    assert result.exit_code == 0, result.output
-    return result
-
-
-def refused(*arguments: str | Path) -> str:
-    """The message of a command that must refuse, after the rules that hold for all of them."""
-    result = sme(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert "Traceback" not in result.output
-    return result.stderr
 
 
 @pytest.fixture(autouse=True)

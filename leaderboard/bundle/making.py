@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from leaderboard.artefact.gate import inspect, widths
-from leaderboard.bundle.reading import Bundle, digest_of
+from leaderboard.bundle.reading import Bundle
 from leaderboard.bundle.runs import SubmittedRun, listed_by_class, refuse_other_specs, runs_of
 from leaderboard.documents.board import hex_of
 from leaderboard.documents.checks import check_names, check_runs
@@ -27,7 +27,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
-from sme_registry.io import build_folder, refuse_existing, write_atomically
+from sme_registry.io import build_folder, refuse_existing, sha256_of, write_atomically
 from sme_registry.spec import SuiteFile
 
 Progress = Callable[[int, int], None]
@@ -178,7 +178,7 @@ def _put_artefact(run: SubmittedRun, bundle: Path) -> Artefact | None:
         inspect(data, *widths(run.spec))
     except Rejection as error:
         raise Rejection(error.code, f"{run.source}: {error.message}") from error
-    artefact = Artefact(sha256=digest_of(data), size=len(data))
+    artefact = Artefact(sha256=sha256_of(data), size=len(data))
     write_atomically(bundle / ARTEFACTS / f"{hex_of(artefact.sha256)}.onnx", data)
     return artefact
 

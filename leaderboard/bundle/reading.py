@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
 import stat
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.errors import Rejection
 from sme_registry.errors import OptionError
+from sme_registry.io import sha256_of
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,14 @@ class Bundle:
                 f"{ARTEFACTS}/{name}: must be at most {MAX_ARTEFACT_BYTES:,} bytes. Submit a "
                 "smaller network.",
             )
-        if sizes != {len(data)} or digest_of(data) != digest:
+        if sizes != {len(data)} or sha256_of(data) != digest:
             raise Rejection(
                 "artefact_digest",
-                f"{ARTEFACTS}/{name}: {len(data):,} bytes of {digest_of(data)}: must be "
+                f"{ARTEFACTS}/{name}: {len(data):,} bytes of {sha256_of(data)}: must be "
                 f"{' and '.join(f'{size:,}' for size in sorted(sizes))} bytes of {digest}. "
                 "Recreate the bundle.",
             )
         return data
-
-
-def digest_of(data: bytes) -> str:
-    """The SHA-256 digest of bytes, as documents write it."""
-    return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
 def _read_regular(folder: Path, parts: tuple[str, ...], limit: int) -> bytes | None:

@@ -22,6 +22,7 @@ from leaderboard.documents.plain import plain_json
 from leaderboard.documents.reading import read_regular
 from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
+from sme_registry.io import sha256_of
 
 SEAL = "sme-seal/1"
 BYTES = 32
@@ -87,7 +88,7 @@ class Master:
 
     def commitment_to(self, terms: bytes) -> str:
         """SHA-256 of the seal, this master and a season's terms: `sha256:` and 64 hex digits."""
-        return "sha256:" + hashlib.sha256(SEAL.encode() + self.raw + terms).hexdigest()
+        return sha256_of(SEAL.encode() + self.raw + terms)
 
     def secret(self, purpose: Purpose, place: Place) -> bytes:
         """The 32 bytes for a purpose in a place."""

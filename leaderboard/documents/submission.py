@@ -9,7 +9,6 @@ A bundle is the submitted folder: `submission.json` (a `SignedSubmission`) and o
 from __future__ import annotations
 
 import datetime
-import hashlib
 import re
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
@@ -21,7 +20,7 @@ from leaderboard.documents.keys import PublicKey, Signature, SigningKey, verifie
 from leaderboard.documents.plain import PlainDocument
 from leaderboard.errors import Rejection
 from sme_registry.errors import MalformedDocumentError, SpecError
-from sme_registry.io import parse_json, to_json
+from sme_registry.io import parse_json, sha256_of, to_json
 from sme_registry.spec import (
     Digest,
     Document,
@@ -386,7 +385,7 @@ def _is_hex(value: Any, digits: int) -> bool:
 def _raw_digest(content: dict[str, Any], file: str) -> str:
     """The digest of a document's content as it arrived."""
     try:
-        return "sha256:" + hashlib.sha256(rfc8785.dumps(content)).hexdigest()
+        return sha256_of(rfc8785.dumps(content))
     except RecursionError:
         raise Rejection(
             "not_json", f"{file}: nested too deeply. Valid documents have at most ten levels."

@@ -9,7 +9,6 @@ All of it follows from the terms and the master, and `season.json` has its diges
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +23,7 @@ from leaderboard.scoring.sealed import Instance, challenge, instances
 from sme_registry.compiled import chosen_backend
 from sme_registry.datasets import DatasetRecipe, SealedDataset
 from sme_registry.evaluation import resolve_protocol
-from sme_registry.io import build_folder, read_json, to_json, versions
+from sme_registry.io import build_folder, read_json, sha256_of, to_json, versions
 from sme_registry.sealed import instance_name, pack_table, table_bytes
 
 Progress = Callable[[int, int], None]
@@ -289,7 +288,7 @@ def _digests(hidden: Hidden, data: SealedDataset, states: bytes) -> Digests:
         class_name=hidden.member.name,
         instance=hidden.instance,
         data=data.digest,
-        challenge=_sha256(states),
+        challenge=sha256_of(states),
     )
 
 
@@ -300,10 +299,6 @@ def _dataset_id(season: str, hidden: Hidden) -> str:
 def _file_digest(path: Path, season: Season, hidden: Hidden) -> str:
     size = table_bytes(rows_of(season.protocol), hidden.member.setting.state_dim + 2)
     try:
-        return _sha256(read_regular(path, size))
+        return sha256_of(read_regular(path, size))
     except OSError as error:
         raise BoardError(f"{path}: cannot be read: {error.strerror}. Download it again.") from None
-
-
-def _sha256(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()

@@ -178,7 +178,7 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
         fields = {"kind": "random"}
     elif isinstance(policy, str | os.PathLike):
         path = Path(policy)
-        fields = {"policy": path.stem, "sha256": sha256_of(path), "action_range": action_range}
+        fields = {"policy": path.stem, "sha256": policy_digest(path), "action_range": action_range}
     elif callable(policy) or hasattr(policy, "predict"):
         name = getattr(policy, "__name__", type(policy).__name__)
         name = "policy" if name == "<lambda>" else name
@@ -191,7 +191,7 @@ def parse_behaviour(policy: Any, weight: float = 1.0, action_range: str | None =
     return Behaviour.from_dict({"kind": "policy", "weight": weight, **fields}, "behaviour")
 
 
-def sha256_of(path: Path) -> str:
+def policy_digest(path: Path) -> str:
     """The SHA-256 digest of a policy's file; raises PolicyError if it cannot be read."""
     try:
         with path.open("rb") as stream:

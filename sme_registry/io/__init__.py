@@ -1,7 +1,8 @@
-"""Files, folders, locks, strict JSON, arrays, servers, spare memory, packages, argument checks."""
+"""Files, locks, digests, strict JSON, arrays, servers, spare memory, packages, argument checks."""
 
 from sme_registry.io.arrays import Arrays, read_arrays, write_arrays
 from sme_registry.io.checks import choice, integer_in, number_in
+from sme_registry.io.digests import sha256_of
 from sme_registry.io.files import (
     TEMPORARY,
     atomic_file,
@@ -53,6 +54,7 @@ __all__ = [
     "refuse_unwritable",
     "require_packages",
     "server_address",
+    "sha256_of",
     "sync_folder",
     "temporary_beside",
     "to_json",

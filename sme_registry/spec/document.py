@@ -6,7 +6,6 @@ equal digests on every machine, regardless of key order and of how a number was 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence, Sized
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
@@ -24,6 +23,7 @@ from pydantic import (
 )
 
 from sme_registry.errors import DigestMismatchError
+from sme_registry.io import sha256_of
 from sme_registry.spec.validation_errors import spec_error
 
 
@@ -202,7 +202,7 @@ class Document(StrictModel):
     @property
     def digest(self) -> str:
         """`sha256:` and 64 hex digits: the identity of this document."""
-        return "sha256:" + hashlib.sha256(self.canonical_json()).hexdigest()
+        return sha256_of(self.canonical_json())
 
 
 class NamedDocument(Document):

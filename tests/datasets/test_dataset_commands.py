@@ -11,26 +11,17 @@ from typer.testing import CliRunner
 
 from sme_registry.cli import app
 from sme_registry.datasets import open_dataset
+from tests import commands
 
 NAME = "sme/Default-v1-nu50-seed7-v0"
 
 
-def sme(*arguments):
-    return CliRunner().invoke(app, ["dataset", *map(str, arguments)])
-
-
 def good(*arguments):
-    result = sme(*arguments)
-    assert result.exit_code == 0, result.output
-    return result
+    return commands.good("dataset", *arguments)
 
 
 def refused(*arguments):
-    result = sme(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert "Traceback" not in result.output
-    return " ".join(result.stderr.split())
+    return " ".join(commands.refused("dataset", *arguments).split())
 
 
 @pytest.fixture(autouse=True)
@@ -87,14 +78,14 @@ def test_a_policys_zip_is_recorded_by_its_digest(tmp_path):
     from stable_baselines3 import PPO
 
     import sme_registry
-    from sme_registry.datasets.recipe import sha256_of
+    from sme_registry.io import sha256_of
 
     env = sme_registry.make("Default", action_range="symmetric")
     PPO("MlpPolicy", env, seed=0, n_steps=8, batch_size=8, device="cpu").save(tmp_path / "mine.zip")
     good("make", "Default", "--mix", "policy=mine.zip:1", "-n", "60", "--name", "sme/ppo-v0")
     (behaviour,) = open_dataset("sme/ppo-v0").recipe.behaviours
     assert behaviour.policy == "mine"
-    assert behaviour.sha256 == sha256_of(tmp_path / "mine.zip")
+    assert behaviour.sha256 == sha256_of((tmp_path / "mine.zip").read_bytes())
     assert "valid" in good("validate", "sme/ppo-v0").stdout
 
 
@@ -105,7 +96,7 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
 
     import sme_registry
     from leaderboard.cli import app as leaderboard
-    from sme_registry.datasets.recipe import sha256_of
+    from sme_registry.io import sha256_of
 
     env = sme_registry.make("Default", action_range="symmetric")
     TD3("MlpPolicy", env, seed=0, buffer_size=1, device="cpu").save(tmp_path / "mine.zip")
@@ -119,7 +110,7 @@ def test_a_policys_onnx_acts_as_its_zip(tmp_path):
     assert "valid" in good("validate", "sme/onnx-v0").stdout
     (behaviour,) = sets["onnx"].recipe.behaviours
     assert behaviour.policy == "mine"
-    assert behaviour.sha256 == sha256_of(tmp_path / "mine.onnx")
+    assert behaviour.sha256 == sha256_of((tmp_path / "mine.onnx").read_bytes())
     # A later step doubles a difference in the last bit; the first few are the same to rounding.
     one, other = (made.transitions().actions[:5] for made in sets.values())
     np.testing.assert_allclose(one, other, atol=1e-5)
@@ -176,7 +167,9 @@ def test_validate_names_the_invalid_data_set_and_checks_the_others(tmp_path):
         good("make", "Default", "-n", "50", "--name", name)
     with h5py.File(tmp_path / "minari/sme/bad-v0/data/main_data.hdf5", "r+") as file:
         file["episode_0/rewards"][0] = 1.0
-    result = sme("validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json")
+    result = commands.sme(
+        "dataset", "validate", "sme/bad-v0", "sme/good-v0", "sme/none-v0", "--json"
+    )
     assert result.exit_code == 2
     assert [checked["valid"] for checked in json.loads(result.stdout)] == [False, True, False]
 

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from sme_registry import SMESpec, StreamSpec
-from sme_registry.cli import app
 from sme_registry.diagnosis import (
     StreamDiagnosis,
     StreamSubject,
@@ -41,6 +39,7 @@ from sme_registry.studies import run_study
 from sme_registry.studies.engine.result import CellResult, LearningCurve, Timing
 from sme_registry.training import train
 from sme_registry.training.snapshots import Snapshots
+from tests.commands import refused, sme
 from tests.diagnosis.lives import (
     PROTOCOL,
     SPEC,
@@ -382,18 +381,6 @@ def test_a_life_is_readable_at_every_width_and_in_a_pipe(width: int | None) -> N
 
 
 # --- runs, cells and the command ----------------------------------------------------------------
-
-
-def sme(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def refused(*arguments: str | Path) -> str:
-    result = sme(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert "Traceback" not in result.output
-    return result.stderr
 
 
 def same_network(own: Perceptron | None, model: Any, hidden: str) -> bool:

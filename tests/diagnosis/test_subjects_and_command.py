@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 import sme_registry
-from sme_registry.cli import app
 from sme_registry.diagnosis import (
     Diagnosis,
     diagnose,
@@ -30,6 +28,7 @@ from sme_registry.errors import (
     UnknownNameError,
 )
 from sme_registry.wrappers import RecordRegret
+from tests.commands import refused, sme
 from tests.diagnosis.policies import SPEC, diagnosis_of, faults, shrunk
 from tests.geometry import assert_readable
 
@@ -50,18 +49,6 @@ def test_what_cannot_be_diagnosed_is_rejected(tmp_path: Path) -> None:
 
 
 # --- runs, cells and the command ----------------------------------------------------------------
-
-
-def sme(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def refused(*arguments: str | Path) -> str:
-    result = sme(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ")
-    assert "Traceback" not in result.output
-    return result.stderr
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,9 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
+from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
+from tests.leaderboard.sealing import move_clock
 
 Submit = Callable[..., SignedSubmission]
 
@@ -87,7 +88,7 @@ def tiny_submission(
       fields: of the submission, instead of those here.
     """
     data = linear_onnx(number)
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     plain = {
         "suite": store.document.suite_reference,
         "method": {
@@ -128,7 +129,7 @@ def put_submission(
 
 def put_policy(store: Store, key: SigningKey, data: bytes, number: int = 0) -> SignedSubmission:
     """`put_submission`, with one run: this artefact on the suite's first instance."""
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     store.put_object(digest, [data], by=key.public)
     run = {
         "spec": store.document.suite.instances[0].digest,
@@ -155,6 +156,12 @@ def key() -> SigningKey:
 def store(tmp_path: Path) -> Iterator[Store]:
     with tiny_board(tmp_path / "board") as made:
         yield made
+
+
+@pytest.fixture
+def later(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Moves the clock behind the close of tiny seasons."""
+    return functools.partial(move_clock, monkeypatch)
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import datetime
 import functools
 from typing import Any
 
+import pytest
+
 from leaderboard.documents.entry import (
     Entry,
     SignedEntry,
@@ -29,6 +31,12 @@ SETTING = {"state_dim": 2, "action_dim": 1, "complexity": 5, "hidden_width": 8}
 def moment(days: float) -> str:
     """The time so many days from now."""
     return utc(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days))
+
+
+def move_clock(monkeypatch: pytest.MonkeyPatch, time: str = AFTERWARDS) -> None:
+    """Set the clock by which boards decide on seasons and date their log."""
+    for module in ("sealed", "log"):
+        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: time)
 
 
 @functools.cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
 import sqlite3
@@ -20,6 +19,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.scoring.score import score_submission
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry.io import sha256_of
 from sme_registry.spec import ProtocolFile, SuiteFile
 from tests.leaderboard.conftest import linear_onnx, tiny_suite
 from tests.leaderboard.serving import serving
@@ -537,7 +537,7 @@ def test_gc_removes_unnamed_artefacts_and_a_dry_run_only_counts_them() -> None:
     make_board()
     key = SigningKey.generate()
     data = linear_onnx(1)
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     with Store.open("board") as store:
         store.put_object(digest, [data], by=key.public)
     assert "1 files" in good("gc", "board", "--older-than-hours", "0", "--dry-run")

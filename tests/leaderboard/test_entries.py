@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from leaderboard.errors import BoardError, Rejection
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SpecError
+from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import manifest, moment, signed_entry, tiny_season
@@ -30,19 +30,17 @@ GOOD = pack_table(np.full((300, 1), 0.5, np.float32))
 NOT_FINITE = GOOD.replace(b"\0\0\0?", b"\0\0\xc0\x7f")
 
 
-def digest(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()
-
-
 def entry(store: Store, key: SigningKey, *answers: bytes | None, **fields: Any) -> SignedEntry:
     named = [
-        None if data is None else {"sha256": digest(data), "size": len(data)} for data in answers
+        None if data is None else {"sha256": sha256_of(data), "size": len(data)} for data in answers
     ]
     return signed_entry(store, SEASON, key, named, **fields)
 
 
 def send(store: Store, signed: SignedEntry, *answers: bytes) -> bool:
-    return intake.enter(store, signed, answers={digest(data): data for data in answers}.__getitem__)
+    return intake.enter(
+        store, signed, answers={sha256_of(data): data for data in answers}.__getitem__
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -64,8 +62,8 @@ def test_an_entry_is_stored_once_with_its_answers(store, key):
     assert not send(store, signed, GOOD)
     [row] = store.entrants(SEASON.digest)
     assert (row.entrant.runs, row.entrant.policies) == (2, 1)
-    assert store.objects.read(digest(GOOD)) == GOOD
-    assert not store.is_public(digest(GOOD))
+    assert store.objects.read(sha256_of(GOOD)) == GOOD
+    assert not store.is_public(sha256_of(GOOD))
 
 
 def test_the_same_answers_are_read_once(store, key, monkeypatch):
@@ -81,10 +79,10 @@ def test_answers_may_be_uploaded_before(store, key):
     signed = entry(store, key, GOOD, GOOD)
     with pytest.raises(Rejection, match="artefact_missing"):
         intake.enter(store, signed)
-    store.put_object(digest(GOOD), [GOOD], by=SigningKey.generate().public)
+    store.put_object(sha256_of(GOOD), [GOOD], by=SigningKey.generate().public)
     with pytest.raises(Rejection, match="artefact_missing"):
         intake.enter(store, signed)
-    store.put_object(digest(GOOD), [GOOD], by=key.public)
+    store.put_object(sha256_of(GOOD), [GOOD], by=key.public)
     assert intake.enter(store, signed)
 
 
@@ -148,7 +146,7 @@ def test_refused_entries_of_a_server_count_for_their_key(tmp_path: Path, key):
 
 
 def test_entries_over_http_have_the_same_codes(store, key):
-    signed, digits = entry(store, key, GOOD, None), digest(GOOD)[7:]
+    signed, digits = entry(store, key, GOOD, None), sha256_of(GOOD)[7:]
     elsewhere = signed_entry(store, tiny_season(id="elsewhere"), key, [None, None])
     changed = signed.to_bytes().replace(b'"Test"', b'"Best"')
     with (
@@ -161,7 +159,7 @@ def test_entries_over_http_have_the_same_codes(store, key):
             return answer.status_code, answer.json().get("code", "")
 
         assert post(SEASON.id, signed.to_bytes()) == (422, "artefact_missing")
-        header = {"Authorization": authorization(url, key, digest(GOOD))}
+        header = {"Authorization": authorization(url, key, sha256_of(GOOD))}
         put = client.put(f"/api/objects/{digits}", content=GOOD, headers=header)
         assert put.status_code == 201
         assert post("winter", signed.to_bytes()) == (404, "season_unknown")

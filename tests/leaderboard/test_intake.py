@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from leaderboard.intake import admission, references
 from leaderboard.scoring.ranking import refuse_unpublishable
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.store import Store
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_submission,
@@ -65,7 +65,7 @@ def receive(store: Store, signed: SignedSubmission, at: datetime.datetime | None
 
 def with_artefact(store: Store, key: SigningKey, data: bytes) -> SignedSubmission:
     """A submission of a file that is on the board, whatever it is."""
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     put(store, key, {digest: data})
     signed, _ = tiny_submission(store, key)
     plain = signed.submission.to_dict()
@@ -349,7 +349,7 @@ def test_a_second_of_a_wrong_clock_uses_up_no_quota_for_good(
             later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=900)
             patch.setattr("leaderboard.store.log.now", lambda: utc(later))
             patch.setattr("leaderboard.store.store.now", lambda: utc(later))
-            put(store, key, {"sha256:" + _sha256(bytes(900)): bytes(900)})
+            put(store, key, {sha256_of(bytes(900)): bytes(900)})
             put_submission(store, key, 1)
         intake.check_upload(store, key.public, 1000)
         signed, _ = tiny_submission(store, key, 1, statement="Again.")
@@ -624,7 +624,7 @@ def test_the_signature_of_a_submission_does_not_sign_an_upload(key: SigningKey) 
 def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: SigningKey) -> None:
     limits = {"upload_bytes_per_day": 1000, "total_bytes": 2000, "artefact_bytes": 900}
     with tiny_board(tmp_path / "b", limits=limits) as store:
-        put(store, key, {"sha256:" + _sha256(bytes(500)): bytes(500)})
+        put(store, key, {sha256_of(bytes(500)): bytes(500)})
         me, other = key.public, SigningKey.generate().public
         intake.check_upload(store, me, 500)
         intake.check_upload(store, other, 900)
@@ -634,10 +634,6 @@ def test_upload_quotas_count_stored_and_pending_bytes(tmp_path: Path, key: Signi
         assert code_of(lambda: intake.check_upload(store, other, 901)) == "too_large"
         tomorrow = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=1, seconds=2)
         intake.check_upload(store, me, 900, at=tomorrow)
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 def test_documents_count_like_artefacts(store: Store, key: SigningKey) -> None:
@@ -674,7 +670,7 @@ def full(tmp_path: Path) -> Iterator[tuple[Store, Upload]]:
     with tiny_board(tmp_path / "full", limits={"total_bytes": 1000, "artefact_bytes": 900}) as made:
 
         def upload(key: str, data: bytes, minutes: float) -> str:
-            digest = "sha256:" + _sha256(data)
+            digest = sha256_of(data)
             made.put_object(digest, [data], by=key)
             time = utc(datetime.datetime.now(datetime.UTC) - datetime.timedelta(minutes=minutes))
             with made.transaction() as index:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import re
 import shutil
@@ -35,9 +34,10 @@ from leaderboard.store import Store
 from sme_registry import evaluate, materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
+from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, signed_entry, tiny_terms
+from tests.leaderboard.sealing import MASTER, moment, signed_entry, tiny_terms
 
 
 def plan(**fields: Any) -> dict[str, Any]:
@@ -53,15 +53,6 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def later(monkeypatch: pytest.MonkeyPatch) -> Any:
-    def move() -> None:
-        for module in ("sealed", "log"):
-            monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
-
-    return move
-
-
 def challenges(folder: Path) -> list[np.ndarray]:
     season = read_season(folder)
     return [
@@ -73,7 +64,7 @@ def enter(
     store: Store, season: Season, key: SigningKey, answers: list[np.ndarray | None], **fields: Any
 ) -> str:
     files = [None if each is None else pack_table(each) for each in answers]
-    digests = [None if each is None else _digest(each) for each in files]
+    digests = [None if each is None else sha256_of(each) for each in files]
     named = [
         None if data is None else {"sha256": digest, "size": len(data)}
         for data, digest in zip(files, digests, strict=True)
@@ -82,10 +73,6 @@ def enter(
     data = dict(zip(digests, files, strict=True))
     assert intake.enter(store, signed, answers=lambda digest: data[digest] or b"")
     return signed.id
-
-
-def _digest(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
 def method(name: str, knowledge: str = "generic") -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from leaderboard.scoring.publication import read_season
 from leaderboard.store import Store
 from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import linear_onnx, tiny_board
-from tests.leaderboard.sealing import AFTERWARDS, tiny_terms
+from tests.leaderboard.sealing import tiny_terms
 from tests.leaderboard.serving import serving
 from tests.leaderboard.test_cli import board_command, fails, good
 
@@ -45,16 +46,11 @@ def season() -> Path:
     return Path("autumn")
 
 
-def later(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
-
-
 def facts(*arguments: str) -> Any:
     return json.loads(good("season", *arguments, "--json"))
 
 
-def test_a_season_is_played_from_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_season_is_played_from_the_command_line(later: Callable[[], None]) -> None:
     printed = good("season", "new", "board", PLAN)
     secret = Path("board.autumn.master")
     assert stat.S_IMODE(secret.stat().st_mode) == 0o600
@@ -76,7 +72,7 @@ def test_a_season_is_played_from_the_command_line(monkeypatch: pytest.MonkeyPatc
     assert "season_not_closed" in fails(1, "season", "verify", "board", "autumn")
     assert facts("verify", "board", "autumn", "--published", "autumn")["published"] == 2
 
-    later(monkeypatch)
+    later()
     assert "log entry 2" in good("season", "close", "board", "autumn")
     Master(bytes(32)).write("other.master")
     wrong = fails(1, "season", "reveal", "board", "autumn", "--secret", "other.master")

@@ -25,6 +25,7 @@ from leaderboard.errors import BoardError
 from leaderboard.scoring import score as score_module
 from leaderboard.scoring.score import ROUNDING_STATES, evaluation_seed, score_submission
 from sme_registry import EvaluationProtocol, SMESpec, evaluate
+from sme_registry.io import sha256_of
 from sme_registry.spec import Suite
 from tests.leaderboard.artefact import models
 
@@ -55,10 +56,6 @@ BOARD = BoardDocument(
 Policy = Callable[[SMESpec], bytes] | bytes | None
 
 
-def digest_of(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()
-
-
 def as_bytes(model: ModelProto) -> bytes:
     return model.SerializeToString(deterministic=True)
 
@@ -80,8 +77,8 @@ def score(
         content = policy(spec) if callable(policy) else policy
         artefact = None
         if content is not None:
-            data[digest_of(content)] = content
-            artefact = {"sha256": digest_of(content), "size": len(content)}
+            data[sha256_of(content)] = content
+            artefact = {"sha256": sha256_of(content), "size": len(content)}
         digest = specs[index] if specs else spec.digest
         runs.append({"spec": digest, "seed": index, "steps": 10, "artefact": artefact})
     submission = Submission.from_dict(
@@ -201,7 +198,7 @@ def test_a_run_has_the_numbers_that_anyone_can_recompute() -> None:
     result = score(LINEAR, LINEAR, LINEAR)
 
     for run, spec in zip(result.runs, SUITE.instances, strict=True):
-        seed = evaluation_seed(BOARD.protocol.digest, spec.digest, digest_of(LINEAR))
+        seed = evaluation_seed(BOARD.protocol.digest, spec.digest, sha256_of(LINEAR))
         report = evaluate(
             lambda observations: observations @ W,
             spec,
@@ -288,7 +285,7 @@ def test_a_rejected_artefact_rejects_the_submission_and_is_named(policy: bytes, 
 
     assert (result.status, result.code) == ("rejected", code)
     assert result.message.startswith(
-        f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, artefact {digest_of(policy)}): "
+        f"runs.1 (class shallow, spec {SUITE.instances[1].digest}, artefact {sha256_of(policy)}): "
     )
     assert result.scores is None
     assert result.runs == ()

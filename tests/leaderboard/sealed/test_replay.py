@@ -21,7 +21,7 @@ from leaderboard.store import Store
 from leaderboard.store.log import Log
 from sme_registry import sealed
 from tests.leaderboard.sealed.playing import Board, online_board
-from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, signed_request
+from tests.leaderboard.sealing import AFTERWARDS, MASTER, moment, move_clock, signed_request
 from tests.leaderboard.serving import serving
 
 
@@ -49,8 +49,7 @@ def revealed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey) -
     board = online_board(tmp_path)
     play(board, key, 0.5)
     play(board, key, 0.25)
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    move_clock(monkeypatch)
     with Store.open(board.path) as store:
         store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
     return board
@@ -127,33 +126,28 @@ def test_a_ticket_of_a_season_that_is_not_open_is_found(
             verify_season(store, board.season.id)
 
 
-def test_more_tickets_than_a_key_may_have_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
+@pytest.mark.parametrize(
+    ("fields", "number", "limit"),
+    [({}, 3, "2 tickets of a key"), ({"tickets": 1}, 2, "1 tickets of the season")],
+)
+def test_more_tickets_than_there_may_be_are_found(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    key: SigningKey,
+    fields: dict[str, Any],
+    number: int,
+    limit: str,
 ) -> None:
-    board = online_board(tmp_path)
+    board = online_board(tmp_path, **fields)
     with Store.open(board.path) as store:
         folder = store.season_folder(board.season.digest)
-        for number in (1, 2, 3):
-            request = signed_request(store, board.season, key, number)
-            path = folder.request(number)
+        for count in range(1, number + 1):
+            request = signed_request(store, board.season, key, count)
+            path = folder.request(count)
             logged(monkeypatch, moment(0), store, "ticket", request.id, request, path)
         logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
-        with pytest.raises(TamperedError, match=r"tickets/3/ticket\.json: exceeds the 2 tickets"):
-            verify_season(store, board.season.id)
-
-
-def test_more_tickets_than_a_season_may_have_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey
-) -> None:
-    board = online_board(tmp_path, tickets=1)
-    with Store.open(board.path) as store:
-        folder = store.season_folder(board.season.digest)
-        for number in (1, 2):
-            request = signed_request(store, board.season, key, number)
-            path = folder.request(number)
-            logged(monkeypatch, moment(0), store, "ticket", request.id, request, path)
-        logged(monkeypatch, AFTERWARDS, store, *reveal(board, folder))
-        with pytest.raises(TamperedError, match=r"tickets/2/ticket\.json: exceeds the 1 tickets"):
+        message = rf"tickets/{number}/ticket\.json: exceeds the {limit}"
+        with pytest.raises(TamperedError, match=message):
             verify_season(store, board.season.id)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import BoardError
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store, collect_garbage
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_submission,
@@ -29,7 +29,7 @@ Work = Callable[[Path, SigningKey], object]
 def put(board: Path, key: SigningKey) -> object:
     data = linear_onnx(1)
     with Store.open(board) as store:
-        digest = "sha256:" + hashlib.sha256(data).hexdigest()
+        digest = sha256_of(data)
         return store.put_object(digest, [data], by=key.public)
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 
@@ -11,13 +10,14 @@ from leaderboard.errors import Rejection
 from leaderboard.intake import admission
 from leaderboard.store import Store, collect_garbage
 from leaderboard.store.objects import Objects
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_submission
 
 HOUR, DAY = 3600.0, 86400.0
 
 
 def put(store, key, data: bytes) -> str:
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
     store.put_object(digest, [data], by=key.public)
     return digest
 
@@ -77,7 +77,7 @@ def test_ages_are_arguments(store, litter):
 
 def test_gc_keeps_an_upload_in_progress(store, key):
     data = b"first half, second half"
-    digest = "sha256:" + hashlib.sha256(data).hexdigest()
+    digest = sha256_of(data)
 
     def slow():
         yield data[:10]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 import os
 import stat
 import threading
@@ -10,13 +9,10 @@ import pytest
 
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.store import Store
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import tiny_board
 
 KEY = "ab" * 32
-
-
-def digest(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
 def files(store: Store) -> list[str]:
@@ -26,16 +22,16 @@ def files(store: Store) -> list[str]:
 def test_an_object_is_stored_once_and_read_back_unchanged(store):
     data = os.urandom(100_000)
     pieces = [data[start : start + 4096] for start in range(0, len(data), 4096)]
-    assert store.put_object(digest(data), pieces, by=KEY)
-    assert not store.put_object(digest(data), pieces, by=KEY)
-    assert store.objects.has(digest(data))
-    assert store.objects.read(digest(data)) == data
-    assert stat.S_IMODE(store.folder.object(digest(data)).stat().st_mode) == 0o644
+    assert store.put_object(sha256_of(data), pieces, by=KEY)
+    assert not store.put_object(sha256_of(data), pieces, by=KEY)
+    assert store.objects.has(sha256_of(data))
+    assert store.objects.read(sha256_of(data)) == data
+    assert stat.S_IMODE(store.folder.object(sha256_of(data)).stat().st_mode) == 0o644
 
 
 def test_bytes_of_another_digest_leave_nothing(store):
     with pytest.raises(Rejection) as refused:
-        store.put_object(digest(b"one"), [b"another"], by=KEY)
+        store.put_object(sha256_of(b"one"), [b"another"], by=KEY)
     assert refused.value.code == "artefact_digest"
     assert files(store) == []
 
@@ -51,7 +47,7 @@ def test_a_stream_is_stopped_at_the_limit_and_leaves_nothing(tmp_path):
                 yield bytes(100)
 
         with pytest.raises(Rejection) as refused:
-            store.put_object(digest(b""), endless(), by=KEY)
+            store.put_object(sha256_of(b""), endless(), by=KEY)
         assert refused.value.code == "too_large"
         assert read == 1100
         assert files(store) == []
@@ -63,20 +59,20 @@ def test_an_upload_that_breaks_off_leaves_nothing(store):
         raise ConnectionAbortedError
 
     with pytest.raises((BoardError, ConnectionAbortedError)):
-        store.put_object(digest(b"half and half"), broken(), by=KEY)
+        store.put_object(sha256_of(b"half and half"), broken(), by=KEY)
     assert files(store) == []
 
 
 def test_altered_bytes_are_not_returned(store):
-    store.put_object(digest(b"policy"), [b"policy"], by=KEY)
-    store.folder.object(digest(b"policy")).write_bytes(b"Policy")
+    store.put_object(sha256_of(b"policy"), [b"policy"], by=KEY)
+    store.folder.object(sha256_of(b"policy")).write_bytes(b"Policy")
     with pytest.raises(TamperedError, match="objects/"):
-        store.objects.read(digest(b"policy"))
+        store.objects.read(sha256_of(b"policy"))
 
 
 def test_a_missing_object_is_reported(store):
     with pytest.raises(BoardError, match="cannot be read"):
-        store.objects.read(digest(b"never seen"))
+        store.objects.read(sha256_of(b"never seen"))
 
 
 def test_a_path_is_not_a_digest(store):
@@ -87,7 +83,7 @@ def test_a_path_is_not_a_digest(store):
 
 def test_bytes_count_for_their_uploader_before_and_after_submission(store, key, submit):
     since = "2000-01-01T00:00:00Z"
-    store.put_object(digest(b"12345"), [b"12345"], by=key.public)
+    store.put_object(sha256_of(b"12345"), [b"12345"], by=key.public)
     assert store.uploaded_bytes(key.public, since) == store.total_bytes() == 5
     signed = submit()
     size = 5 + signed.submission.runs[0].artefact.size + len(signed.to_bytes())
@@ -103,7 +99,7 @@ def test_many_threads_upload_the_same_object_once(store):
     new: list[bool] = []
 
     def upload() -> None:
-        new.append(store.put_object(digest(data), [data], by=KEY))
+        new.append(store.put_object(sha256_of(data), [data], by=KEY))
 
     threads = [threading.Thread(target=upload) for _ in range(8)]
     for thread in threads:
@@ -112,5 +108,5 @@ def test_many_threads_upload_the_same_object_once(store):
         thread.join()
     assert len(new) == 8
     assert any(new)
-    assert files(store) == [store.folder.object(digest(data)).name]
+    assert files(store) == [store.folder.object(sha256_of(data)).name]
     assert store.total_bytes() == len(data)

@@ -23,6 +23,7 @@ from tests.leaderboard.sealing import (
     AFTERWARDS,
     MASTER,
     moment,
+    move_clock,
     signed_entry,
     signed_request,
     tiny_season,
@@ -31,17 +32,6 @@ from tests.leaderboard.store.crashing import crashes_before
 
 ONLINE, OFFLINE = "sealed-online", "sealed-offline"
 ANSWER = {"sha256": "sha256:" + "a" * 64, "size": 512}
-
-
-@pytest.fixture
-def later(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Moves the clock behind the close of tiny seasons."""
-
-    def move() -> None:
-        for module in ("sealed", "log"):
-            monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
-
-    return move
 
 
 def failed(season: Season, subject: str) -> SealedResult:
@@ -164,8 +154,7 @@ def test_the_clock_decides_and_no_earlier_clock_reopens(store, key, track, monke
         attempt(coming)
     with pytest.raises(Rejection, match="season_track"):
         attempt(other)
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    move_clock(monkeypatch)
     with pytest.raises(Rejection, match="season_closed"):
         attempt(season)
     store.announce(tiny_season(track, id="later", opens=AFTERWARDS, closes=moment(9)))

@@ -30,6 +30,7 @@ from leaderboard.web import app
 from leaderboard.web.errors import HTTP_CODES, STATUSES
 from leaderboard.web.serve import serve
 from sme_registry.errors import OptionError
+from sme_registry.io import sha256_of
 from tests.leaderboard.conftest import (
     linear_onnx,
     put_submission,
@@ -81,13 +82,9 @@ def refusal(answer: httpx.Response) -> tuple[int, str]:
 def put(
     url: str, key: SigningKey, data: bytes, digest: str | None = None, **more: Any
 ) -> httpx.Response:
-    digest = digest or sha256(data)
+    digest = digest or sha256_of(data)
     headers = {"Authorization": authorization(url, key, digest), **more}
     return HTTP.put(f"{url}/api/objects/{hex_of(digest)}", content=data, headers=headers)
-
-
-def sha256(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
 def raw(url: str, request: bytes, patience: float = 60.0) -> bytes:
@@ -499,7 +496,7 @@ def test_an_artefact_is_uploaded_once(url: str, store: Store, key: SigningKey) -
     data = linear_onnx(1)
     assert put(url, key, data).status_code == 201
     assert put(url, key, data).status_code == 200
-    assert store.objects.read(sha256(data)) == data
+    assert store.objects.read(sha256_of(data)) == data
     assert store.uploaded_bytes(key.public, "2000-01-01T00:00:00Z") == len(data)
 
 
@@ -513,15 +510,15 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
             assert head.headers["Content-Length"] == get.headers["Content-Length"]
             return {(head.status_code, ""), (get.status_code, get.text.replace(digest, "DIGEST"))}
 
-        unknown = downloads(sha256(b"unknown"))
+        unknown = downloads(sha256_of(b"unknown"))
         assert {status for status, _ in unknown} == {404}
 
         assert put(url, key, b"uploaded").status_code == 201
-        assert downloads(sha256(b"uploaded")) == unknown
+        assert downloads(sha256_of(b"uploaded")) == unknown
 
         waiting = uploaded(url, store, key, 1)
         assert post(url, waiting.to_bytes()).status_code == 202
-        assert downloads(sha256(linear_onnx(1))) == unknown
+        assert downloads(sha256_of(linear_onnx(1))) == unknown
 
         claim = store.queue.claim("worker")
         assert claim is not None
@@ -534,19 +531,19 @@ def test_an_artefact_is_public_once_it_is_scored(tmp_path: Path, key: SigningKey
             message="took too long",
         )
         assert store.queue.finish(claim, result)
-        assert downloads(sha256(linear_onnx(1))) == unknown
+        assert downloads(sha256_of(linear_onnx(1))) == unknown
 
         withdrawn = uploaded(url, store, key, 2)
         assert post(url, withdrawn.to_bytes()).status_code == 202
         store.withdraw(signed_withdrawal(store, withdrawn.id, key))
-        assert downloads(sha256(linear_onnx(2))) == unknown
+        assert downloads(sha256_of(linear_onnx(2))) == unknown
 
         scored = boards.submit(store, key, "PPO", [0.2] * 6)
         policy = b"PPO 1.0 plane1 0"  # whose digest the submission names
-        store.put_object(sha256(policy), [policy], by=key.public)
-        assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
+        store.put_object(sha256_of(policy), [policy], by=key.public)
+        assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}
         store.withdraw(signed_withdrawal(store, scored, key))
-        assert downloads(sha256(policy)) == {(200, ""), (200, policy.decode())}
+        assert downloads(sha256_of(policy)) == {(200, ""), (200, policy.decode())}
 
 
 def test_the_policies_of_reference_rows_are_public(url: str, store: Store) -> None:
@@ -554,7 +551,7 @@ def test_the_policies_of_reference_rows_are_public(url: str, store: Store) -> No
     (run,) = store.submission(optimal).submission.runs
     assert run.artefact is not None
     answer = HTTP.get(f"{url}/api/objects/{hex_of(run.artefact.sha256)}")
-    assert sha256(answer.content) == run.artefact.sha256
+    assert sha256_of(answer.content) == run.artefact.sha256
 
 
 def test_an_artefact_is_verified_again_only_if_its_file_changes(
@@ -582,15 +579,17 @@ def test_an_artefact_is_verified_again_only_if_its_file_changes(
 
 def test_bytes_of_another_digest_are_refused(url: str, store: Store, key: SigningKey) -> None:
     before = files_of(store)
-    answer = put(url, key, b"these", digest=sha256(b"others"))
+    answer = put(url, key, b"these", digest=sha256_of(b"others"))
     assert refusal(answer) == (422, "artefact_digest")
     assert files_of(store) == before
 
 
 def test_an_upload_without_a_signature_is_refused(url: str, key: SigningKey) -> None:
-    path = f"{url}/api/objects/{hex_of(sha256(b'x'))}"
-    other = authorization(url, key, sha256(b"y"))
-    forged = authorization(url, key, sha256(b"x")).replace(key.public, SigningKey.generate().public)
+    path = f"{url}/api/objects/{hex_of(sha256_of(b'x'))}"
+    other = authorization(url, key, sha256_of(b"y"))
+    forged = authorization(url, key, sha256_of(b"x")).replace(
+        key.public, SigningKey.generate().public
+    )
     for header in (None, "", "Bearer x", other, forged, "SME-Ed25519 " + "x" * 10_000):
         headers = {} if header is None else {"Authorization": header}
         answer = HTTP.put(path, content=b"x", headers=headers)
@@ -602,12 +601,12 @@ def test_an_upload_signed_at_another_time_is_refused(
     url: str, key: SigningKey, minutes: int
 ) -> None:
     moment = datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=minutes)
-    header = authorization(url, key, sha256(b"x"), utc(moment))
+    header = authorization(url, key, sha256_of(b"x"), utc(moment))
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
 def test_an_upload_signed_at_an_impossible_time_is_rejected(url: str, key: SigningKey) -> None:
-    header = authorization(url, key, sha256(b"x"), "2026-02-31T00:00:00Z")
+    header = authorization(url, key, sha256_of(b"x"), "2026-02-31T00:00:00Z")
     assert refusal(put(url, key, b"x", Authorization=header)) == (403, "stale_time")
 
 
@@ -615,12 +614,12 @@ def test_an_upload_that_is_too_large_is_refused_by_its_length(
     store: Store, key: SigningKey, url: str
 ) -> None:
     limit = store.document.limits.artefact_bytes
-    header = authorization(url, key, sha256(b"x"))
+    header = authorization(url, key, sha256_of(b"x"))
     start = time.process_time()  # the server is a thread of this process
     answer = raw(
         url,
         (
-            f"PUT /api/objects/{hex_of(sha256(b'x'))} HTTP/1.1\r\nHost: x\r\n"
+            f"PUT /api/objects/{hex_of(sha256_of(b'x'))} HTTP/1.1\r\nHost: x\r\n"
             f"Authorization: {header}\r\nContent-Length: {limit + 1}\r\n\r\n"
         ).encode(),
     )
@@ -640,19 +639,21 @@ def test_an_upload_without_a_length_is_stopped_at_the_limit(
                 for _ in range(40):
                     yield b"x" * 5000
 
-            digest = sha256(b"x" * 200_000)
+            digest = sha256_of(b"x" * 200_000)
             headers = {"Authorization": authorization(url, key, digest)}
             answer = HTTP.put(
                 f"{url}/api/objects/{hex_of(digest)}", content=endless(), headers=headers
             )
             assert refusal(answer) == (413, "too_large")
             small = b"y" * 5000
-            headers = {"Authorization": authorization(url, key, sha256(small))}
+            headers = {"Authorization": authorization(url, key, sha256_of(small))}
             answer = HTTP.put(
-                f"{url}/api/objects/{hex_of(sha256(small))}", content=iter([small]), headers=headers
+                f"{url}/api/objects/{hex_of(sha256_of(small))}",
+                content=iter([small]),
+                headers=headers,
             )
             assert answer.status_code == 201
-        store.folder.object(sha256(small)).unlink()
+        store.folder.object(sha256_of(small)).unlink()
         assert files_of(store) == before
 
 
@@ -661,8 +662,8 @@ def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: Signi
     data = b"z" * 1000
     for length in (999, 1001):
         head = (
-            f"PUT /api/objects/{hex_of(sha256(data))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256(data))}\r\n"
+            f"PUT /api/objects/{hex_of(sha256_of(data))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {authorization(url, key, sha256_of(data))}\r\n"
             f"Connection: close\r\nContent-Length: {length}\r\n\r\n"
         )
         parts = urlsplit(url)
@@ -671,7 +672,7 @@ def test_a_false_length_leaves_nothing_behind(url: str, store: Store, key: Signi
             connection.shutdown(socket.SHUT_WR)
             answer = connection.recv(2**16)
         assert answer.startswith(b"HTTP/1.1 4") or answer == b""
-    assert not store.objects.has(sha256(data))
+    assert not store.objects.has(sha256_of(data))
     assert files_of(store) == before
 
 
@@ -681,8 +682,8 @@ def test_uploads_that_are_slow_or_broken_off_leave_nothing_behind(
     before = files_of(store)
     with serving(store.folder.path, upload_seconds=2.0) as url:
         head = (
-            f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256(b'z'))}\r\n"
+            f"PUT /api/objects/{hex_of(sha256_of(b'z'))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {authorization(url, key, sha256_of(b'z'))}\r\n"
             "Content-Length: 1000000\r\n\r\n"
         ).encode() + b"z" * 70_000
         parts = urlsplit(url)
@@ -699,8 +700,8 @@ def test_the_quota_of_a_key_counts_uploads_in_progress(tmp_path: Path, key: Sign
     limits = {"upload_bytes_per_day": 1000, "artefact_bytes": 600}
     with tiny_board(tmp_path / "b", limits=limits) as store, serving(store.folder.path) as url:
         head = (
-            f"PUT /api/objects/{hex_of(sha256(b'z'))} HTTP/1.1\r\nHost: x\r\n"
-            f"Authorization: {authorization(url, key, sha256(b'z'))}\r\n"
+            f"PUT /api/objects/{hex_of(sha256_of(b'z'))} HTTP/1.1\r\nHost: x\r\n"
+            f"Authorization: {authorization(url, key, sha256_of(b'z'))}\r\n"
             "Content-Length: 600\r\n\r\n"
         ).encode()
         parts = urlsplit(url)
@@ -711,7 +712,7 @@ def test_the_quota_of_a_key_counts_uploads_in_progress(tmp_path: Path, key: Sign
                 answer = put(url, key, bytes(401))
                 if answer.status_code == 429 or time.monotonic() > deadline:
                     break
-                store.folder.object(sha256(bytes(401))).unlink()
+                store.folder.object(sha256_of(bytes(401))).unlink()
             assert refusal(answer) == (429, "quota")
             assert put(url, SigningKey.generate(), bytes(401)).status_code == 201
 

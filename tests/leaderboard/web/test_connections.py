@@ -30,6 +30,7 @@ from leaderboard.web.errors import RequestError
 from leaderboard.web.guard import Guard
 from leaderboard.web.limits import Turns, counted_address
 from sme_registry.errors import OptionError
+from sme_registry.io import sha256_of
 from tests.leaderboard.serving import serving, serving_process
 from tests.leaderboard.web.site import boards
 
@@ -96,7 +97,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def publish(store: Store, data: bytes) -> str:
     """Put an artefact on the board that its scored submission might have named; its address."""
-    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    digest = sha256_of(data)
     store.put_object(digest, [data], by=SigningKey.generate().public)
     scored = next(entry.id for entry in store.entries() if entry.scores and not entry.reference)
     with store.transaction() as index:
@@ -203,6 +204,7 @@ def test_slots_leave_files_for_everything_else() -> None:
     program = """
 import resource
 from leaderboard.web import limits, serve
+from sme_registry.io import sha256_of
 for hard in 9000, 1024:
     resource.setrlimit(resource.RLIMIT_NOFILE, (128, hard))
     print(serve._connections(), resource.getrlimit(resource.RLIMIT_NOFILE)[0])

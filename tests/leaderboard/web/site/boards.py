@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import ClassScore, Estimate, Result, RunScore, Scores
 from leaderboard.documents.submission import Artefact, Method, Run, Submission, Submitter, Training
 from leaderboard.store import Store
+from sme_registry.io import sha256_of
 from sme_registry.spec import EvaluationProtocol, Suite
 
 CREATED = "2026-11-21T09:30:00Z"
@@ -137,7 +137,7 @@ def submit(
 
 
 def _digest(text: str) -> str:
-    return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
+    return sha256_of(text.encode())
 
 
 def _result(

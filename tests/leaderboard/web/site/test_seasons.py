@@ -14,7 +14,7 @@ from leaderboard.scoring.metrics import failed_run
 from leaderboard.scoring.sealed import sealed_result
 from leaderboard.store import Store
 from leaderboard.web.site import Pages, write_site
-from tests.leaderboard.sealing import AFTERWARDS, MASTER, signed_entry, signed_request, tiny_season
+from tests.leaderboard.sealing import MASTER, move_clock, signed_entry, signed_request, tiny_season
 from tests.leaderboard.web.site import boards, test_pages
 from tests.leaderboard.web.site.test_pages import Page
 
@@ -68,8 +68,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     assert page(board, "seasons.html").words.count("sealed-offline") == 1
     assert "Seasons" in page(board, "index.html").words
 
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    move_clock(monkeypatch)
     board.reveal(Reveal(season=OFFLINE.digest, master=MASTER.raw.hex()))
     for id in (last, fitted):
         board.rank(result(OFFLINE, id))
