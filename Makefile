@@ -48,8 +48,10 @@ bench: $(INSTALLED)    ## measure speed against peers in the same run
 lowest:          ## run the core's tests with the lowest versions that pyproject.toml allows; before a release
 	PYTHON=$(PYTHON) .ci/lowest
 
-docs: $(INSTALLED)     ## regenerate the generated pages of docs/
+docs: $(INSTALLED)     ## regenerate the generated pages of docs/, run the tutorials, build docs/_build/html
 	$(PY) docs/generate.py
+	$(PY) -m sphinx -q -W --keep-going $(SPHINX) docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
 
 frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for gymnax, RLlib, sbx and Tianshou, each in an environment of its own
 

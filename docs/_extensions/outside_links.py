@@ -1,0 +1,49 @@
+"""Links from a page to files outside `docs/`, which work on GitHub, work on the site as well.
+
+A link to a page of the repository that the site contains (`_PAGES`) leads there. MyST makes a link
+to any other file a download. A folder cannot be downloaded: its link becomes plain text.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+_PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "project/changelog.md",
+    "CONTRIBUTING.md": "project/contributing.md",
+}
+_LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<path>\.\./[^)#\s]*)(?P<anchor>#[^)\s]*)?\)")
+
+
+def rewrite(text: str, folder: str, root: Path) -> str:
+    """The Markdown of a page with its links to files outside `docs/` made links of the site.
+
+    Args:
+      text: Markdown.
+      folder: the page's folder, relative to `docs/`, with slashes.
+      root: the folder of `docs/`.
+    """
+
+    def replaced(link: re.Match[str]) -> str:
+        path = posixpath.normpath(posixpath.join("docs", folder, link["path"]))
+        if path in _PAGES:
+            page = posixpath.relpath(_PAGES[path], folder or ".")
+            return f"[{link['text']}]({page}{link['anchor'] or ''})"
+        return link["text"] if (root.parent / path).is_dir() else link[0]
+
+    return _LINK.sub(replaced, text)
+
+
+def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
+    source[0] = rewrite(source[0], posixpath.dirname(name), Path(app.srcdir))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register with Sphinx."""
+    app.connect("source-read", _on_read, priority=400)
+    return {"parallel_read_safe": True}

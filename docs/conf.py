@@ -1,0 +1,59 @@
+"""The site's settings: `make docs` builds it into `docs/_build/html`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE / "_extensions")]
+# Cells run `sme` and `import sme_registry` as a reader does, and draw without a display.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["PYTHONPATH"] = str(HERE.parent)
+os.environ["MPLBACKEND"] = "agg"
+
+from sme_registry.version import __version__  # noqa: E402
+
+project = "SME Registry"
+author = "The SME Registry developers"
+copyright = author
+version = release = __version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "contents",
+    "outside_links",
+    "tutorial_cells",
+]
+exclude_patterns = ["_build", "_extensions", "**/.ipynb_checkpoints"]
+
+# Markdown: the sources are read on GitHub too, so only what GitHub also shows.
+myst_enable_extensions = ["colon_fence", "attrs_block"]
+myst_heading_anchors = 4  # headings have the anchors that GitHub gives them
+myst_links_external_new_tab = False
+
+# Tutorials are executed when built; a page whose cells did not change comes from the cache.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / "executed")
+nb_execution_in_temp = True
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+nb_merge_streams = True
+
+html_theme = "furo"
+html_title = f"SME Registry {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+pygments_style = "default"
+pygments_dark_style = "github-dark"
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
