@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +27,7 @@ from leaderboard.cli.options import (
 )
 from leaderboard.documents.keys import SigningKey
 from sme_registry.errors import OptionError
+from sme_registry.io import sha256_of
 from sme_registry.terminal import Progress, err, out
 
 
@@ -91,7 +91,7 @@ def enter(
                 None if name in without else _answers(policies[name], states, setting, action_range)
             )
             progress.update(done)
-    digests = [None if data is None else _digest(data) for data in files]
+    digests = [None if data is None else sha256_of(data) for data in files]
     data = {name: each for name, each in zip(digests, files, strict=True) if name and each}
     entry = Entry.from_dict(
         {
@@ -137,7 +137,3 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
-
-
-def _digest(data: bytes) -> str:
-    return "sha256:" + hashlib.sha256(data).hexdigest()

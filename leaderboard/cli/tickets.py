@@ -70,6 +70,7 @@ def ticket(
         err().print(f"Repeating {escape(str(request_file))}.", soft_wrap=True)
     else:
         season_digest, board = client.season(url, season)
+        nonce = secrets.token_hex(32)
         request = TicketRequest.from_dict(
             {
                 **manifest_fields(
@@ -80,7 +81,8 @@ def ticket(
                     statement=statement,
                 ),
                 "season": season_digest,
-                "nonce": secrets.token_hex(32),
+                "nonce": nonce,
+                "answers_key": signing_key.of_answers(nonce).public,
             }
         )
         signed = request.signed(signing_key, board)

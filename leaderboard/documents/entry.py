@@ -1,21 +1,28 @@
-"""`Entry` and `TicketRequest`: what an entrant signs to take part in a sealed season.
+"""`Entry`, `TicketRequest`, `SignedAnswers`: what an entrant of a sealed season signs.
 
     id = "sha256:" + hex(SHA-256(canonical JSON of the entry or request))
 
 Offline an entry names the answers: for each hidden instance, in the order of the season's classes,
 one .npy file of float32 actions `[regions · n, A]` in the challenge states, in their order. Online
-a request starts a ticket, whose answers follow.
+a request starts a ticket; the answers of each instance follow, signed by a key that it names.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, field_validator
 
-from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.keys import PublicKey, SigningKey, verifies
 from leaderboard.documents.season import MAX_OFFLINE_INSTANCES
-from leaderboard.documents.submission import Artefact, Manifest, Method, SignedManifest
+from leaderboard.documents.submission import (
+    Artefact,
+    Manifest,
+    Method,
+    SignedDocument,
+    SignedManifest,
+)
+from sme_registry.sealed import Signer, Statement
 from sme_registry.spec import Digest
 
 
@@ -62,11 +69,15 @@ class TicketRequest(SealedManifest):
     Attributes:
       nonce: 64 hex digits that the entrant has drawn at random, for this ticket alone. The tasks
         depend on it, and on the ticket's number, which the board assigns later.
+      answers_key: signs the answers; null in requests that are older than it.
     """
+
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("answers_key",)
 
     nonce: Annotated[
         str, Field(pattern=r"^[0-9a-f]{64}$", description="64 hex digits, drawn at random")
     ]
+    answers_key: PublicKey | None = None
 
     def signed(self, key: SigningKey, board: str | None = None) -> SignedTicketRequest:
         """This request, signed as `SignedManifest.sign` says."""
@@ -99,3 +110,28 @@ class SignedTicketRequest(SignedSealed):
     COMMAND = "ticket"
 
     ticket: TicketRequest
+
+    def signer(self, key: SigningKey) -> Signer | None:
+        """What signs the answers of the ticket, if the request names `SigningKey.of_answers`.
+
+        Args:
+          key: the entrant's.
+        """
+        answers = key.of_answers(self.ticket.nonce)
+        if self.board is None or self.ticket.answers_key != answers.public:
+            return None
+        return Signer(board=self.board, request=self.id, key=answers.secret)
+
+
+class SignedAnswers(SignedDocument):
+    """`tickets/<number>/<instance>.json` of a season, beside the answers and the journal.
+
+    Attributes:
+      statement: what the key that the ticket's request names has signed.
+    """
+
+    statement: Statement
+
+    def is_valid(self, key: str) -> bool:
+        """Whether this public key made the signature, for this statement and board."""
+        return verifies(key, self.signature, "answers", self.statement.digest, self.board)

@@ -12,6 +12,8 @@ boards of rules 1.
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +28,7 @@ from sme_registry.io import require_packages
 if TYPE_CHECKING:
     from nacl import signing
 
-Purpose = Literal["submission", "entry", "ticket", "withdrawal", "log", "upload"]
+Purpose = Literal["submission", "entry", "ticket", "answers", "withdrawal", "log", "upload"]
 PublicKey = Annotated[
     str, Field(pattern=r"^[0-9a-f]{64}$", description="an ed25519 public key, 64 hex digits")
 ]
@@ -90,6 +92,23 @@ class SigningKey:
     def public(self) -> str:
         """The public half, 64 hex digits."""
         return self._private.verify_key.encode().hex()
+
+    def of_answers(self, nonce: str) -> SigningKey:
+        """The key that signs the answers of a ticket, from the nonce in its request.
+
+        Whoever has it learns nothing of this one, and can sign for no other ticket.
+        """
+        from nacl import signing
+
+        label = f"sme-leaderboard/key of answers/{nonce}".encode()
+        return SigningKey(
+            signing.SigningKey(hmac.digest(self._private.encode(), label, hashlib.sha256))
+        )
+
+    @property
+    def secret(self) -> str:
+        """The private half, 64 hex digits."""
+        return self._private.encode().hex()
 
     def sign(self, purpose: Purpose, digest: str, board: str | None = None) -> str:
         """The signature of a digest (or other short text), 128 hex digits.

@@ -16,7 +16,7 @@ how runs become scores. Fields younger than version 1 are left out of the JSON a
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
@@ -196,7 +196,7 @@ class Result(Document):
         return self
 
 
-class Stepping(StrictModel):
+class Stepping(Document):
     """The steps taken on one instance of a ticket, as the board's journal has them.
 
     Attributes:
@@ -204,11 +204,15 @@ class Stepping(StrictModel):
       normalised_online_regret: Σ regret / Σ regret of the constant ½ in the same states, over the
         budget. Steps that were not taken count like the constant's.
       learning_curve: the same over each of at most 100 equal parts of the budget, in order.
+      signed: digest of the file in which the entrant signed answers and journal; null without any.
     """
+
+    left_out_by_default: ClassVar[tuple[str, ...]] = ("signed",)
 
     steps: Annotated[Integer, Field(ge=0)]
     normalised_online_regret: Annotated[Real, Field(ge=0)]
     learning_curve: Annotated[tuple[Real, ...], Field(strict=False, min_length=1, max_length=100)]
+    signed: Digest | None = None
 
 
 class SealedResult(Document):

@@ -191,7 +191,7 @@ _ORDER = (
 )
 
 
-class _Signed(StrictModel):
+class SignedDocument(StrictModel):
     """A document with the signature of the submitter's key, for one board or for none.
 
     Attributes:
@@ -210,7 +210,7 @@ class _Signed(StrictModel):
         return {**plain, "signature": signature, **({} if board is None else {"board": board})}
 
 
-class SignedManifest(_Signed):
+class SignedManifest(SignedDocument):
     """A manifest, in the field `KIND`, with its signature.
 
     Attributes:
@@ -407,7 +407,7 @@ class Withdrawal(Document):
     reason: Annotated[str, Field(max_length=300)] = ""
 
 
-class SignedWithdrawal(_Signed):
+class SignedWithdrawal(SignedDocument):
     """A withdrawal, signed with the key of the submission."""
 
     withdrawal: Withdrawal

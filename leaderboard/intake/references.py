@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,6 +21,7 @@ from leaderboard.documents.submission import (
 )
 from leaderboard.intake.admission import admit
 from leaderboard.store import Store
+from sme_registry.io import sha256_of
 from sme_registry.spec import SMESpec
 
 
@@ -85,7 +85,7 @@ def _submission(
     instances = store.document.instances
     for digest, (_, spec) in instances.items():
         data = reference.onnx(spec)
-        sha256 = "sha256:" + hashlib.sha256(data).hexdigest()
+        sha256 = sha256_of(data)
         artefacts[sha256] = data
         runs.append(
             Run(spec=digest, seed=0, steps=0, artefact=Artefact(sha256=sha256, size=len(data)))

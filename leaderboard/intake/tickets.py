@@ -72,6 +72,12 @@ def start_ticket(
             f"season={request.season}: the request was sent to the season {season}. Send it to "
             "its own.",
         )
+    if request.answers_key is None:
+        raise Rejection(
+            "schema",
+            "ticket.answers_key: missing: must be the public key that will sign the answers. "
+            "Create the request with `sme-leaderboard ticket`.",
+        )
     check_names(request, store.document.key)
     moment = at or datetime.datetime.now(datetime.UTC)
     check_time(request.created, moment, store.document.limits.age_days)

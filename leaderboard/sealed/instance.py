@@ -2,30 +2,33 @@
 
     waiting ── start ──▶ stepping ── finish, or no step fits the budget ──▶ answering ──▶ answered
 
-Its files are `<number>.journal` and `<number>.npy` in the ticket's folder, and its state follows
-from them. Each method may be called again after a lost answer, without a further effect.
+Its files are `<number>.journal`, `<number>.npy` with the answers, and `<number>.json` with the
+entrant's signature of both, in the ticket's folder. Its state follows from them. Each method may be
+called again after a lost answer, without a further effect.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
 from leaderboard.artefact.answers import Float32, read_answers, rows_of
+from leaderboard.documents.entry import SignedAnswers
 from leaderboard.documents.reading import read_regular
 from leaderboard.documents.season import MAX_LANES, SeasonClass
 from leaderboard.errors import Rejection, TamperedError
 from leaderboard.sealed.journal import Journal
+from leaderboard.sealed.signatory import Signatory
 from leaderboard.sealed.stepping import Lanes, Start
 from sme_registry import EvaluationProtocol, io
-from sme_registry.errors import ActionError, WireError
+from sme_registry.errors import ActionError, SMEError, WireError
 from sme_registry.sealed import Begun, InstanceStatus, StepFormat, table_bytes
 
 Phase = Literal["waiting", "stepping", "answering", "answered"]
+_MAX_SIGNED = 4096
 _QUICK_PRODUCTS = 2**23
 """Of weights and lanes, in steps short enough for the event loop: a few milliseconds."""
 
@@ -39,6 +42,7 @@ class SteppedInstance:
       member: its class.
       protocol: the season's.
       start: derives what is hidden; called when it is needed.
+      signatory: signs the answers; None in tickets that are older than signed answers.
 
     Attributes:
       budget: steps over all lanes.
@@ -51,9 +55,12 @@ class SteppedInstance:
         member: SeasonClass,
         protocol: EvaluationProtocol,
         start: Callable[[], Start],
+        signatory: Signatory | None = None,
     ) -> None:
+        self._number, self._signatory = number, signatory
         self._journal_path = folder / f"{number}.journal"
         self._answers_path = folder / f"{number}.npy"
+        self._signed_path = folder / f"{number}.json"
         self._member = member
         assert member.budget is not None  # the track is online
         self.budget = member.budget
@@ -61,6 +68,7 @@ class SteppedInstance:
         self._start = start
         self._lock = threading.RLock()
         self._journal: Journal | None = None
+        self._journal_digest = ""  # once no more steps can be taken
         self._lanes: Lanes | None = None
         self._format: StepFormat | None = None
         self._last = b"", b""  # actions and answer of the last request
@@ -123,8 +131,32 @@ class SteppedInstance:
             return None, None
         with _storage():
             data = read_regular(self._answers_path, self.answer_bytes)
-        digest = "sha256:" + hashlib.sha256(data).hexdigest()
-        return read_answers(data, self._member.setting, self._protocol), digest
+        return read_answers(data, self._member.setting, self._protocol), io.sha256_of(data)
+
+    @property
+    def signed_digest(self) -> str | None:
+        """The digest of the file with the entrant's signature; None where there is none to read."""
+        with contextlib.suppress(OSError):
+            if self._answered and self._signatory is not None:
+                return io.sha256_of(read_regular(self._signed_path, _MAX_SIGNED))
+        return None
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the entrant has signed these answers and this journal, where that is required.
+
+        Raises:
+          Rejection, TamperedError: a file cannot be read.
+        """
+        if not self._answered or self._signatory is None:
+            return True
+        _, answers = self.stored_answers
+        try:
+            data = read_regular(self._signed_path, _MAX_SIGNED)
+            stored = SignedAnswers.from_dict(io.parse_json(data, "signature"))
+            return stored == self._signed(str(answers), stored.signature)
+        except (OSError, SMEError):
+            return False
 
     @property
     def answer_bytes(self) -> int:
@@ -228,6 +260,19 @@ class SteppedInstance:
         if phase in ("waiting", "stepping"):
             raise _wrong_phase(phase, "Take all steps, or finish it, before the challenge.")
 
+    def journal_digest(self) -> str:
+        """`Journal.digest` of the steps.
+
+        Raises:
+          Rejection: `instance_phase` as long as steps may follow, or `storage_full`.
+        """
+        self.refuse_challenge()
+        with self._lock:
+            if not self._journal_digest:
+                with _storage():
+                    self._journal_digest = self._started().digest()
+            return self._journal_digest
+
     def has_stored(self, data: bytes) -> bool:
         """Whether these are its answers, which a client sends again if the reply was lost.
 
@@ -240,18 +285,19 @@ class SteppedInstance:
             io.sync_folder(self._answers_path.parent)  # which may have failed the first time
         return True
 
-    def answer(self, data: bytes) -> bool:
+    def answer(self, data: bytes, signature: str) -> bool:
         """Store the answers to the challenge.
 
         Args:
           data: an .npy file of float32 actions `[rows, A]`, one for each challenge state.
+          signature: of the `Statement` of them and the journal.
 
         Returns:
           False if the same ones are stored.
 
         Raises:
-          Rejection: `instance_phase`, `answer_shape`, `answer_not_finite`, `answer_conflict` or
-            `storage_full`.
+          Rejection: `instance_phase`, `answer_shape`, `answer_not_finite`, `answer_conflict`,
+            `bad_signature` or `storage_full`.
         """
         with self._lock:
             self._refuse_closed()
@@ -265,7 +311,11 @@ class SteppedInstance:
                     "answers: others were stored for this instance, and count. Go on with the "
                     "next instance.",
                 )
-            try:
+            if self._signatory is not None:
+                signed = self._signed(io.sha256_of(data), signature)
+                with _storage(), io.atomic_file(self._signed_path) as stream:
+                    stream.write(io.to_json(signed.to_dict()).encode())
+            try:  # the answers come last: with them, the instance is answered
                 with _storage(), io.atomic_file(self._answers_path, new=True) as stream:
                     stream.write(data)
                 with _storage():
@@ -293,6 +343,10 @@ class SteppedInstance:
             with contextlib.suppress(OSError):  # the steps survive all but a loss of power
                 self.sync()
             self._lanes = self._format = None
+
+    def _signed(self, answers: str, signature: str) -> SignedAnswers:
+        assert self._signatory is not None
+        return self._signatory.signed(self._number, answers, self.journal_digest(), signature)
 
     def _opened(self) -> Journal | None:
         """The journal; None before the start."""

@@ -12,6 +12,7 @@ kill in the middle of a write, leaves of the last record is ignored, and cut off
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import struct
 import zlib
@@ -137,6 +138,16 @@ class Journal:
             for _ in range(self.requests):
                 _, actions = self._record(stream)
                 yield np.frombuffer(actions, "<f4").reshape(self.lanes, self.action_dim)
+
+    def digest(self) -> str:
+        """SHA-256 of the bodies of all requests for steps, in order, as their senders know it."""
+        hashed = hashlib.sha256()
+        with open_regular(self.path) as stream:
+            stream.seek(_START)
+            for _ in range(self.requests):
+                number, actions = self._record(stream)
+                hashed.update(_NUMBER.pack(number) + actions)
+        return f"sha256:{hashed.hexdigest()}"
 
     def _append(self, number: int, actions: bytes) -> None:
         if self.ended or len(actions) != self._actions_size:

@@ -2,7 +2,7 @@
 
 The store has checked each file against the log, and the master against the commitment. What is
 left are the data sets and challenge states, the signatures, and the scores: of offline entries
-from their answers, of tickets also from their journals of actions.
+from their answers, of tickets also from their journals of actions, which the entrants signed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from leaderboard.scoring.sealed import instances, sealed_result
 from leaderboard.scoring.season import counting, scored_entry
 from leaderboard.scoring.verify import EXACT, close
 from leaderboard.sealed.scores import score_ticket
-from leaderboard.sealed.ticket import deadline
+from leaderboard.sealed.ticket import RunningTicket, deadline
 from leaderboard.store import SealedRow, Store
 
 Progress = Callable[[int, int], None]
@@ -151,8 +151,17 @@ def _check_signature(store: Store, season: Season, row: SealedRow) -> None:
 
 def _scored(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
     if season.track == "sealed-online":
+        _check_answers(store, season, master, row)
         return score_ticket(store, season, master, row.number)
     return scored_entry(store, season, master, row)
+
+
+def _check_answers(store: Store, season: Season, master: Master, row: SealedRow) -> None:
+    """Check that the entrant has signed the answers and the journal of each answered instance."""
+    for number, instance in enumerate(RunningTicket(store, season, master, row).instances):
+        if not instance.is_signed:
+            path = store.season_folder(row.season).ticket(row.number) / f"{number}.json"
+            _refuse(store, path, "is not the entrant's signature of these answers and this journal")
 
 
 def _compare(store: Store, season: Season, stored: SealedResult, again: SealedResult) -> None:
@@ -166,6 +175,8 @@ def _compare(store: Store, season: Season, stored: SealedResult, again: SealedRe
     for number, (was, now) in enumerate(zip(stored.stepping, again.stepping, strict=True)):
         if was.steps != now.steps or not _alike(_regrets(was), _regrets(now)):
             _refuse(store, path, f"stepping.{number}: replayed from its journal, it differs")
+        if was.signed != now.signed:
+            _refuse(store, path, f"stepping.{number}: names another signature than the stored one")
     follows = sealed_result(
         season,
         stored.subject,

@@ -35,7 +35,8 @@ def score_ticket(store: Store, season: Season, master: Master, number: int) -> S
         run, used = score_run(ticket.hidden(index), *instance.stored_answers)
         runs.append(run)
         versions |= used
-        stepping.append(measured_steps(ticket.start(index), instance.journal, instance.budget))
+        steps = measured_steps(ticket.start(index), instance.journal, instance.budget)
+        stepping.append(steps.model_copy(update={"signed": instance.signed_digest}))
     draws = store.document.draws
     return sealed_result(season, row.entrant.id, runs, versions, draws, stepping)
 

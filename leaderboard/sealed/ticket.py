@@ -13,6 +13,7 @@ from leaderboard.documents.submission import shifted, utc
 from leaderboard.errors import Rejection
 from leaderboard.scoring.sealed import Instance, challenge, instances
 from leaderboard.sealed.instance import SteppedInstance
+from leaderboard.sealed.signatory import Signatory
 from leaderboard.sealed.stepping import Start
 from leaderboard.store import SealedRow, Store
 from sme_registry import sealed
@@ -41,7 +42,8 @@ class RunningTicket:
     def __init__(self, store: Store, season: Season, master: Master, row: SealedRow) -> None:
         self.number = row.number
         self._season, self._master = season, master
-        self._nonce = store.request_of(row).ticket.nonce
+        request = store.request_of(row)
+        self._nonce = request.ticket.nonce
         place = Place(season.id, "", 0, str(row.number), self._nonce)
         self._token = master.secret("token", place).hex()
         self._deadline = deadline(season, row)
@@ -50,7 +52,8 @@ class RunningTicket:
         folder = store.season_folder(row.season).ticket(row.number)
         self.instances = tuple(
             SteppedInstance(
-                folder, number, hidden.member, season.protocol, partial(self.start, number)
+                *(folder, number, hidden.member, season.protocol, partial(self.start, number)),
+                Signatory.named_in(request, row.number),
             )
             for number, hidden in enumerate(season.hidden)
         )

@@ -171,7 +171,15 @@ class Tickets:
         self._chosen(number, token, instance)
         return self.ticket(number).challenge(instance)
 
-    def answer(self, number: int, token: str, instance: int, data: bytes) -> bool:
+    def journal_digest(self, number: int, token: str, instance: int) -> str:
+        """`SteppedInstance.journal_digest`, with the password of the ticket; also after its end."""
+        ticket = self.ticket(number)
+        ticket.refuse_token(token)
+        return ticket.instance(instance).journal_digest()
+
+    def answer(
+        self, number: int, token: str, instance: int, data: bytes, signature: str = ""
+    ) -> bool:
         """`SteppedInstance.answer`, with the password of the ticket.
 
         The same answers are confirmed after the ticket's end, too: the last ones are what ends it.
@@ -182,7 +190,7 @@ class Tickets:
         if chosen.has_stored(data):
             return False
         ticket.refuse_over(self.now)
-        return chosen.answer(data)
+        return chosen.answer(data, signature)
 
     def over(self) -> list[int]:
         """The numbers of tickets that are over and have no result, in order."""

@@ -74,7 +74,7 @@ def to_bytes(document: StrictModel) -> bytes:
 
 def digest_of(document: StrictModel) -> str:
     """`sha256:` and 64 hex digits of the document's file, as `sha256sum` prints them."""
-    return "sha256:" + hashlib.sha256(to_bytes(document)).hexdigest()
+    return io.sha256_of(to_bytes(document))
 
 
 def write_document(path: Path, document: StrictModel, *, new: bool = False) -> None:

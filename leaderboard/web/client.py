@@ -141,6 +141,9 @@ def request_ticket(
       signed: the request, signed for this board.
       key: the entrant's, which signed it.
 
+    Returns:
+      The ticket, with the signer of its answers.
+
     Raises:
       Rejection: the board rejects it.
       BoardError: the board cannot be reached, or its answer is invalid.
@@ -151,9 +154,10 @@ def request_ticket(
         path = tickets_path(_name(season))
         _, answer = client.request("POST", path, signed.to_bytes(), sign)
     try:
-        return Ticket.from_dict(answer, "ticket")
+        ticket = Ticket.from_dict(answer, "ticket")
     except SpecError as error:
         raise BoardError(f"{url}: answered with no ticket: {printable(error)}") from None
+    return ticket.model_copy(update={"signer": signed.signer(key)})
 
 
 def enter(

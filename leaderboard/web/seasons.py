@@ -10,6 +10,7 @@
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps      one step of all lanes
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish     take no more steps
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge  challenge states
+    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal    digest of the steps
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
 
 Steps are answered in the event loop (`QuickSteps`), where they take less time than a thread would;
@@ -97,6 +98,7 @@ class SeasonRoutes:
             Route(f"{_INSTANCE}/start", self.start, methods=["POST"]),
             Route(f"{_INSTANCE}/finish", self.finish, methods=["POST"]),
             Route(f"{_INSTANCE}/challenge", self.challenge, methods=["GET"]),
+            Route(f"{_INSTANCE}/journal", self.journal, methods=["GET"]),
             Route(f"{_INSTANCE}/answers", self.answer, methods=["PUT"]),
             Route("/api/seasons", self.get_seasons, methods=["GET"]),
             Route(_SEASON, self.get_season, methods=["GET"]),
@@ -194,13 +196,21 @@ class SeasonRoutes:
         owner = f"{tickets.season.id}/{where.ticket}"
         return _octets(await self._challenges.run(lambda: tickets.challenge(*where), owner))
 
+    async def journal(self, request: Request) -> Response:
+        """The digest of an instance's steps."""
+        tickets, where = self.place(request.scope)
+        owner = f"{tickets.season.id}/{where.ticket}"
+        digest = await self._challenges.run(lambda: tickets.journal_digest(*where), owner)
+        return JSONResponse(sealed.JournalDigest(journal=digest).to_dict())
+
     async def answer(self, request: Request) -> Response:
         """Store the answers to a challenge."""
         tickets, where = self.place(request.scope)
         limit = await self._in_thread(lambda: tickets.answer_bytes(*where))
         chunks = limits.body_chunks(request, limit, limits.UPLOAD_SECONDS, "answers")
         data = b"".join([chunk async for chunk in chunks])
-        new = await self._in_thread(lambda: tickets.answer(*where, data))
+        signature = request.query_params.get("signature", "")
+        new = await self._in_thread(lambda: tickets.answer(*where, data, signature))
         return Response(status_code=201 if new else 200)
 
     async def step(self, request: Request) -> Response:

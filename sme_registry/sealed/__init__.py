@@ -13,8 +13,10 @@
 from sme_registry.sealed.connection import PATIENCE
 from sme_registry.sealed.envs import SealedEnv, SealedVectorEnv, make, make_vec
 from sme_registry.sealed.instance import Instance, actions_in, answer, prepare_policy
+from sme_registry.sealed.signing import Signer, Statement
 from sme_registry.sealed.ticket import (
     InstanceStatus,
+    JournalDigest,
     Place,
     Ticket,
     TicketClass,
@@ -39,9 +41,12 @@ __all__ = [
     "Begun",
     "Instance",
     "InstanceStatus",
+    "JournalDigest",
     "Place",
     "SealedEnv",
     "SealedVectorEnv",
+    "Signer",
+    "Statement",
     "StepFormat",
     "Steps",
     "Ticket",

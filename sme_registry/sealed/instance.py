@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from typing import Any, TypeVar
 
@@ -12,9 +13,10 @@ from sme_registry.errors import MalformedDocumentError, PolicyError, SealedError
 from sme_registry.evaluation import Policy, as_policy
 from sme_registry.evaluation.references import POLICIES
 from sme_registry.evaluation.regions import batch_rows
-from sme_registry.io import integer_in, parse_json
+from sme_registry.io import integer_in, parse_json, sha256_of
 from sme_registry.sealed.connection import PATIENCE, Connection
-from sme_registry.sealed.ticket import Ticket, TicketStatus
+from sme_registry.sealed.signing import Statement, require_signatures
+from sme_registry.sealed.ticket import JournalDigest, Ticket, TicketStatus
 from sme_registry.sealed.wire import (
     Float32,
     StepFormat,
@@ -84,6 +86,7 @@ class Instance:
         S, A = self.setting.state_dim, self.setting.action_dim
         self._format = StepFormat(integer_in("lanes", lanes, 1, ticket.lanes), S, A)
         self._ticket, self._instance = ticket, instance
+        self._taken: hashlib._Hash | None = None  # of all steps, if this process knows them
         self._connection = Connection(url, ticket.token, insecure=insecure, patience=patience)
 
     @property
@@ -106,7 +109,12 @@ class Instance:
           SealedError: the server refuses it, such as other lanes than those of the first steps.
         """
         data = self._request("POST", f"start?lanes={self.lanes}", most=self._format.answer_bytes)
-        self.number, observation = self._format.unpack_begun(data)
+        number, observation = self._format.unpack_begun(data)
+        if number == 0:
+            self._taken = hashlib.sha256()
+        elif number != self.number:
+            self._taken = None
+        self.number = number
         return observation
 
     def step(self, actions: npt.NDArray[np.floating]) -> Steps:
@@ -131,28 +139,46 @@ class Instance:
                 "present observation; no other process may step the instance.",
             ) from None
         self.number += 1
+        if self._taken is not None:
+            self._taken.update(body)
         return self._format.unpack_steps(data)
 
     def challenge(self) -> Float32:
         """End the stepping, and return the challenge states: observations `[rows, S + 2]`.
 
         Raises:
+          MissingDependencyError: PyNaCl, which signs the answers, is not installed.
           SealedError: the server refuses it, or gives no answer.
         """
+        if self._ticket.signer is not None:
+            require_signatures()  # before the stepping ends for good
         self._request("POST", "finish")
         data = self._request("GET", "challenge", most=_MAX_CHALLENGE)
         return unpack_table(data, self.setting.state_dim + 2)
 
     def send_answers(self, actions: npt.NDArray[np.floating]) -> None:
-        """Answer the challenge; the last instance's answers end the ticket.
+        """Sign and send the answers to the challenge; the last instance's end the ticket.
 
         Args:
           actions: `[rows, A]` of the unit range, finite; clipped.
 
         Raises:
-          SealedError: the server refuses them, such as others than those it has.
+          MissingDependencyError: PyNaCl, which signs them, is not installed.
+          SealedError: the server refuses them, such as others than those it has, or its journal
+            has other steps than this object has taken.
         """
-        self._request("PUT", "answers", pack_table(actions))
+        data, signer = pack_table(actions), self._ticket.signer
+        if signer is None:
+            self._request("PUT", "answers", data)
+            return
+        statement = Statement(
+            request=signer.request,
+            ticket=self._ticket.ticket,
+            instance=self._instance,
+            answers=sha256_of(data),
+            journal=self._journal_digest(),
+        )
+        self._request("PUT", f"answers?signature={signer.sign(statement)}", data)
 
     def status(self) -> TicketStatus:
         """The status of the whole ticket.
@@ -173,6 +199,18 @@ class Instance:
     def close(self) -> None:
         """Close the connection; the next request opens another one."""
         self._connection.close()
+
+    def _journal_digest(self) -> str:
+        """That of the server's journal, compared with the steps as far as they are known here."""
+        found = parse_answer(JournalDigest, self._request("GET", "journal")).journal
+        if self._taken is not None and found != f"sha256:{self._taken.hexdigest()}":
+            raise SealedError(
+                "journal",
+                f"journal: the server's, {found[:19]}…, is not of the steps that were taken here, "
+                "so it is not signed. If another process has stepped the instance, call `begin` "
+                "to accept its steps; otherwise ask the board's owner.",
+            )
+        return found
 
     def _request(self, method: str, action: str, body: bytes = b"", *, most: int = 0) -> bytes:
         ticket = self._ticket

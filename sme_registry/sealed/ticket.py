@@ -13,7 +13,8 @@ from pydantic import Field
 from sme_registry.errors import OptionError
 from sme_registry.io import integer_in, read_json, to_json
 from sme_registry.io.files import atomic_file, unwritable
-from sme_registry.spec import Integer, Name, Setting, StrictModel, TupleOf
+from sme_registry.sealed.signing import Signer
+from sme_registry.spec import Digest, Integer, Name, Setting, StrictModel, TupleOf
 
 _Count = Annotated[Integer, Field(ge=0)]
 
@@ -60,6 +61,7 @@ class Ticket(StrictModel):
       deadline: until when answers count, in UTC.
       lanes: the most copies of an instance that are stepped together.
       classes: instance i of the ticket counts over all of them, class by class.
+      signer: signs the answers; null in a server's answer, which does not know the key.
     """
 
     season: Name
@@ -68,6 +70,7 @@ class Ticket(StrictModel):
     deadline: Annotated[str, Field(max_length=40)]
     lanes: Annotated[Integer, Field(ge=1)]
     classes: Annotated[TupleOf[TicketClass], Field(min_length=1)]
+    signer: Signer | None = None
 
     @property
     def places(self) -> Iterator[Place]:
@@ -131,6 +134,16 @@ class InstanceStatus(StrictModel):
     lanes: Annotated[Integer, Field(ge=1)] | None
     requests: _Count
     used: _Count
+
+
+class JournalDigest(StrictModel):
+    """The answer to a request for the digest of an instance's steps, once no more can follow.
+
+    Attributes:
+      journal: SHA-256 of the bodies of all requests for steps, in order.
+    """
+
+    journal: Digest
 
 
 class TicketStatus(StrictModel):

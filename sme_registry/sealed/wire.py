@@ -6,11 +6,12 @@
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/steps               one step of all lanes
     POST /api/seasons/{id}/tickets/{n}/instances/{i}/finish              take no more steps
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/challenge           challenge states, .npy
-    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers             an action for each, .npy
+    GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal             digest of all steps, JSON
+    PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers?signature=  an action for each, .npy
 
-Each but the first has the ticket's token as `Authorization: Bearer`. Every request may be repeated
-after a lost answer: none has a further effect. Numbers are little-endian; L are the lanes, S and A
-the state and action channels.
+Each but the first has the ticket's token as `Authorization: Bearer`; the signature is that of
+`signing`. Every request may be repeated after a lost answer: none has a further effect. Numbers are
+little-endian; L are the lanes, S and A the state and action channels.
 
     start, answer    uint64 number of the last steps, float32 [L, S + 2] present observations
     steps, request   uint64 number: 1, 2, …           float32 [L, A] actions in [0, 1]
@@ -61,7 +62,7 @@ def ticket_path(season: str, ticket: int) -> str:
 
 
 def instance_path(season: str, ticket: int, instance: int, action: str) -> str:
-    """The address of an action on an instance: start, steps, finish, challenge or answers."""
+    """The address of an action on an instance, such as `start` or `steps`."""
     return f"{ticket_path(season, ticket)}/instances/{instance}/{action}"
 
 

@@ -104,5 +104,6 @@ def signed_request(
     store: Store, season: Season, key: SigningKey, nonce: int = 0, **fields: Any
 ) -> SignedTicketRequest:
     """A request for a ticket of a board."""
-    plain = manifest(season, key, nonce=f"{nonce:064x}", **fields)
+    names = {"nonce": f"{nonce:064x}", "answers_key": key.of_answers(f"{nonce:064x}").public}
+    plain = manifest(season, key, **{**names, **fields})
     return TicketRequest.from_dict(plain).signed(key, store.document.key)

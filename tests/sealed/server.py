@@ -109,7 +109,8 @@ def _relay(server: Server) -> Iterator[None]:
 
         def respond(self) -> None:
             body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            server.requests.append(f"{self.command} {self.path.rpartition('/')[2]}")
+            action = self.path.rpartition("/")[2].partition("?signature")[0]
+            server.requests.append(f"{self.command} {action}")
             fault = server.faults.pop(0) if server.faults else ""
             if fault == "lose request":
                 self.close_connection = True

@@ -326,6 +326,22 @@ def test_answers_are_the_policy_s_actions_in_the_challenge_states(server, tmp_pa
     assert [each.phase for each in status.instances] == ["waiting", "answered", "waiting"]
 
 
+def test_a_journal_with_other_steps_than_were_taken_is_not_signed(server):
+    answers = np.zeros((ROWS, 2))
+    with (
+        Instance(server.url, server.ticket, lanes=2) as hidden,
+        Instance(server.url, server.ticket, lanes=2) as other,
+    ):
+        for each in (hidden, other):
+            each.begin()
+            each.step(np.zeros((2, 2)))
+        hidden.challenge()
+        with pytest.raises(SealedError, match="journal: the server's, sha256"):
+            hidden.send_answers(answers)
+        hidden.begin()
+        hidden.send_answers(answers)
+
+
 def test_the_last_answers_may_be_repeated_after_they_have_ended_the_ticket(server):
     answers = np.zeros((ROWS, 2))
     for number in range(3):

@@ -9,11 +9,13 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
+from leaderboard.documents.entry import SignedTicketRequest
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import Season
 from leaderboard.documents.submission import SignedManifest
 from leaderboard.intake import upload_header
 from leaderboard.store import Store
+from leaderboard.web import client
 from sme_registry import sealed
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealing import MASTER, signed_request, tiny_season
@@ -28,7 +30,7 @@ class Board(NamedTuple):
     season: Season
     secret: Path
 
-    def request(self, key: SigningKey, nonce: int = 0, **fields: Any) -> SignedManifest:
+    def request(self, key: SigningKey, nonce: int = 0, **fields: Any) -> SignedTicketRequest:
         """A signed request for a ticket."""
         with Store.open(self.path) as store:
             return signed_request(store, self.season, key, nonce, **fields)
@@ -41,9 +43,7 @@ class Board(NamedTuple):
 
     def ticket(self, url: str, key: SigningKey, nonce: int = 0) -> sealed.Ticket:
         """A new ticket of a served board."""
-        answer = self.send(url, self.request(key, nonce), key)
-        assert answer.status_code == 201, answer.text
-        return sealed.Ticket.from_dict(answer.json())
+        return client.request_ticket(url, self.season.id, self.request(key, nonce), key)
 
 
 def online_board(folder: Path, **fields: Any) -> Board:

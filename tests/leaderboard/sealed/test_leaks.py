@@ -20,6 +20,7 @@ from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.ticket import RunningTicket
 from leaderboard.store import Store
 from sme_registry import SMEError, materialize, sealed
+from sme_registry.io import sha256_of
 from tests.leaderboard.sealed.playing import Board, online_board
 from tests.leaderboard.serving import serving
 
@@ -48,9 +49,12 @@ def secrets_of(board: Board, store: Store) -> list[bytes]:
 
 def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.Response]:
     """The answers to every request of an entrant, and to a refused one of each kind."""
-    started = board.send(url, board.request(KEY), KEY)
+    request = board.request(KEY)
+    started = board.send(url, request, KEY)
     yield started
     ticket = sealed.Ticket.from_dict(started.json())
+    signer = request.signer(KEY)
+    assert signer is not None
     token = {"Authorization": sealed.bearer(ticket.token)}
     wire = sealed.StepFormat(4, 2, 1)
 
@@ -76,6 +80,17 @@ def everything(url: str, board: Board, client: httpx.Client) -> Iterator[httpx.R
     yield client.put(at("answers"), content=b"x", headers=token)
     answers = sealed.pack_table(np.full((300, 1), 0.5))
     yield client.put(at("answers"), content=answers, headers=token)
+    journal = client.get(at("journal"), headers=token)
+    yield journal
+    statement = sealed.Statement(
+        request=signer.request,
+        ticket=1,
+        instance=0,
+        answers=sha256_of(answers),
+        journal=journal.json()["journal"],
+    )
+    signed = f"answers?signature={signer.sign(statement)}"
+    yield client.put(at(signed), content=answers, headers=token)
     yield client.get(url + sealed.ticket_path(board.season.id, 1), headers=token)
 
 

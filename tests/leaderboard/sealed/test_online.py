@@ -175,6 +175,7 @@ def test_the_same_request_has_the_same_ticket_and_another_one_a_new_ticket(tmp_p
     [
         ({"nonce": "0" * 63}, True, 422, "schema"),
         ({"nonce": "0" * 63 + "G"}, True, 422, "schema"),
+        ({"answers_key": None}, True, 422, "schema"),
         ({"season": "sha256:" + "0" * 64}, True, 404, "season_unknown"),
         ({"created": moment(-30)}, True, 403, "stale_time"),
         ({"created": moment(1)}, True, 403, "stale_time"),
@@ -186,7 +187,8 @@ def test_requests_for_tickets_are_checked(
     tmp_path: Path, changes: dict[str, Any], board_key: bool, status: int, code: str
 ) -> None:
     board = online_board(tmp_path)
-    plain = {**manifest(board.season, KEY), "nonce": "0" * 64, **changes}
+    plain = {**manifest(board.season, KEY), "nonce": "0" * 64, "answers_key": OTHER.public}
+    plain |= changes
     valid = TicketRequest.from_dict({**plain, "nonce": "0" * 64})
     with Store.open(board.path) as store:
         signed = valid.signed(KEY, store.document.key if board_key else None)

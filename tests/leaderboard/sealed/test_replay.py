@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from leaderboard.errors import TamperedError
 from leaderboard.scoring.season import season_rankings
 from leaderboard.scoring.verify import verify
 from leaderboard.sealed import verify_season
+from leaderboard.sealed.journal import Journal
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from leaderboard.store.log import Log
@@ -73,8 +75,8 @@ def test_a_season_of_tickets_is_replayed_and_every_one_of_them_counts(revealed: 
 def test_altered_journals_and_answers_are_found(revealed: Board) -> None:
     with Store.open(revealed.path, read_only=True) as store:
         folder = store.season_folder(revealed.season.digest).ticket(1)
-        files = [path for path in sorted(folder.iterdir()) if path.suffix != ".json"]
-        assert len(files) >= 4  # a journal and answers of each instance
+        files = [path for path in sorted(folder.iterdir()) if path.name != "ticket.json"]
+        assert len(files) == 6  # a journal, answers and their signature of each instance
         for path in files:
             whole = path.read_bytes()
             middle = len(whole) // 2
@@ -85,6 +87,46 @@ def test_altered_journals_and_answers_are_found(revealed: Board) -> None:
             assert path.read_bytes() == altered
             path.write_bytes(whole)
         assert verify_season(store, revealed.season.id).results == 2
+
+
+def replace_answers(folder: Path) -> None:
+    (folder / "0.npy").write_bytes(sealed.pack_table(np.full((300, 1), 0.75)))
+
+
+def replace_journal(folder: Path) -> None:
+    (folder / "0.journal").unlink()
+    journal = Journal.create(folder / "0.journal", 4, 1)
+    journal.append(np.full((4, 1), 0.75, "<f4").tobytes())
+    journal.end()
+
+
+def remove_signature(folder: Path) -> None:
+    (folder / "0.json").unlink()
+
+
+@pytest.mark.parametrize("replace", [replace_answers, replace_journal, remove_signature])
+def test_what_an_organiser_replaces_before_the_result_is_found(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    key: SigningKey,
+    replace: Callable[[Path], None],
+) -> None:
+    board = online_board(tmp_path)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        ticket = board.ticket(url, key)
+        with sealed.Instance(url, ticket, lanes=4) as instance:
+            instance.begin()
+            instance.step(np.full((4, 1), 0.5))
+            instance.send_answers(np.full((len(instance.challenge()), 1), 0.5))
+    for module in ("sealed", "log"):
+        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    with Store.open(board.path) as store:
+        replace(store.season_folder(board.season.digest).ticket(1))
+        result = score_ticket(store, board.season, MASTER, 1)
+        store.end_ticket(board.season.digest, 1, result)
+        store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+        with pytest.raises(TamperedError, match=r"tickets/1/0\.json: is not the entrant's"):
+            verify_season(store, board.season.id)
 
 
 def test_a_learning_curve_that_no_journal_has_is_found(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import pickle
@@ -25,8 +26,10 @@ from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
 from leaderboard.store import Store
-from sme_registry.sealed import StepFormat, pack_table, unpack_table
+from sme_registry.io import sha256_of
+from sme_registry.sealed import Statement, StepFormat, pack_table, unpack_table
 from tests.leaderboard.sealed.playing import Board, online_board
+from tests.leaderboard.sealing import NOTHING
 
 LANES = 4
 WIRE = StepFormat(LANES, 2, 1)
@@ -40,8 +43,9 @@ class Played:
     def __init__(self, board: Board) -> None:
         self.board = board
         self.store = Store.open(board.path)
-        request = Envelope.read(board.request(KEY).to_bytes(), SignedTicketRequest)
-        self.number, _ = start_ticket(self.store, request, board.season.digest)
+        self.request = board.request(KEY)
+        envelope = Envelope.read(self.request.to_bytes(), SignedTicketRequest)
+        self.number, _ = start_ticket(self.store, envelope, board.season.digest)
         self.open()
         self.token = self.tickets.ticket(self.number).document.token
 
@@ -65,7 +69,24 @@ class Played:
 
     def answer(self, table: Any, instance: int = 0) -> bool:
         data = table if isinstance(table, bytes) else pack_table(table)
-        return self.tickets.answer(self.number, self.token, instance, data)
+        journal = NOTHING
+        with contextlib.suppress(Rejection):  # as long as steps may follow
+            journal = self.tickets.journal_digest(self.number, self.token, instance)
+        signature = self.signature(data, journal, instance)
+        return self.tickets.answer(self.number, self.token, instance, data, signature)
+
+    def signature(self, data: bytes, journal: str, instance: int = 0) -> str:
+        """The entrant's, of these answers and this digest of the steps."""
+        signer = self.request.signer(KEY)
+        assert signer is not None
+        statement = Statement(
+            request=self.request.id,
+            ticket=self.number,
+            instance=instance,
+            answers=sha256_of(data),
+            journal=journal,
+        )
+        return signer.sign(statement)
 
     @property
     def used(self) -> int:
@@ -218,6 +239,46 @@ def test_answers_have_one_form(played: Played, table: Any, code: str) -> None:
     assert played.answer(np.full((ROWS, 1), 0.5))
 
 
+def test_answers_need_a_signature_of_them_and_the_journal(played: Played) -> None:
+    played.start()
+    played.step(1)
+    played.finish()
+    data = pack_table(np.full((ROWS, 1), 0.5))
+    instance = played.tickets.ticket(played.number).instance(0)
+    journal = instance.journal_digest()
+    body = WIRE.pack_request(1, np.full((LANES, 1), 0.3, np.float32))
+    assert journal == sha256_of(body)
+    others = [
+        "",
+        "0" * 128,
+        played.signature(data + b"x", journal),
+        played.signature(data, NOTHING),
+        played.signature(data, journal, instance=1),
+        KEY.sign("answers", played.request.id, played.request.board),
+    ]
+    for other in others:
+        refused("bad_signature", instance.answer, data, other)
+    assert not instance.answered
+    assert instance.answer(data, played.signature(data, journal))
+    assert instance.is_signed
+
+
+def test_requests_older_than_signed_answers_need_no_signature(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        request = board.request(KEY, answers_key=None)
+        assert "answers_key" not in request.to_dict()["ticket"]
+        number = store.start_ticket(request)
+        tickets = Tickets(store, board.secret)
+        instance = tickets.ticket(number).instance(0)
+        instance.finish()
+        assert instance.answer(pack_table(np.full((ROWS, 1), 0.5)), "")
+        assert instance.is_signed
+        result = score_ticket(store, board.season, Master.read(board.secret), number)
+        tickets.close()
+    assert "signed" not in result.to_dict()["stepping"][0]
+
+
 def test_a_token_opens_one_ticket(played: Played) -> None:
     request = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
     other, _ = start_ticket(played.store, request, played.board.season.digest)
@@ -293,7 +354,7 @@ def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played)
     instance = played.tickets.ticket(played.number).instance(0)
     played.finish()
     played.tickets.close_ticket(played.number)
-    refused("ticket_ended", instance.answer, pack_table(np.full((ROWS, 1), 0.5)))
+    refused("ticket_ended", instance.answer, pack_table(np.full((ROWS, 1), 0.5)), "")
     assert not instance.answered
 
 
