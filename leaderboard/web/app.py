@@ -45,7 +45,7 @@ from leaderboard.web import errors, limits
 from leaderboard.web.downloads import Downloads
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.guard import Guard
-from leaderboard.web.seasons import QuickSteps, SeasonRoutes
+from leaderboard.web.seasons import SeasonRoutes
 from leaderboard.web.site import Pages, content_type
 from sme_registry.errors import SMEError
 
@@ -115,10 +115,10 @@ def create_app(
         },
     )
     app.state.scores = score_workers > 0  # see `errors.on_board_error`
+    app.state.take_steps = seasons.take_steps  # see `serve.server_config`
     app.add_middleware(limits.RequestsByAddress, limit=requests_of_address)
     app.add_middleware(Guard)
-    app.add_middleware(limits.RefusedBodies)
-    app.add_middleware(QuickSteps, seasons=seasons)  # the last one is the outermost
+    app.add_middleware(limits.RefusedBodies)  # the last one is the outermost
     app.router.routes.extend(seasons.routes)
     app.add_api_route("/healthz", routes.health)
     app.add_api_route("/api/objects/{digits}", routes.put_object, methods=["PUT"])

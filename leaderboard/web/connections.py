@@ -2,9 +2,11 @@
 
 A connection is in one of three phases, each with its own limit:
 
-    waiting    no complete request head has arrived     at most `head_seconds`, however it drips in
+    waiting    no complete request head has arrived*    at most `head_seconds`, however it drips in
     working    a request is read or answered            bodies have their own deadline in `limits`
     writing    the client has not read what was sent    at most `stalled_seconds` for each piece
+
+    * of steps, no complete request
 
 When all slots are taken, or all those of one address, a new connection takes the slot of another
 one: of the one that has waited longest without a complete request, or, if that has just come, of
@@ -15,7 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +25,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from leaderboard.web.limits import LEAST_RATE, LOOPBACK, Network, counted_address
+from leaderboard.web.quick import StepRequest, step_answer, step_request
 
 _COMPARED = 64
 _HEAD_BYTES = 2**14
@@ -59,6 +62,9 @@ class Connections:
       limits: on their number and times.
       proxies: the networks of trusted reverse proxies.
       uncounted: other networks without a limit by address.
+
+    Attributes:
+      take_steps: takes the steps of a request, and returns them; None if the application must.
     """
 
     def __init__(
@@ -70,6 +76,7 @@ class Connections:
         self.limits = limits
         self.proxies = tuple(proxies)
         self._uncounted = (*self.proxies, *uncounted)
+        self.take_steps: Callable[[StepRequest], bytes | None] = lambda _: None
         # Dictionaries keep the order in which connections came, or began to wait.
         self._open: dict[Connection, None] = {}
         self._waiting: dict[Connection, None] = {}
@@ -184,6 +191,7 @@ class Connection(H11Protocol):
         self._deadline: asyncio.TimerHandle | None = None
         self._started = self.loop.time()
         self._moved = 0
+        self._held = b""  # a request for steps whose body has not arrived
 
     @property
     def host(self) -> str:
@@ -221,9 +229,21 @@ class Connection(H11Protocol):
             self.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Read bytes of a request."""
+        """Read bytes of a request; steps are taken here, and all else in the application."""
         self._moved += len(data)
-        super().data_received(data)
+        data, self._held = self._held + data, b""
+        request = step_request(data) if self._is_between_requests else None
+        if request is not None and request.missing:
+            self._unset_keepalive_if_required()  # the deadline of this phase goes on
+            self._held = data
+            return
+        steps = None if request is None else self._take(request)
+        if steps is None:
+            super().data_received(data)
+            return
+        self._enter("working")
+        self.transport.write(step_answer(steps, self.server_state.default_headers))
+        self.on_response_complete()
 
     def handle_events(self) -> None:
         """Go on with the requests that have arrived."""
@@ -257,10 +277,26 @@ class Connection(H11Protocol):
         self._connections.close(self)
         self._set_deadline(None)
 
+    @property
+    def _is_between_requests(self) -> bool:
+        """Whether none is in progress, and h11 has no part of one."""
+        h11_waits = self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]
+        return self._phase == "waiting" and h11_waits
+
+    def _take(self, request: StepRequest) -> bytes | None:
+        try:
+            return self._connections.take_steps(request)
+        except Exception:  # the application takes the same steps again, or says what fails
+            return None
+
     def _update(self) -> None:
-        """Enter the present phase; the deadline of a phase that lasts is not extended."""
+        """Enter the present phase."""
         idle = self.cycle is None or self.cycle.response_complete
         phase: _Phase = "writing" if self.flow.write_paused else "waiting" if idle else "working"
+        self._enter(phase)
+
+    def _enter(self, phase: _Phase) -> None:
+        """Enter a phase; the deadline of one that lasts is not extended."""
         if phase == self._phase:
             return
         if "waiting" in (phase, self._phase):

@@ -13,16 +13,14 @@
     GET  /api/seasons/{id}/tickets/{n}/instances/{i}/journal    digest of the steps
     PUT  /api/seasons/{id}/tickets/{n}/instances/{i}/answers    201 stored, 200 the same again
 
-Steps are answered in the event loop (`QuickSteps`), where they take less time than a thread would;
-what replays a journal, or waits for the disk, runs in threads.
+Steps are usually answered before they come here (`quick`), in the event loop; what replays a
+journal, waits for the disk or is refused runs in threads.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,7 +28,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Scope
 
 from leaderboard import intake
 from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
@@ -40,6 +38,7 @@ from leaderboard.sealed import Tickets, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web import limits
 from leaderboard.web.errors import HTTP_CODES, RequestError
+from leaderboard.web.quick import StepRequest
 from sme_registry import sealed
 
 _SEASON = "/api/seasons/{season}"
@@ -49,12 +48,6 @@ _WORKERS = 4  # threads that replay journals and write answers
 _REQUESTS = 64  # of a kind, that wait or run at the same time
 _LARGEST = 2**31
 _BODY_SECONDS = 30.0
-_STEPS = re.compile(r"/api/seasons/([^/]+)/tickets/(\d{1,9})/instances/(\d{1,9})/steps", re.ASCII)
-_STEP_HEADERS = (
-    (b"content-type", b"application/octet-stream"),
-    (b"cache-control", b"no-store"),
-    (b"x-content-type-options", b"nosniff"),
-)
 _T = TypeVar("_T")
 
 
@@ -220,14 +213,13 @@ class SeasonRoutes:
         body = b"".join([chunk async for chunk in chunks])
         return _octets(await self._in_thread(lambda: tickets.step(*where, body)))
 
-    def steps_in(self, scope: Scope) -> tuple[Tickets, _Where] | None:
-        """The instance of which a request may take steps; None if it surely does not."""
-        posted = scope["type"] == "http" and scope["method"] == "POST"
-        match = _STEPS.fullmatch(scope["path"]) if posted else None
-        tickets = self._tickets.get(match[1]) if match else None
-        if match is None or tickets is None:
+    def take_steps(self, request: StepRequest) -> bytes | None:
+        """The answer to a request for steps; None where that would block, or refuse them."""
+        tickets = self._tickets.get(request.season)
+        if tickets is None:
             return None
-        return tickets, _Where(int(match[2]), _token(scope), int(match[3]))
+        token = _without_scheme(request.authorization)
+        return tickets.quick_step(request.ticket, token, request.instance, request.body)
 
     def tickets_of(self, season: str) -> Tickets:
         """The tickets of a season that this server steps.
@@ -267,50 +259,6 @@ class _Where(NamedTuple):
     instance: int
 
 
-class QuickSteps:
-    """ASGI middleware: answers steps that need no replay before the rest of an application.
-
-    Whatever else there is to say about a request, such as why it is refused, the application says.
-    It costs as much processor time as all else in a step.
-
-    Args:
-      app: the application.
-      seasons: its seasons.
-    """
-
-    def __init__(self, app: ASGIApp, seasons: SeasonRoutes) -> None:
-        self._app = app
-        self._seasons = seasons
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
-        steps = self._seasons.steps_in(scope)
-        if steps is None:
-            await self._app(scope, receive, send)
-            return
-        tickets, where = steps
-        first: Message | None = None
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_BODY_SECONDS):
-                first = await receive()
-        if first is not None and first["type"] == "http.request" and not first.get("more_body"):
-            answer = tickets.quick_step(*where, first.get("body", b""))
-            if answer is not None:
-                headers = [*_STEP_HEADERS, (b"content-length", str(len(answer)).encode())]
-                await send({"type": "http.response.start", "status": 200, "headers": headers})
-                await send({"type": "http.response.body", "body": answer})
-                return
-
-        async def receive_again() -> Message:
-            nonlocal first
-            if first is None:
-                return await receive()
-            message, first = first, None
-            return message
-
-        await self._app(scope, receive_again, send)
-
-
 def _small(scope: Scope, name: str) -> int:
     """A number of the path; of more than nine digits, one that no ticket or instance has."""
     text: str = scope["path_params"][name]
@@ -323,9 +271,12 @@ def _token(scope: Scope) -> str:
     """The password in the header `Authorization`; empty without one."""
     for name, value in scope["headers"]:
         if name == b"authorization":
-            text: str = value.decode("latin-1")
-            return text.removeprefix(sealed.bearer(""))
+            return _without_scheme(value.decode("latin-1"))
     return ""
+
+
+def _without_scheme(authorization: str) -> str:
+    return authorization.removeprefix(sealed.bearer(""))
 
 
 def _octets(data: bytes) -> Response:

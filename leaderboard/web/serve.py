@@ -111,6 +111,7 @@ def server_config(app: FastAPI, connections: Connections) -> uvicorn.Config:
     import uvicorn
 
     proxies = [str(network) for network in connections.proxies]
+    connections.take_steps = app.state.take_steps
     return uvicorn.Config(
         app,
         loop="asyncio",

@@ -132,13 +132,40 @@ class Connection:
         """A new connection, through the proxy that the environment names, if there is one."""
         address = self._address
         if not address.is_https:
-            return http.client.HTTPConnection(address.host, address.port, timeout=_TIMEOUT)
+            return _InOnePiece(address.host, address.port, timeout=_TIMEOUT)
         proxy = urlsplit(getproxies().get("https", ""))
         if address.is_local or not proxy.hostname or proxy_bypass(address.host):
-            return http.client.HTTPSConnection(address.host, address.port, timeout=_TIMEOUT)
-        connection = http.client.HTTPSConnection(proxy.hostname, proxy.port, timeout=_TIMEOUT)
+            return _SecureInOnePiece(address.host, address.port, timeout=_TIMEOUT)
+        connection = _SecureInOnePiece(proxy.hostname, proxy.port, timeout=_TIMEOUT)
         connection.set_tunnel(address.host, address.port)
         return connection
+
+
+class _InOnePiece(http.client.HTTPConnection):
+    """Sends a request's head and body together: the head alone wakes the server for nothing."""
+
+    _pieces: list[bytes] | None = None
+
+    def request(self, *args: Any, **kwargs: Any) -> None:
+        if self.sock is None:
+            self.connect()
+        self._pieces = []
+        try:
+            super().request(*args, **kwargs)
+            data = b"".join(self._pieces)
+        finally:
+            self._pieces = None
+        self.send(data)
+
+    def send(self, data: Any) -> None:
+        if self._pieces is None:
+            super().send(data)
+        else:
+            self._pieces.append(data)
+
+
+class _SecureInOnePiece(_InOnePiece, http.client.HTTPSConnection):
+    """The same over TLS."""
 
 
 def _reason_in(data: bytes, status: int) -> tuple[str, str]:

@@ -107,7 +107,7 @@ def test_no_answer_file_or_log_holds_a_secret(
     with (
         caplog.at_level(logging.DEBUG),
         serving(board.path, season_secrets=[board.secret]) as url,
-        httpx.Client(event_hooks={"response": [record]}) as client,
+        httpx.Client(event_hooks={"response": [record]}, timeout=60.0) as client,
     ):
         statuses = [each.status_code for each in everything(url, board, client)]
     assert set(statuses) == {200, 201, 400, 403, 409, 422}
