@@ -64,7 +64,7 @@ class Limits(StrictModel):
       waiting_submissions: submissions of all keys that are not scored yet.
       artefact_bytes: size of an artefact.
       age_days: age of a submission's signature.
-      total_bytes: size of all artefacts, submissions and results.
+      total_bytes: size of all artefacts, submissions, results, journals and answers.
     """
 
     submissions_per_day: Annotated[Integer, Field(ge=1)] = 20

@@ -3,6 +3,8 @@
 The answer to a request has the ticket's password, and a board keeps requests where others may read
 them. So a request is sent with a header `Authorization` as for an upload of the request's id, whose
 signature is at most ten minutes old, and nobody else can repeat it.
+
+A ticket starts only where the board has room for all steps of its budget, so that it can take them.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
 from leaderboard.intake.admission import check_daily_quota, check_name
 from leaderboard.intake.uploads import check_room, uploader
-from leaderboard.store import Store
+from leaderboard.store import Store, played_bytes
 
 
 def refuse_other_sender(
@@ -81,8 +83,9 @@ def start_ticket(
     check_names(request, store.document.key)
     moment = at or datetime.datetime.now(datetime.UTC)
     check_time(request.created, moment, store.document.limits.age_days)
-    with store.transaction():  # no other entrant can take the name in between
+    size = len(signed.to_bytes()) + played_bytes(store.season(season))
+    with store.transaction():  # no other entrant can take the name, or the room, in between
         check_name(store, request.submitter)
         check_daily_quota(store, request.submitter.key, moment)
-        check_room(store, request.submitter.key, len(signed.to_bytes()))
+        check_room(store, request.submitter.key, size)
         return store.start_ticket(signed), True

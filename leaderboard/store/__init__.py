@@ -13,7 +13,7 @@ from leaderboard.store.log import EMPTY, Head, Log, LogEntry
 from leaderboard.store.objects import Objects
 from leaderboard.store.queue import LEASE_SECONDS, Claim, Queue
 from leaderboard.store.rows import EntryRow
-from leaderboard.store.seasons import SealedRow, SeasonRow
+from leaderboard.store.seasons import SealedRow, SeasonRow, played_bytes
 from leaderboard.store.store import Store, unknown_submission
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "collect_garbage",
     "digest_of",
     "make_room",
+    "played_bytes",
     "read_document",
     "unknown_submission",
 ]

@@ -11,16 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from leaderboard.artefact.answers import rows_of
 from leaderboard.documents.board import Folder, SeasonFolder
 from leaderboard.documents.checks import skeleton
 from leaderboard.documents.entry import SignedEntry, SignedSealed, SignedTicketRequest
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import SealedResult
-from leaderboard.documents.season import Reveal, SealedTrack, Season
+from leaderboard.documents.season import MAX_LANES, Reveal, SealedTrack, Season
 from leaderboard.errors import TamperedError
 from leaderboard.store.files import read_document
 from leaderboard.store.log import LogEntry
 from leaderboard.store.rows import EntryRow, name_object, scores_of, scores_text
+from sme_registry.sealed import table_bytes
 
 DERIVED = {"season": "digest", "sealed": "id", "answer": "digest || entry"}
 """Tables and their keys."""
@@ -39,7 +41,8 @@ CREATE TABLE sealed (
   method TEXT NOT NULL, version TEXT NOT NULL, family TEXT NOT NULL, knowledge TEXT NOT NULL,
   submitter TEXT NOT NULL, key TEXT NOT NULL, code_link TEXT,
   runs INTEGER NOT NULL, policies INTEGER NOT NULL, steps INTEGER NOT NULL DEFAULT 0,
-  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, bytes INTEGER NOT NULL
+  oracle_like INTEGER NOT NULL DEFAULT 0, scores TEXT, bytes INTEGER NOT NULL,
+  played_bytes INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE UNIQUE INDEX sealed_number ON sealed (season, number);
 CREATE INDEX sealed_of_key ON sealed (key, received);
@@ -49,6 +52,28 @@ CREATE TABLE answer (
 """
 
 _Signed = TypeVar("_Signed", bound=SignedSealed)
+_RECORD_BYTES, _HEAD_BYTES = 12, 4096  # of a journal; heads with the signature's file
+
+
+def played_bytes(season: Season, result: SealedResult | None = None) -> int:
+    """The most bytes that the journals and answers of a ticket take.
+
+    A journal is longest where a single lane is stepped: then each step has a record of its own.
+
+    Args:
+      season: the ticket's.
+      result: the ticket's, after which nothing more is written; None before.
+    """
+    total = 0
+    rows = rows_of(season.protocol)
+    for number, (member, _) in enumerate(season.hidden):
+        A = member.setting.action_dim
+        steps = (member.budget or 0) if result is None else result.stepping[number].steps
+        answered = result is None or result.runs[number].artefact is not None
+        answers = table_bytes(rows, A) if answered else 0
+        last = 4 * MAX_LANES * A  # the record that ends a journal
+        total += steps * (_RECORD_BYTES + 4 * A) + last + answers + _HEAD_BYTES
+    return total
 
 
 @dataclass(frozen=True)
@@ -208,7 +233,7 @@ class Seasons:
         if len(answers) != season.instances:
             raise entry.contradiction("names more or fewer answers than there are instances")
         given = [answer for answer in answers if answer is not None]
-        self._add(entry, season, signed, path, policies=len(given))
+        self._add(entry, season, signed, path, policies=len(given), played=0)
         for answer in given:
             key = signed.entry.submitter.key
             name_object(self._connection, answer.sha256, answer.size, key, entry.time)
@@ -223,7 +248,8 @@ class Seasons:
             SignedTicketRequest,
             lambda row: self._at(row.digest).request(self.next_number(row.digest)),
         )
-        self._add(entry, season, signed, path, policies=season.instances)
+        played = played_bytes(self.read(season))
+        self._add(entry, season, signed, path, policies=season.instances, played=played)
 
     def _signed(
         self,
@@ -252,7 +278,14 @@ class Seasons:
         raise fault or entry.contradiction("its document is missing from every season")
 
     def _add(
-        self, entry: LogEntry, season: SeasonRow, signed: SignedSealed, path: Path, policies: int
+        self,
+        entry: LogEntry,
+        season: SeasonRow,
+        signed: SignedSealed,
+        path: Path,
+        *,
+        policies: int,
+        played: int,
     ) -> None:
         if self.entrant(entry.subject) is not None:
             raise entry.contradiction("receives an entry or ticket twice")
@@ -275,6 +308,7 @@ class Seasons:
             "runs": season.instances,
             "policies": policies,
             "bytes": path.stat().st_size,
+            "played_bytes": played,
         }
         self._insert("sealed", values)
 
@@ -289,16 +323,18 @@ class Seasons:
         path = self._at(row.season).result(entry.subject)
         result = read_document(self._folder, path, SealedResult, entry.document)
         entry.check_subject(result.subject)
-        if result.season != row.season or len(result.runs) != season.instances:
+        sizes = len(result.runs), len(result.stepping)
+        if result.season != row.season or sizes != (season.instances, season.instances * online):
             raise entry.contradiction("names a result of another season")
         self._connection.execute(
             "UPDATE sealed SET result = ?, finished = ?, policies = ?, steps = ?, oracle_like = ?, "
-            "scores = ?, bytes = bytes + ? WHERE id = ?",
+            "scores = ?, bytes = bytes + ?, played_bytes = ? WHERE id = ?",
             (
                 *(entry.document, entry.time),
                 sum(run.artefact is not None for run in result.runs),
                 sum(each.steps for each in result.stepping),
                 *(result.oracle_like, scores_text(result.scores), path.stat().st_size),
+                played_bytes(self.read(season), result) if online else 0,
                 entry.subject,
             ),
         )

@@ -319,13 +319,16 @@ class Store(SealedStore):
             )
 
     def total_bytes(self) -> int:
-        """Bytes of all artefacts, submissions, results and withdrawals."""
+        """Bytes of all artefacts, submissions, results, withdrawals, journals and answers.
+
+        Tickets count with the most that they can take, until they have ended.
+        """
         with self.reading() as index:
             return index.number(
                 "SELECT (SELECT coalesce(sum(size), 0) FROM "
                 "(SELECT digest, size FROM object UNION SELECT digest, size FROM upload))"
                 " + (SELECT coalesce(sum(bytes), 0) FROM entry)"
-                " + (SELECT coalesce(sum(bytes), 0) FROM sealed)"
+                " + (SELECT coalesce(sum(bytes + played_bytes), 0) FROM sealed)"
             )
 
     def submission_times(self, key: str, since: str, until: str = LAST_TIME) -> list[str]:

@@ -46,10 +46,10 @@ class Board(NamedTuple):
         return client.request_ticket(url, self.season.id, self.request(key, nonce), key)
 
 
-def online_board(folder: Path, **fields: Any) -> Board:
+def online_board(folder: Path, limits: dict[str, int] | None = None, **fields: Any) -> Board:
     """A board with an open season of one class, 64 steps on each of two instances."""
     season = tiny_season("sealed-online", **fields)
     secret = MASTER.write(folder / "season.master")
-    with tiny_board(folder / "board") as store:
+    with tiny_board(folder / "board", limits=limits or {}) as store:
         store.announce(season)
     return Board(folder / "board", season, secret)

@@ -25,11 +25,12 @@ from leaderboard.sealed import tickets as tickets_module
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
-from leaderboard.store import Store
+from leaderboard.store import Store, played_bytes
+from leaderboard.store.files import to_bytes
 from sme_registry.io import sha256_of
 from sme_registry.sealed import Statement, StepFormat, pack_table, unpack_table
 from tests.leaderboard.sealed.playing import Board, online_board
-from tests.leaderboard.sealing import NOTHING
+from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, tiny_season
 
 LANES = 4
 WIRE = StepFormat(LANES, 2, 1)
@@ -372,6 +373,47 @@ def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPat
     assert played.step(1) == first
     assert played.used == LANES
     played.step(2)
+
+
+@pytest.mark.parametrize("lanes", [1, LANES])
+def test_journals_and_answers_count_on_the_board(tmp_path: Path, lanes: int) -> None:
+    fields = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1024}
+    played = Played(online_board(tmp_path, classes=[fields]))
+    wire = StepFormat(lanes, 2, 1)
+    played.start(lanes)
+    for number in range(1, 1024 // lanes):  # the budget, but for its last request
+        body = wire.pack_request(number, np.ones((lanes, 1), np.float32))
+        played.tickets.step(played.number, played.token, 0, body)
+    played.finish()
+    played.answer(np.full((ROWS, 1), 0.5))
+
+    def written() -> int:
+        files = played.board.path.glob("seasons/*/tickets/1/0.*")
+        return sum(path.stat().st_size for path in files)
+
+    def counted() -> int:
+        return played.store.total_bytes() - len(played.request.to_bytes())
+
+    assert 4 * 1000 < written() <= counted() == played_bytes(played.board.season)
+    result = score_ticket(played.store, played.board.season, MASTER, 1)
+    played.store.end_ticket(played.board.season.digest, 1, result)
+    assert written() < counted() < played_bytes(played.board.season) + len(to_bytes(result))
+    assert played_bytes(played.board.season, result) >= written()
+
+
+def test_no_ticket_starts_without_room_for_its_steps(tmp_path: Path) -> None:
+    fields = {"name": "deep", "setting": SETTING, "instances": 2, "budget": 4096}
+    room = played_bytes(tiny_season("sealed-online", classes=[fields])) * 3 // 2
+    played = Played(online_board(tmp_path, limits={"total_bytes": room}, classes=[fields]))
+    second = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
+    refused("quota", start_ticket, played.store, second, played.board.season.digest)
+    assert len(played.store.entrants(played.board.season.digest)) == 1
+    played.start()
+    for number in range(1, 64 // LANES + 1):
+        played.step(number)
+    result = score_ticket(played.store, played.board.season, MASTER, 1)
+    played.store.end_ticket(played.board.season.digest, 1, result)
+    assert start_ticket(played.store, second, played.board.season.digest) == (2, True)
 
 
 def test_answers_that_do_not_fit_the_disk_are_not_stored(
