@@ -5,19 +5,23 @@ from __future__ import annotations
 import hashlib
 import itertools
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import rfc8785
 
 from leaderboard.documents.master import Master, Place, Purpose
-from leaderboard.documents.season import Season, Terms
+from leaderboard.documents.season import Reveal, Season, Terms
 from leaderboard.errors import BoardError
 from sme_registry import SMESpec
 from sme_registry.errors import SpecError
 
 MASTER = Master(bytes(range(32)))
+PURPOSES = get_args(Purpose)
 SETTING = {"state_dim": 3, "action_dim": 2, "complexity": 5}
+TEAM = {"complexity": 5, "team": {"agents": [{"action_dim": 4}]}}
 
 
 def online(**fields: Any) -> dict[str, Any]:
@@ -65,14 +69,25 @@ def test_a_season_round_trips_and_is_committed_to_its_master_and_to_every_term()
         assert not season.is_committed_to(Master(bytes(32)))
         later = Season.from_dict({**season.to_dict(), "closes": "2026-02-02T00:00:00Z"})
         assert not later.is_committed_to(MASTER)
+        last = "1" if season.commitment[-1] == "0" else "0"
+        other = Season.from_dict({**season.to_dict(), "commitment": season.commitment[:-1] + last})
+        assert not other.is_committed_to(MASTER)
 
 
-def test_the_commitment_is_the_documented_hash() -> None:
-    terms = Terms.from_dict(online())
-    message = b"sme-seal/1" + MASTER.raw + terms.canonical_json()
+@pytest.mark.parametrize("track", [online, offline])
+def test_the_commitment_is_the_documented_hash(track: Callable[..., dict[str, Any]]) -> None:
+    terms = Terms.from_dict(track(versions={"numpy": "2.0.0"}))
+    message = b"sme-seal/1" + MASTER.raw + rfc8785.dumps(terms.to_dict())
     expected = "sha256:" + hashlib.sha256(message).hexdigest()
     assert terms.commit(MASTER).commitment == expected
-    assert b"commitment" not in terms.canonical_json()
+    assert set(terms.to_dict()) == set(Terms.model_fields)
+
+
+@pytest.mark.parametrize("master", ["", "0" * 63, "0" * 65, "G" * 64, "A" * 64])
+def test_a_reveal_has_32_bytes(master: str) -> None:
+    season = Terms.from_dict(online()).commit(MASTER)
+    with pytest.raises(SpecError, match="64 hex digits"):
+        Reveal.from_dict({"season": season.digest, "master": master})
 
 
 def test_every_purpose_and_place_has_a_secret_of_its_own() -> None:
@@ -82,9 +97,8 @@ def test_every_purpose_and_place_has_a_secret_of_its_own() -> None:
             ("a", "b"), ("a", "ab"), (0, 1, 10), ("", "1", "b"), ("", "2", "b2")
         )
     ]
-    purposes = get_args(Purpose)
-    drawn = {MASTER.secret(purpose, place) for purpose in purposes for place in places}
-    assert len(drawn) == len(purposes) * len(places)
+    drawn = {MASTER.secret(purpose, place) for purpose in PURPOSES for place in places}
+    assert len(drawn) == len(PURPOSES) * len(places)
     assert MASTER.secret("task", places[0]) != Master(bytes(32)).secret("task", places[0])
 
 
@@ -99,6 +113,12 @@ def test_the_seed_of_hidden_data_cannot_be_tried_out() -> None:
     seeds = [MASTER.seed(Place("autumn", "deep", i), "data") for i in range(64)]
     assert max(int(seed, 16).bit_length() for seed in seeds) > 250
     assert seeds[0] != MASTER.seed(Place("autumn", "deep", 0))
+
+
+def test_the_seed_of_published_states_has_no_bits_of_another_secret() -> None:
+    place = Place("autumn", "deep", 0)
+    first = {each: int.from_bytes(MASTER.secret(each, place)[:8]) >> 11 for each in PURPOSES}
+    assert {each for each in PURPOSES if first[each] == MASTER.states_seed(place)} == {"states"}
 
 
 def test_a_master_is_written_for_its_owner_only_and_never_shown(tmp_path: Path) -> None:
@@ -137,16 +157,27 @@ def test_a_file_without_a_master_is_named(tmp_path: Path, content: str) -> None:
             ),
             "safety: must be null",
         ),
+        (
+            online(classes=[{**online()["classes"][0], "setting": TEAM}]),
+            "team: must be null",
+        ),
         (online(classes=online()["classes"] * 2), "different names"),
         (online(classes=[{**online()["classes"][0], "instances": 1001}]), "1000"),
         (online(classes=[{**online()["classes"][0], "budget": None}]), r"budget: must be given"),
         (offline(classes=online()["classes"]), r"deep\.budget: must be null"),
+        (
+            online(classes=[{**online()["classes"][0], "data": {"nu": 0.5, "transitions": 9}}]),
+            r"deep\.data: must be null",
+        ),
         (online(ticket_hours=None), "ticket_hours: must be given"),
+        (online(tickets=None), "tickets: must be given"),
+        (offline() | {"tickets": 3}, "tickets: must be null"),
         (offline() | {"tickets_per_key": 3}, "tickets_per_key: must be null"),
         (offline() | {"published": []}, "published: must list every instance"),
+        (offline() | {"published": offline()["published"][::-1]}, "published: must list every"),
         (online(published=offline()["published"]), "published: must list every instance"),
         (online(closes="2026-01-01T00:00:00Z"), "must be after opens"),
-        (online(opens="2026-02-30T00:00:00Z"), "opens"),
+        (online(opens="2025-02-30T00:00:00Z"), "2025-02-30T00:00:00Z: is no date"),
         (online(protocol={"seed": 1}), "seed=1: must be 0"),
     ],
 )
