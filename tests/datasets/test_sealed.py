@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,27 @@ def test_a_strangers_file_is_read_only_as_it_would_be_written(
         return
     with pytest.raises(MalformedDocumentError, match=message):
         SealedDataset.read(tmp_path)
+
+
+def test_an_episode_that_is_a_link_is_not_followed(dataset: SealedDataset, tmp_path: Path) -> None:
+    private = dataset.write(ID, tmp_path / "private") / "data" / "main_data.hdf5"
+    (tmp_path / "data").mkdir()
+    with h5py.File(tmp_path / "data" / "main_data.hdf5", "w") as file:
+        file["episode_0"] = h5py.ExternalLink(str(private), "episode_0")
+    with pytest.raises(MalformedDocumentError, match="episode_0: is a link"):
+        SealedDataset.read(tmp_path)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    path = tmp_path / "data" / "main_data.hdf5"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)  # so that a reader would fail, and not wait for ever
+    try:
+        with pytest.raises(MalformedDocumentError, match="no such file"):
+            SealedDataset.read(tmp_path)
+    finally:
+        os.close(writer)
 
 
 def test_episodes_that_share_their_bytes_do_not_multiply(tmp_path: Path) -> None:

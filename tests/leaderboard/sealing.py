@@ -16,8 +16,11 @@ from leaderboard.documents.entry import (
 )
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
+from leaderboard.documents.result import SealedResult, Stepping
 from leaderboard.documents.season import Season, Terms
 from leaderboard.documents.submission import now, shifted, utc
+from leaderboard.scoring.metrics import failed_run
+from leaderboard.scoring.sealed import sealed_result
 from leaderboard.store import Store
 from sme_registry import EvaluationProtocol
 
@@ -90,6 +93,18 @@ def manifest(season: Season, key: SigningKey, **fields: Any) -> dict[str, Any]:
         "created": now(),
         **fields,
     }
+
+
+def failed_result(season: Season, subject: str) -> SealedResult:
+    """The result of an entry or a ticket of which every run failed, without a step."""
+    hidden = list(season.hidden)
+    runs = [failed_run(season.protocol, each.member.name, None) for each in hidden]
+    steps = [
+        Stepping(steps=0, normalised_online_regret=1.0, learning_curve=(1.0,))
+        for _ in hidden
+        if season.track == "sealed-online"
+    ]
+    return sealed_result(season, subject, runs, {"synthetic": "1"}, 100, steps)
 
 
 def signed_entry(

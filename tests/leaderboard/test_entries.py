@@ -15,13 +15,14 @@ from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.season import MAX_OFFLINE_INSTANCES
 from leaderboard.documents.submission import MAX_ARTEFACT_BYTES, Envelope
 from leaderboard.errors import BoardError, Rejection
+from leaderboard.intake import entries
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from sme_registry.errors import SpecError
 from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealing import manifest, moment, signed_entry, tiny_season
+from tests.leaderboard.sealing import NOTHING, manifest, moment, signed_entry, tiny_season
 from tests.leaderboard.serving import authorization, serving
 from tests.leaderboard.store.crashing import fill, small_disk
 
@@ -100,6 +101,46 @@ def test_answers_may_be_uploaded_before(store, key):
 def test_bad_answers_are_refused(store, key, answer, code):
     signed = entry(store, key, GOOD, answer or b"0")
     assert refused(store, signed, GOOD, answer or b"0") == code
+
+
+def test_the_same_answers_must_fit_each_class(store, key):
+    setting = {"state_dim": 2, "complexity": 5, "hidden_width": 8}
+    sizes = {"narrow": 1, "wide": 2}
+    data = {"nu": 0.5, "transitions": 300}
+    season = tiny_season(
+        id="mixed",
+        classes=[
+            {"name": name, "setting": {**setting, "action_dim": A}, "instances": 1, "data": data}
+            for name, A in sizes.items()
+        ],
+        published=[
+            {"class_name": name, "instance": 0, "data": NOTHING, "challenge": NOTHING}
+            for name in sizes
+        ],
+    )
+    store.announce(season)
+    answer = {"sha256": sha256_of(GOOD), "size": len(GOOD)}
+    assert refused(store, signed_entry(store, season, key, [answer] * 2), GOOD) == "answer_shape"
+    assert send(store, signed_entry(store, season, key, [answer, None]), GOOD)
+
+
+def test_what_changes_between_the_check_and_the_record_is_checked_again(store, key, monkeypatch):
+    signed, path = entry(store, key, GOOD, None), store.folder.object(sha256_of(GOOD))
+    room = "leaderboard.intake.entries.check_room"
+    with monkeypatch.context() as patch:  # as `gc` of another process
+        patch.setattr(room, lambda *_: path.unlink())
+        assert refused(store, signed, GOOD) == "artefact_missing"
+
+    def taken(*arguments: Any) -> Any:
+        other = SigningKey.generate()
+        name = {"name": f"Tester {key.public[:8]}", "key": other.public}
+        store.enter(signed_entry(store, SEASON, other, [None, None], submitter=name))
+        return check_answers(*arguments)
+
+    check_answers = entries._check_answers
+    monkeypatch.setattr("leaderboard.intake.entries._check_answers", taken)
+    with pytest.raises(Rejection, match="name_taken"):
+        send(store, signed, GOOD)
 
 
 def test_bad_entries_are_refused_with_stable_codes(store, key):

@@ -37,7 +37,16 @@ from sme_registry.errors import SMEError
 from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
-from tests.leaderboard.sealing import MASTER, moment, signed_entry, tiny_terms
+from tests.leaderboard.sealing import (
+    MASTER,
+    NOTHING,
+    failed_result,
+    moment,
+    signed_entry,
+    signed_request,
+    tiny_season,
+    tiny_terms,
+)
 
 
 def plan(**fields: Any) -> dict[str, Any]:
@@ -330,3 +339,56 @@ def test_a_rank_needs_the_runs_of_the_board(tmp_path: Path, key, published, late
         score_entries(store, season.id)
         [row] = season_rankings(store, season, "wd_regret")["generic"]
     assert (row.ranks, row.reason) == ("", "too_few_runs")
+
+
+@pytest.mark.parametrize(("needed", "reason"), [(1, ""), (2, "too_few_runs")])
+def test_the_class_with_the_fewest_runs_decides_on_a_rank(
+    tmp_path: Path, key, later, needed: int, reason: str
+) -> None:
+    sizes = {"one": 1, "three": 3}
+    member = tiny_terms().to_dict()["classes"][0]
+    season = tiny_season(
+        classes=[{**member, "name": name, "instances": size} for name, size in sizes.items()],
+        published=[
+            {"class_name": name, "instance": number, "data": NOTHING, "challenge": NOTHING}
+            for name, size in sizes.items()
+            for number in range(size)
+        ],
+    )
+    with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
+        store.announce(season)
+        enter(store, season, key, [None] * 4)
+        later()
+        store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+        score_entries(store, season.id)
+        [row] = season_rankings(store, season, "wd_regret")["generic"]
+    assert row.reason == reason
+
+
+@pytest.mark.parametrize(("needed", "reason"), [(4, ""), (5, "too_few_runs")])
+def test_runs_of_all_tickets_count_towards_a_rank(
+    tmp_path: Path, key, needed: int, reason: str
+) -> None:
+    season = tiny_season("sealed-online")
+    with tiny_board(tmp_path / "board", runs_to_rank=needed) as store:
+        store.announce(season)
+        for nonce in (1, 2):
+            request = signed_request(store, season, key, nonce)
+            number = store.start_ticket(request)
+            store.end_ticket(season.digest, number, failed_result(season, request.id))
+        [row] = season_rankings(store, season, "wd_regret")["generic"]
+    assert (row.reason, row.entry.runs) == (reason, 4)
+
+
+def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
+    """As an organiser's own board may log it."""
+    season = tiny_season()
+    store.announce(season)
+    first = enter(store, season, key, [None, None])
+    later()
+    late = signed_entry(store, season, key, [None, None], statement="late")
+    path = store.season_folder(season.digest).entry(late.id)
+    with store.transaction():
+        store.record("entry", late.id, late, path)
+    assert [row.entrant.id for row in store.entrants(season.digest)] == [first, late.id]
+    assert [row.entrant.id for row in counting(store, season)] == [first]

@@ -132,6 +132,37 @@ def test_a_write_that_could_not_be_undone_is_undone_before_the_next(
     assert contents(Journal.open(path)) == [actions(2)]
 
 
+def test_what_was_added_is_flushed_to_the_disk_once_and_again_if_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders: list[Path] = []
+    flushed: list[int] = []  # sizes of the file
+    failing = False
+
+    def flush(handle: int) -> None:
+        if failing:
+            raise OSError(errno.EIO, "Input/output error")
+        flushed.append(os.fstat(handle).st_size)
+
+    monkeypatch.setattr("leaderboard.sealed.journal.io.sync_folder", folders.append)
+    monkeypatch.setattr(os, "fdatasync", flush)
+    journal = Journal.create(tmp_path / "0", LANES, A)
+    assert folders == [tmp_path]
+    journal.sync()
+    assert flushed == []
+    journal.append(actions(1))
+    journal.append(actions(2))
+    failing = True
+    with pytest.raises(OSError, match="Input"):
+        journal.sync()
+    failing = False
+    journal.sync()
+    journal.sync()
+    assert flushed == [HEADER + 2 * RECORD]
+    journal.end()
+    assert flushed == [HEADER + 2 * RECORD, HEADER + 3 * RECORD]
+
+
 def test_another_file_is_no_journal(tmp_path: Path) -> None:
     path = tmp_path / "0"
     for content in (b"", b"x" * 20, b"x" * 100):

@@ -11,9 +11,11 @@ import httpx
 import numpy as np
 import pytest
 
-from leaderboard.documents.entry import TicketRequest
+from leaderboard.documents.entry import SignedTicketRequest, TicketRequest
 from leaderboard.documents.keys import SigningKey
-from leaderboard.intake import upload_header
+from leaderboard.documents.submission import Envelope
+from leaderboard.errors import Rejection
+from leaderboard.intake import start_ticket, upload_header
 from leaderboard.sealed import Tickets
 from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
@@ -207,6 +209,18 @@ def test_requests_for_tickets_are_checked(
     assert names == [board.season.id]
     with Store.open(board.path) as store:
         assert store.entrants(board.season.digest) == []
+
+
+def test_a_request_of_one_season_opens_no_ticket_of_another(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    other = tiny_season("sealed-online", id="other")
+    with Store.open(board.path) as store:
+        store.announce(other)
+        envelope = Envelope.read(board.request(KEY).to_bytes(), SignedTicketRequest)
+        assert start_ticket(store, envelope, board.season.digest) == (1, True)
+        with pytest.raises(Rejection, match="season_unknown"):
+            start_ticket(store, envelope, other.digest)
+        assert start_ticket(store, envelope, board.season.digest) == (1, False)
 
 
 def test_a_name_belongs_to_one_key(tmp_path: Path) -> None:

@@ -10,11 +10,8 @@ import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
-from leaderboard.documents.result import SealedResult, Stepping
 from leaderboard.documents.season import Reveal, Season
 from leaderboard.errors import BoardError, Rejection, TamperedError
-from leaderboard.scoring.metrics import failed_run
-from leaderboard.scoring.sealed import sealed_result
 from leaderboard.scoring.verify import verify
 from leaderboard.store import Store
 from leaderboard.store.files import write_document
@@ -22,6 +19,7 @@ from tests.leaderboard.conftest import put_submission, tiny_board
 from tests.leaderboard.sealing import (
     AFTERWARDS,
     MASTER,
+    failed_result,
     moment,
     move_clock,
     signed_entry,
@@ -32,19 +30,6 @@ from tests.leaderboard.store.crashing import crashes_before
 
 ONLINE, OFFLINE = "sealed-online", "sealed-offline"
 ANSWER = {"sha256": "sha256:" + "a" * 64, "size": 512}
-
-
-def failed(season: Season, subject: str) -> SealedResult:
-    """A result of which every run failed."""
-    hidden = list(season.hidden)
-    runs = [failed_run(season.protocol, each.member.name, None) for each in hidden]
-    online = season.track == ONLINE
-    steps = [
-        Stepping(steps=0, normalised_online_regret=1.0, learning_curve=(1.0,))
-        for _ in hidden
-        if online
-    ]
-    return sealed_result(season, subject, runs, {"synthetic": "1"}, 100, steps)
 
 
 def reveal(season: Season, master: Master = MASTER) -> Reveal:
@@ -61,11 +46,11 @@ def play(store: Store, key: SigningKey, move: Any) -> tuple[Season, Season]:
     assert store.announce(online)
     assert store.enter(entry)
     assert store.start_ticket(request) == 1
-    assert store.end_ticket(online.digest, 1, failed(online, request.id))
+    assert store.end_ticket(online.digest, 1, failed_result(online, request.id))
     move()
     for season in (offline, online):
         assert store.reveal(reveal(season))
-    assert store.rank(failed(offline, entry.id))
+    assert store.rank(failed_result(offline, entry.id))
     return offline, online
 
 
@@ -89,7 +74,7 @@ def test_a_season_is_played_from_its_announcement_to_its_results(store, key, lat
         assert row.entrant.status == "scored"
         assert row.entrant.scores is not None
         assert row.entrant.scores.wd_regret.value == 1.0
-        assert store.sealed_result(row) == failed(season, row.entrant.id)
+        assert store.sealed_result(row) == failed_result(season, row.entrant.id)
         assert store.revealed_master(season.id) == MASTER
     assert store.entry_of(store.entrants(offline.digest)[0]).is_valid
     assert store.request_of(store.ticket(online.digest, 1)).is_valid
@@ -127,7 +112,7 @@ def test_the_same_request_is_the_same_ticket_and_another_the_next(store, key):
         store.start_ticket(signed_request(store, season, key, 3))
     other = SigningKey.generate()
     assert store.start_ticket(signed_request(store, season, other, 3)) == 3
-    result = failed(season, first.id)
+    result = failed_result(season, first.id)
     assert store.end_ticket(season.digest, 1, result)
     assert not store.end_ticket(season.digest, 1, result)
     with pytest.raises(ValueError, match="does not match"):
@@ -177,7 +162,7 @@ def test_a_reveal_follows_the_close_and_the_tickets_and_matches(store, key, late
     later()
     with pytest.raises(Rejection, match="1 tickets run, the first of them number 1"):
         store.reveal(reveal(season))
-    store.end_ticket(season.digest, 1, failed(season, request.id))
+    store.end_ticket(season.digest, 1, failed_result(season, request.id))
     assert store.reveal(reveal(season))
     assert not store.reveal(reveal(season))
     with pytest.raises(Rejection, match="season_revealed"):
@@ -211,7 +196,7 @@ def test_offline_nothing_is_ranked_before_the_reveal(store, key):
     store.enter(entry)
     before = store.head
     with pytest.raises(Rejection, match="season_not_closed"):
-        store.rank(failed(season, entry.id))
+        store.rank(failed_result(season, entry.id))
     assert store.head == before
 
 
@@ -231,7 +216,7 @@ def test_files_of_seasons_that_no_entry_names_are_counted_or_named(store, key):
     journal = folder.ticket(1) / "0.journal"
     journal.write_bytes(b"actions")
     write_document(folder.request(2), request)
-    write_document(folder.result(request.id), failed(season, request.id))
+    write_document(folder.result(request.id), failed_result(season, request.id))
     write_document(folder.reveal, reveal(season))
     assert verify(store.folder.path).unlogged == 3
     stray = folder.path / "note.txt"
@@ -303,7 +288,7 @@ def test_an_entry_and_a_reveal_of_processes_that_die_are_logged_or_not(tmp_path:
     later()
     with after_every_death(lambda store: store.reveal(reveal(season))) as store:
         assert store.revealed_master(season.id) == MASTER
-    with after_every_death(lambda store: store.rank(failed(season, entry.id))) as store:
+    with after_every_death(lambda store: store.rank(failed_result(season, entry.id))) as store:
         assert [row.entrant.status for row in store.entrants(season.digest)] == ["scored"]
     assert verify(tmp_path / "board").unlogged == 0
 
