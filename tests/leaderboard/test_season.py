@@ -15,7 +15,7 @@ import pytest
 from leaderboard import intake
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.master import Master
-from leaderboard.documents.season import Reveal, Season
+from leaderboard.documents.season import Reveal, Season, Terms
 from leaderboard.errors import BoardError, Rejection, TamperedError
 from leaderboard.scoring.publication import (
     challenge_path,
@@ -24,10 +24,11 @@ from leaderboard.scoring.publication import (
     dataset_path,
     read_plan,
     read_season,
+    recipe,
     refuse_large_answers,
     refuse_unrankable,
 )
-from leaderboard.scoring.sealed import instances
+from leaderboard.scoring.sealed import instances, sealed_result
 from leaderboard.scoring.season import by_key, counting, score_entries, season_rankings
 from leaderboard.sealed import verify_season
 from leaderboard.store import Store
@@ -392,3 +393,73 @@ def test_an_entry_after_the_close_counts_nowhere(store, key, later) -> None:
         store.record("entry", late.id, late, path)
     assert [row.entrant.id for row in store.entrants(season.digest)] == [first, late.id]
     assert [row.entrant.id for row in counting(store, season)] == [first]
+
+
+@pytest.mark.parametrize("fault", ["signature", "board"])
+def test_a_replay_finds_entries_that_their_key_has_not_signed(
+    store, key, published, later, fault: str
+) -> None:
+    season = read_season(published)
+    store.announce(season)
+    signed = signed_entry(store, season, key, [None, None])
+    if fault == "board":
+        signed = signed.entry.signed(key, "ab" * 32)
+    else:
+        signed = signed.model_copy(update={"signature": "0" * 128})
+    store.enter(signed)
+    later()
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    score_entries(store, season.id)
+    with pytest.raises(TamperedError, match="its signature does not match the entrant's key"):
+        verify_season(store, season.id)
+
+
+def test_a_replay_finds_the_result_of_an_entry_that_does_not_count(
+    store, key, published, later
+) -> None:
+    season = read_season(published)
+    store.announce(season)
+    first, last = (
+        enter(store, season, key, [None, None], statement=note) for note in ("first", "last")
+    )
+    later()
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    assert score_entries(store, season.id) == 1
+    assert verify_season(store, season.id).results == 1
+    store.rank(failed_result(season, first))
+    with pytest.raises(TamperedError, match=rf"{first[7:]}\.json: is of an entry that does not"):
+        verify_season(store, season.id)
+    assert first != last
+
+
+def test_a_replay_finds_challenge_states_that_do_not_follow(store, published, later) -> None:
+    fields = read_season(published).terms.to_dict()
+    fields["published"][1]["challenge"] = fields["published"][0]["challenge"]
+    false = Terms.from_dict(fields).commit(MASTER)
+    later()
+    monkey_open(store, false)
+    with pytest.raises(TamperedError, match="published: deep 1"):
+        verify_season(store, false.id, published=published)
+
+
+def test_a_data_set_is_not_drawn_with_the_seed_of_its_task() -> None:
+    for instance in instances(tiny_terms(), MASTER):
+        seeds = (instance.spec.seed, instance.protocol.seed, recipe(instance, MASTER).seed)
+        assert len(set(seeds)) == 3
+
+
+def test_tickets_of_each_method_have_scores_of_their_own(store, key) -> None:
+    season = tiny_season("sealed-online")
+    store.announce(season)
+    other = SigningKey.generate()
+    for number in range(4):
+        name, who = ("Good", key) if number < 2 else ("Bad", other)
+        request = signed_request(store, season, who, number, method=method(name))
+        store.start_ticket(request)
+        result = failed_result(season, request.id)
+        if name == "Good":
+            runs = [run.model_copy(update={"wd_regret": 0.5}) for run in result.runs]
+            result = sealed_result(season, request.id, runs, {}, 100, result.stepping)
+        store.end_ticket(season.digest, number + 1, result)
+    rows = season_rankings(store, season, "wd_regret")["generic"]
+    assert [(row.entry.method, row.value.value) for row in rows] == [("Good", 0.5), ("Bad", 1.0)]

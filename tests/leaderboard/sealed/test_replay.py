@@ -12,6 +12,7 @@ import pytest
 
 from leaderboard.documents.board import SeasonFolder
 from leaderboard.documents.keys import SigningKey
+from leaderboard.documents.result import SealedResult
 from leaderboard.documents.season import Reveal
 from leaderboard.errors import TamperedError
 from leaderboard.scoring.season import season_rankings
@@ -118,8 +119,7 @@ def test_what_an_organiser_replaces_before_the_result_is_found(
             instance.begin()
             instance.step(np.full((4, 1), 0.5))
             instance.send_answers(np.full((len(instance.challenge()), 1), 0.5))
-    for module in ("sealed", "log"):
-        monkeypatch.setattr(f"leaderboard.store.{module}.now", lambda: AFTERWARDS)
+    move_clock(monkeypatch)
     with Store.open(board.path) as store:
         replace(store.season_folder(board.season.digest).ticket(1))
         result = score_ticket(store, board.season, MASTER, 1)
@@ -129,20 +129,61 @@ def test_what_an_organiser_replaces_before_the_result_is_found(
             verify_season(store, board.season.id)
 
 
-def test_a_learning_curve_that_no_journal_has_is_found(
-    revealed: Board, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def flattered(*arguments: Any) -> Any:
-        result = score_ticket(*arguments)
-        first = result.stepping[0].model_copy(update={"normalised_online_regret": 0.0})
+def _lie(result: SealedResult, part: str) -> SealedResult:
+    """A result that differs from this one in one part."""
+    run, steps, value = result.runs[0], result.stepping[0], result.scores.wd_regret
+    runs: dict[str, Any] = {
+        "regret": {"normalised_regret": (0.5, *run.normalised_regret[1:])},
+        "metric": {"similarity_loss": 0.0},
+        "answers": {"artefact": "sha256:" + "a" * 64},
+    }
+    stepping: dict[str, Any] = {
+        "online regret": {"normalised_online_regret": 0.0},
+        "curve": {"learning_curve": (*steps.learning_curve[:-1], 0.0)},
+        "steps": {"steps": 1},
+        "signature": {"signed": "sha256:" + "a" * 64},
+    }
+    if part in runs:
+        return result.model_copy(
+            update={"runs": (run.model_copy(update=runs[part]), *result.runs[1:])}
+        )
+    if part in stepping:
+        first = steps.model_copy(update=stepping[part])
         return result.model_copy(update={"stepping": (first, *result.stepping[1:])})
+    if part == "scores":
+        lower = value.model_copy(update={"value": 0.5})
+        return result.model_copy(
+            update={"scores": result.scores.model_copy(update={"wd_regret": lower})}
+        )
+    return result.model_copy(update={part: getattr(result, part)[1:]})
 
-    monkeypatch.setattr("leaderboard.sealed.replay.score_ticket", flattered)
-    with (
-        Store.open(revealed.path, read_only=True) as store,
-        pytest.raises(TamperedError, match=r"stepping\.0: replayed from its journal"),
-    ):
-        verify_season(store, revealed.season.id)
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("regret", r"runs\.0: scored again"),
+        ("metric", r"runs\.0: scored again"),
+        ("answers", r"runs\.0: scored again"),
+        ("online regret", r"stepping\.0: replayed from its journal"),
+        ("curve", r"stepping\.0: replayed from its journal"),
+        ("steps", r"stepping\.0: replayed from its journal"),
+        ("signature", r"stepping\.0: names another signature"),
+        ("stepping", "more or fewer runs"),
+        ("scores", "its scores do not follow from its runs"),
+    ],
+)
+def test_a_result_that_does_not_follow_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: SigningKey, part: str, message: str
+) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        store.start_ticket(signed_request(store, board.season, key))
+        move_clock(monkeypatch)
+        true = score_ticket(store, board.season, MASTER, 1)
+        store.end_ticket(board.season.digest, 1, _lie(true, part))
+        store.reveal(Reveal(season=board.season.digest, master=MASTER.raw.hex()))
+        with pytest.raises(TamperedError, match=message):
+            verify_season(store, board.season.id)
 
 
 def logged(monkeypatch: pytest.MonkeyPatch, time: str, store: Store, *record: Any) -> None:

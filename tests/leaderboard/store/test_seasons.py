@@ -219,6 +219,13 @@ def test_files_of_seasons_that_no_entry_names_are_counted_or_named(store, key):
     write_document(folder.result(request.id), failed_result(season, request.id))
     write_document(folder.reveal, reveal(season))
     assert verify(store.folder.path).unlogged == 3
+    offline = tiny_season(OFFLINE)
+    store.announce(offline)
+    entry = signed_entry(store, offline, key, [None, None])
+    store.enter(entry)
+    assert verify(store.folder.path).unlogged == 3
+    write_document(folder.entry(entry.id), entry)  # in another season's folder
+    assert verify(store.folder.path).unlogged == 4
     stray = folder.path / "note.txt"
     stray.write_text("")
     with pytest.raises(TamperedError, match=r"note\.txt: is not a file of a board"):
@@ -231,6 +238,14 @@ def test_a_request_that_the_board_has_forged_is_named(store, key):
     signed = signed_request(store, season, key)
     forged = signed.model_copy(update={"signature": "0" * 128})
     store.start_ticket(forged)
+    with pytest.raises(TamperedError, match="does not match the entrant's key"):
+        verify(store.folder.path)
+
+
+def test_a_request_that_was_signed_for_another_board_is_named(store, key):
+    season = tiny_season(ONLINE)
+    store.announce(season)
+    store.start_ticket(signed_request(store, season, key).ticket.signed(key, "ab" * 32))
     with pytest.raises(TamperedError, match="does not match the entrant's key"):
         verify(store.folder.path)
 
