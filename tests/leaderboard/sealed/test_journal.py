@@ -64,6 +64,14 @@ def test_a_record_that_never_reached_the_disk_ends_the_journal(tmp_path: Path) -
     assert path.stat().st_size == HEADER + 2 * RECORD
 
 
+def test_a_record_out_of_order_ends_the_journal(tmp_path: Path) -> None:
+    path = tmp_path / "0"
+    written(path, 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: HEADER + RECORD] + whole[HEADER + 2 * RECORD :])
+    assert contents(Journal.open(path)) == [actions(1)]
+
+
 def test_an_ended_journal_stays_ended_and_accepts_nothing(tmp_path: Path) -> None:
     path = tmp_path / "0"
     written(path, 2)

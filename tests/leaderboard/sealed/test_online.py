@@ -21,8 +21,9 @@ from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.store import Store
 from sme_registry import sealed
+from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealed.playing import online_board
-from tests.leaderboard.sealing import MASTER, manifest, moment, tiny_season
+from tests.leaderboard.sealing import MASTER, manifest, moment, signed_request, tiny_season
 from tests.leaderboard.serving import serving
 
 KEY = SigningKey.generate()
@@ -117,6 +118,16 @@ def test_tickets_count_towards_the_quota_of_a_day(tmp_path: Path) -> None:
     with serving(board.path, season_secrets=[board.secret]) as url:
         answer = board.send(url, board.request(KEY, limit), KEY)
     assert (answer.status_code, answer.json()["code"]) == (429, "quota")
+
+
+def test_a_full_board_starts_no_ticket(tmp_path: Path) -> None:
+    season = tiny_season("sealed-online")
+    with tiny_board(tmp_path / "board", limits={"total_bytes": 100}) as store:
+        store.announce(season)
+        envelope = Envelope.read(signed_request(store, season, KEY).to_bytes(), SignedTicketRequest)
+        with pytest.raises(Rejection, match="quota"):
+            start_ticket(store, envelope, season.digest)
+        assert store.entrants(season.digest) == []
 
 
 def test_a_request_that_others_read_is_no_password(tmp_path: Path) -> None:
@@ -273,6 +284,7 @@ def test_large_bodies_and_numbers_are_refused(tmp_path: Path) -> None:
         client.post(at + "start?lanes=4", headers=token)
         answers = [
             client.post(at + "steps", content=bytes(2000), headers=token),
+            client.put(at + "answers", content=bytes(2**16), headers=token),
             client.post(at + "start?lanes=" + "9" * 30, headers=token),
             client.post(at.replace("/0/", f"/{10**30}/") + "steps", headers=token),
             client.post(at.replace("/1/", f"/{10**30}/") + "finish", headers=token),
@@ -281,6 +293,7 @@ def test_large_bodies_and_numbers_are_refused(tmp_path: Path) -> None:
         ]
     codes = [(each.status_code, each.json()["code"]) for each in answers]
     assert codes == [
+        (413, "too_large"),
         (413, "too_large"),
         (400, "bad_request"),
         (404, "instance_unknown"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import errno
 import os
 import pickle
@@ -22,15 +23,19 @@ from leaderboard.intake import start_ticket
 from leaderboard.scoring.sealed import instances
 from leaderboard.sealed import Tickets
 from leaderboard.sealed import tickets as tickets_module
+from leaderboard.sealed.attendant import Attendant
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
+from leaderboard.sealed.ticket import RunningTicket
+from leaderboard.sealed.tickets import Clock
 from leaderboard.store import Store, played_bytes
 from leaderboard.store.files import to_bytes
 from sme_registry.io import sha256_of
 from sme_registry.sealed import Statement, StepFormat, pack_table, unpack_table
+from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.sealed.playing import Board, online_board
-from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, tiny_season
+from tests.leaderboard.sealing import MASTER, NOTHING, SETTING, moment, tiny_season
 
 LANES = 4
 WIRE = StepFormat(LANES, 2, 1)
@@ -284,8 +289,14 @@ def test_a_token_opens_one_ticket(played: Played) -> None:
     request = Envelope.read(played.board.request(KEY, 1).to_bytes(), SignedTicketRequest)
     other, _ = start_ticket(played.store, request, played.board.season.digest)
     for number, token in ((other, played.token), (played.number, ""), (played.number, "é")):
-        refused("token_wrong", played.tickets.start, number, token, 0, 1)
-        refused("token_wrong", played.tickets.status, number, token)
+        tickets = played.tickets
+        refused("token_wrong", tickets.start, number, token, 0, 1)
+        refused("token_wrong", tickets.status, number, token)
+        refused("token_wrong", tickets.answer_bytes, number, token, 0)
+        refused("token_wrong", tickets.journal_digest, number, token, 0)
+        refused(
+            "token_wrong", tickets.answer, number, token, 0, pack_table(np.zeros((ROWS, 1))), ""
+        )
     refused("ticket_unknown", played.tickets.start, 99, played.token, 0, 1)
     refused("instance_unknown", played.tickets.start, played.number, played.token, 2, 1)
 
@@ -310,6 +321,7 @@ def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPa
     refused("ticket_ended", played.step, 2)
     refused("ticket_ended", played.start)
     refused("ticket_ended", played.finish)
+    refused("ticket_ended", played.answer, np.full((ROWS, 1), 0.5))
     assert played.tickets.status(played.number, played.token).phase == "ended"
 
 
@@ -351,12 +363,69 @@ def test_a_clock_set_back_extends_no_deadline(
     refused("ticket_ended", played.step, 1)
 
 
+def test_the_clock_of_a_server_begins_no_earlier_than_the_log() -> None:
+    start = moment(2)
+    clock, expected = Clock(start), datetime.datetime.fromisoformat(start).timestamp()
+    assert clock.now >= expected
+    assert clock.sure >= expected
+
+
 def test_a_closed_ticket_takes_nothing_from_requests_in_progress(played: Played) -> None:
-    instance = played.tickets.ticket(played.number).instance(0)
+    played.start(instance=1)
+    instance, other = played.tickets.ticket(played.number).instances
     played.finish()
     played.tickets.close_ticket(played.number)
     refused("ticket_ended", instance.answer, pack_table(np.full((ROWS, 1), 0.5)), "")
     assert not instance.answered
+    refused("ticket_ended", other.start, LANES)
+    refused("ticket_ended", other.step, WIRE.pack_request(1, np.zeros((LANES, 1))))
+    refused("ticket_ended", other.finish)
+
+
+def test_steps_that_arrive_while_an_unplayed_ticket_is_closed_are_scored(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(ticket: RunningTicket) -> None:
+        ticket.instance(0).start(LANES)
+        ticket.instance(0).step(WIRE.pack_request(1, np.zeros((LANES, 1))))
+        close(ticket)
+
+    close = RunningTicket.close
+    monkeypatch.setattr(RunningTicket, "close", late)
+    assert played.tickets.end_unplayed([played.number], 100) == []
+    assert played.store.ticket(played.board.season.digest, played.number).result is None
+
+
+def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.start()
+    played.step(1)
+    flushed: list[int] = []
+    monkeypatch.setattr(os, "fdatasync", flushed.append)
+    attendant = Attendant(played.tickets)
+    attendant.attend()
+    assert len(flushed) == 1
+    clock = tickets_module.time.time
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
+    played.restart()
+    monkeypatch.setattr(Attendant, "_start", lambda _: None)
+    Attendant(played.tickets).attend()
+    instance = played.tickets.ticket(played.number).instance(0)
+    refused("ticket_ended", instance.step, WIRE.pack_request(2, np.zeros((LANES, 1))))
+
+
+def test_a_disk_that_fails_for_a_moment_ends_no_server(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.start()
+    played.step(1)
+
+    def fails(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fdatasync", fails)
+    played.tickets.sync()
 
 
 def test_a_full_disk_costs_no_step(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,6 +576,10 @@ def test_a_master_must_be_that_of_a_season(played: Played, tmp_path: Path) -> No
     other = Master.generate().write(tmp_path / "other.master")
     with pytest.raises(BoardError, match="the master of no sealed-online season"):
         Tickets(played.store, other)
+    with tiny_board(tmp_path / "offline") as store:
+        store.announce(tiny_season("sealed-offline"))
+        with pytest.raises(BoardError, match="the master of no sealed-online season"):
+            Tickets(store, played.board.secret)
 
 
 def test_what_was_not_answered_scores_one(played: Played) -> None:
