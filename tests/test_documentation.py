@@ -123,17 +123,18 @@ def test_the_readme_names_every_environment_and_suite() -> None:
     assert all(f"`{suite}`" in readme for suite in names(SuiteFile))
 
 
-def test_the_table_of_fields_has_every_field_and_its_default() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| .* \|$", specs_page(), re.M)
-    documented = {name: default.strip("`") for name, default in rows}
+def test_the_table_of_fields_has_every_field_its_default_and_its_meaning() -> None:
+    table = re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| (.*?) \|$", specs_page(), re.M)
     fields = {
-        name: str(field.default)
+        name: field
         for name, field in SMESpec.model_fields.items()
         if name not in ("schema_version", "team", "safety", "observation")
     }
-    assert {name: number(text) for name, text in documented.items()} == {
-        name: number(text) for name, text in fields.items()
+    assert {name: number(default.strip("`")) for name, default, _ in table} == {
+        name: number(str(field.default)) for name, field in fields.items()
     }
+    for name, _, meaning in table:
+        assert f"{meaning.partition(';')[0]}." == fields[name].description
 
 
 def test_the_table_of_safety_and_observation_has_every_field() -> None:

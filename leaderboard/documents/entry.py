@@ -23,7 +23,7 @@ from leaderboard.documents.submission import (
     SignedManifest,
 )
 from sme_registry.sealed import Signer, Statement
-from sme_registry.spec import Digest
+from sme_registry.spec import Digest, matching
 
 
 class SealedManifest(Manifest):
@@ -74,9 +74,7 @@ class TicketRequest(SealedManifest):
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("answers_key",)
 
-    nonce: Annotated[
-        str, Field(pattern=r"^[0-9a-f]{64}$", description="64 hex digits, drawn at random")
-    ]
+    nonce: Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits, drawn at random")]
     answers_key: PublicKey | None = None
 
     def signed(self, key: SigningKey, board: str | None = None) -> SignedTicketRequest:

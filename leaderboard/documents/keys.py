@@ -19,22 +19,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field
-
 from leaderboard.documents.secret_files import parse_secret, write_secret
 from leaderboard.errors import BoardError
 from sme_registry.io import require_packages
+from sme_registry.spec import matching
 
 if TYPE_CHECKING:
     from nacl import signing
 
 Purpose = Literal["submission", "entry", "ticket", "answers", "withdrawal", "log", "upload"]
-PublicKey = Annotated[
-    str, Field(pattern=r"^[0-9a-f]{64}$", description="an ed25519 public key, 64 hex digits")
-]
-Signature = Annotated[
-    str, Field(pattern=r"^[0-9a-f]{128}$", description="an ed25519 signature, 128 hex digits")
-]
+PublicKey = Annotated[str, matching(r"^[0-9a-f]{64}$", "an ed25519 public key, 64 hex digits")]
+Signature = Annotated[str, matching(r"^[0-9a-f]{128}$", "an ed25519 signature, 128 hex digits")]
 
 
 @dataclass(frozen=True)

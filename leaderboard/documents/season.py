@@ -30,6 +30,7 @@ from sme_registry.spec import (
     SchemaVersion,
     Setting,
     StrictModel,
+    matching,
 )
 
 LEAST_COMPLEXITY = 5
@@ -254,6 +255,4 @@ class Reveal(Document):
 
     schema_version: SchemaVersion = 1
     season: Digest
-    master: Annotated[
-        str, Field(pattern=r"^[0-9a-f]{64}$", description="a master secret, 64 hex digits")
-    ]
+    master: Annotated[str, matching(r"^[0-9a-f]{64}$", "a master secret, 64 hex digits")]

@@ -28,6 +28,7 @@ from sme_registry.spec import (
     Name,
     SchemaVersion,
     StrictModel,
+    matching,
 )
 
 FILE = "submission.json"
@@ -47,19 +48,16 @@ _Line = Annotated[str, Field(min_length=1, max_length=80)]
 _Text = Annotated[str, Field(max_length=2000)]
 _Link = Annotated[
     str,
-    Field(
+    matching(
+        r"^https://[!-~]+$",
+        "an https:// link of at most 300 characters, without spaces",
         max_length=300,
-        pattern=r"^https://[!-~]+$",
-        description="an https:// link of at most 300 characters, without spaces",
     ),
 ]
 _Count = Annotated[Integer, Field(ge=0, le=10**12)]
 UtcTime = Annotated[
     str,
-    Field(
-        pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$",
-        description="a time in UTC, as in 2026-11-21T09:30:00Z",
-    ),
+    matching(r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$", "a time in UTC, as in 2026-11-21T09:30:00Z"),
 ]
 
 

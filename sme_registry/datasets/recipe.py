@@ -40,16 +40,22 @@ class Behaviour(StrictModel):
     A mixture acts by a = (1 − α) π*(s) + α ã(s), with one α ~ U(0, ν) for each step and ã another
     DUN of the same shape as π*; ν = 0 is the optimum, 1 the worst. A random policy acts by
     a ~ U([0, 1]^A).
+
+    Attributes:
+      kind: a mixture of the optimum, a user's policy, or random actions.
+      weight: its share of the transitions.
+      nu: ν of a mixture, from the optimum (0) to the worst (1); null for the other kinds.
+      policy: the name of a user's deterministic policy; null for the other kinds.
+      sha256: digest of that policy's file; null for a function, which only its author can run.
+      action_range: of that policy's actions, if it differs from the policy's own.
     """
 
     kind: Literal["mixture", "policy", "random"]
-    weight: Annotated[Real, Field(gt=0, le=1, description="share of the transitions")] = 1.0
-    nu: Annotated[Real | None, Field(ge=0, le=1, description="ν of a mixture")] = None
-    # Of a user's deterministic policy: its name, and the digest of its file; null for a function,
-    # which only its author can run again.
+    weight: Annotated[Real, Field(gt=0, le=1)] = 1.0
+    nu: Annotated[Real | None, Field(ge=0, le=1)] = None
     policy: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     sha256: Digest | None = None
-    action_range: Literal["unit", "symmetric"] | None = None  # if it differs from the policy's own
+    action_range: Literal["unit", "symmetric"] | None = None
 
     @model_validator(mode="after")
     def _fields_of_its_kind(self) -> Self:
@@ -80,19 +86,22 @@ class DatasetRecipe(Document):
 
     With coverage ε it keeps only transitions from states in X_ε = {s : ‖s − ½‖_∞ ≤ (1 + ε)/2}; null
     keeps all, as 0 does. Starts, each α and ã have a named stream of the seed each.
+
+    Attributes:
+      spec: the task.
+      behaviours: the policies that collect it, one after another; their weights add up to 1.
+      transitions: N, rows of the data set.
+      seed: of the data, not the task: an integer or, where nobody may guess it, hexadecimal text.
+      coverage: ε of the sub-cube of states that are kept; null keeps all.
+      protocol: of the evaluation of policies that learn from the data set.
     """
 
     schema_version: SchemaVersion = 1
     spec: SMESpec
-    # They act one after another; their weights add up to 1.
     behaviours: Annotated[TupleOf[Behaviour], Field(min_length=1, max_length=64)]
-    transitions: Annotated[
-        Integer, Field(ge=1, le=10**9, description="N, rows of the data set")
-    ] = 50_000
-    # Of the data, not the task: an integer or, where nobody may guess it, hexadecimal text.
+    transitions: Annotated[Integer, Field(ge=1, le=10**9)] = 50_000
     seed: Seed = 0
-    coverage: Annotated[Real | None, Field(gt=-1, le=0, description="ε of the sub-cube")] = None
-    # For the evaluation of policies that learn from the data set.
+    coverage: Annotated[Real | None, Field(gt=-1, le=0)] = None
     protocol: EvaluationProtocol = EvaluationProtocol()
 
     @model_validator(mode="after")

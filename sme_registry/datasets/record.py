@@ -17,27 +17,47 @@ KEY = "sme"
 
 
 class Seeds(StrictModel):
-    """Seeds of the task and of the data (starts, α, ã and random actions)."""
+    """Seeds of the task and of the data (starts, α, ã and random actions).
+
+    Attributes:
+      task: of the task.
+      data: of the data.
+    """
 
     task: Seed
     data: Seed
 
 
 class DatasetRecord(StrictModel):
-    """Provenance, reference scores and digests of a data set."""
+    """Provenance, reference scores and digests of a data set.
+
+    Attributes:
+      schema_version: version of the record's format.
+      recipe: all that the data set was generated from.
+      recipe_digest: the recipe's digest.
+      spec_digest: the task's digest.
+      task: what the task's file calls it.
+      protocol_digest: the protocol's digest.
+      seeds: of the task and of the data.
+      nu: ν if a single mixture acted; null for other or several behaviours.
+      trajectories: E, the number of Minari episodes.
+      scores: of reference policies on the data set.
+      arrays_digest: see `Transitions.digest`.
+      versions: of Python and the packages that the numbers depend on.
+    """
 
     schema_version: Literal[1] = 1
-    recipe: DatasetRecipe  # all that the data set was generated from
+    recipe: DatasetRecipe
     recipe_digest: Digest
     spec_digest: Digest
-    task: str = ""  # what the task's file calls it
+    task: str = ""
     protocol_digest: Digest
     seeds: Seeds
-    nu: float | None  # ν if a single mixture acted; null for other or several behaviours
-    trajectories: Annotated[Integer, Field(ge=1)]  # E, the number of Minari episodes
+    nu: float | None
+    trajectories: Annotated[Integer, Field(ge=1)]
     scores: ReferenceScores
-    arrays_digest: Digest  # see `Transitions.digest`
-    versions: dict[str, str]  # of Python and the packages that the numbers depend on
+    arrays_digest: Digest
+    versions: dict[str, str]
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "") -> Self:

@@ -34,29 +34,49 @@ Share = Annotated[Real, Field(ge=0, le=1)]
 
 
 class Rollouts(StrictModel):
-    """Whole episodes of a policy."""
+    """Whole episodes of a policy.
 
-    episodes: Integer  # 0 if the values are exact without rollouts
-    mean_return: Real  # mean sum of rewards, in [0, T]
-    standard_error: Real  # of that mean, over episodes
-    similarity: Share  # mean r̃ over all steps
+    Attributes:
+      episodes: 0 if the values are exact without rollouts.
+      mean_return: mean sum of rewards, in [0, T].
+      standard_error: of that mean, over episodes.
+      similarity: mean r̃ over all steps.
+    """
+
+    episodes: Integer
+    mean_return: Real
+    standard_error: Real
+    similarity: Share
 
 
 class PolicyScore(StrictModel):
-    """The scores of one policy."""
+    """The scores of one policy.
 
-    similarity: Share  # mean r̃ over the data set's states
-    step_reward: Share  # mean r over them
-    rollouts: Rollouts | None  # null if the horizon is too long for whole episodes
+    Attributes:
+      similarity: mean r̃ over the data set's states.
+      step_reward: mean r over them.
+      rollouts: null if the horizon is too long for whole episodes.
+    """
+
+    similarity: Share
+    step_reward: Share
+    rollouts: Rollouts | None
 
 
 class ReferenceScores(StrictModel):
-    """The reference scores of a data set."""
+    """The reference scores of a data set.
 
-    constant: PolicyScore  # of a = ½, the lower reference
-    behaviour: PolicyScore  # of the policies that collected the data set
-    behaviours: TupleOf[PolicyScore]  # each over the rows in which it acted
-    optimum: PolicyScore  # of π*
+    Attributes:
+      constant: of a = ½, the lower reference.
+      behaviour: of the policies that collected the data set.
+      behaviours: each over the rows in which it acted.
+      optimum: of π*.
+    """
+
+    constant: PolicyScore
+    behaviour: PolicyScore
+    behaviours: TupleOf[PolicyScore]
+    optimum: PolicyScore
 
 
 def reference_scores(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import POLICY, Comparison, Difference, Measurements
+from sme_registry.diagnosis.document import Comparison, Difference
+from sme_registry.diagnosis.measurements import POLICY, Measurements
 from sme_registry.diagnosis.subject import Subject
 from sme_registry.diagnosis.verdicts import judge
 

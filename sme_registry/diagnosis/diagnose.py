@@ -7,7 +7,8 @@ from typing import Any, TypeAlias, overload
 
 from sme_registry.diagnosis import extended, measure, networks, rollouts, verdicts
 from sme_registry.diagnosis.comparison import compare
-from sme_registry.diagnosis.document import POLICY, CapacityProbe, Diagnosis, Measurements
+from sme_registry.diagnosis.document import Diagnosis
+from sme_registry.diagnosis.measurements import POLICY, CapacityProbe, Measurements
 from sme_registry.diagnosis.questions import thresholds_of
 from sme_registry.diagnosis.stream import diagnose_stream
 from sme_registry.diagnosis.stream_document import StreamDiagnosis

@@ -13,39 +13,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
-from pydantic import JsonValue, SerializerFunctionWrapHandler, model_serializer
+from pydantic import JsonValue
 
+from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.errors import UnknownNameError, did_you_mean
-from sme_registry.evaluation import ObservationReport, SafetyReport, SafetyScore
 from sme_registry.io import read_json
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 from sme_registry.spec.document import refuse_other_digest
 
 __all__ = [
-    "POLICY",
     "Answer",
-    "CapacityProbe",
-    "Channel",
     "Comparison",
     "Diagnosis",
     "Difference",
-    "Distraction",
     "Kind",
     "Level",
-    "LimitedChannel",
-    "Limits",
-    "Measurements",
-    "OnPolicy",
-    "Partition",
-    "Response",
-    "RewardSignal",
-    "Score",
-    "Shell",
-    "SquaredError",
-    "TimeDependence",
-    "Training",
     "Verdict",
     "verdict_on",
 ]
@@ -57,224 +41,34 @@ Level = Literal["solved", "better_than_linear", "worse_than_linear", "no_better_
 POLICY = "policy"  # the key of the diagnosed policy among the names of the references
 
 
-class Score(StrictModel):
-    """One policy over a set of states."""
-
-    regret: Real  # mean
-    mae: Real
-    normalised_regret: Real
-
-
-class Channel(StrictModel):
-    """One action channel over uniform states of the cube; the regrets add up to the mean regret."""
-
-    channel: Integer  # from 1
-    mae: Real
-    normalised_regret: Real
-    linear_normalised_regret: Real  # of the linear least-squares policy
-    regret: Real  # in proportion to the channel's part of the error in each state
-    offset: Real  # mean of a − a*
-    slope: Real  # of the regression of a on a*: 1 at the optimum, 0 if a does not follow a*
-    at_zero: Real  # share of states in which a is within 0.01 of the bound
-    at_one: Real
-    optimal_at_bounds: Real  # share of states in which a* is within 0.01 of either bound
-
-
-class Partition(StrictModel):
-    """Uniform states in bins of equal counts along one quantity."""
-
-    state_channel: Integer | None  # from 1; None for the distance from the cube's centre, E(s)
-    edges: TupleOf[Real]  # of the bins, one more than there are bins
-    regret: TupleOf[Real]  # mean of each bin
-    mae: TupleOf[Real]
-    explained_variance: Real  # share of the variance of the states' errors between bins
-
-
-class Shell(StrictModel):
-    """A region of the protocol (WD, OOD 1, …)."""
-
-    region: str
-    epsilon: Real
-    scores: dict[str, Score]  # of the policy and references
-
-
-class SquaredError(StrictModel):
-    """Shares of the squared error Σ (a − a*)² over uniform states."""
-
-    offset: Real  # a constant a − a* in each channel
-    scale: Real  # a slope of a on a* other than 1
-    residual: Real  # the rest; offset, scale and residual add up to 1
-    noise: Real  # differs when the policy acts again in the same state
-    time: Real  # varies with the input t/T in a fixed state
-    accumulated_reward: Real  # varies with the input r_cum/k in a fixed state
-
-
-class Response(StrictModel):
-    """How actions follow the state, compared with π*.
-
-    A slope is that of a part of the policy on the same part of π*: 1 at the optimum, 0 if nothing
-    was learnt, None if π* has no such part (below 1 % of its variance).
-    """
-
-    nonlinear_variance: Real  # share of the variance of π* that no affine map explains
-    linear_slope: Real | None  # of the affine part
-    nonlinear_slope: Real | None  # of the remainder
-    sensitivity: Real  # RMS change of a over RMS change of a*, for small steps of the state
-    saturation: Real  # share of the policy's entries within 0.01 of a bound
-    optimal_saturation: Real  # likewise of a*
-
-
-class TimeDependence(StrictModel):
-    """The input t/T varied in fixed uniform states."""
-
-    inputs: TupleOf[Real]  # the values of t/T
-    normalised_regret: TupleOf[Real]  # at each value
-    action_change: TupleOf[Real]  # mean |a − mean over the values of a|, at each value
-
-
-class RewardSignal(StrictModel):
-    """How often a step is rewarded; `rewarded`, `gated` and `flat` are shares that add up to 1."""
-
-    rewarded: Real  # r > 0
-    gated: Real  # r̂ > 0, but r_min sets it to 0
-    flat: Real  # r̂ = 0, i.e. r̃ ≤ ¾
-    shortfall: Real  # mean distance of r̃ below ¾ + r_min/4, above which r > 0; 0 beyond it
-
-
-class OnPolicy(StrictModel):
-    """Whole episodes from uniform initial states.
-
-    Credit is the squared correlation of a step's reward with the payout that includes it: 1 at
-    k = 1, about 1/k if rewards are independent. None if one of them is constant.
-    """
-
-    episodes: Integer  # number of episodes
-    scores: dict[str, Score]  # of the policy and of references, each in the states that it visits
-    edges: TupleOf[Real]  # of the bins of time, in steps
-    regret: TupleOf[Real]  # mean of each bin, over the episodes that still run
-    mae: TupleOf[Real]
-    alive: TupleOf[Real]  # the share of those
-    mean_length: Real  # of an episode, in steps
-    termination_rate: Real  # share of episodes that D terminated, in a team because of this agent
-    signal: RewardSignal  # in the states that the policy visits
-    random_signal: RewardSignal  # under uniform random actions, as an untrained agent sees it
-    credit: Real | None
-    random_credit: Real | None
-    state_shift: TupleOf[Real]  # Kolmogorov-Smirnov distance from uniform, by state channel
-    coverage: Real  # smallest share, over state channels, of twenty equal bins that were visited
-
-
-class Training(StrictModel):
-    """A summary of the training log; the regrets are running medians over `window` rows."""
-
-    source: Literal["episodes", "evaluations"]  # with exploration, or of the deterministic policy
-    rows: Integer  # of the log
-    steps: Integer  # environment steps at its last row: an incomplete episode has none
-    window: Integer
-    first_regret: Real
-    best_regret: Real  # the lowest
-    best_step: Integer  # at which it was lowest
-    last_regret: Real
-    constant_regret: Real  # mean regret of the better constant policy on its own states
-    improvement_step: Integer | None  # the first at 0.02 below `constant_regret`; None: never
-    recent_improvement: Real  # fall over the last third of the rows
-    unrewarded: Real | None  # share of episodes without any reward; None for evaluations
-    termination_rate: Real | None  # share of episodes that D terminated; None likewise
-
-
-class CapacityProbe(StrictModel):
-    """A network of the same layers, fitted to a* by regression."""
-
-    layers: TupleOf[Integer]  # widths, from the observation to the action
-    states: Integer  # in the training set: as many as the training had steps, at most 50,000
-    gradient_steps: Integer
-    train_normalised_regret: Real  # in states of the training set
-    test_normalised_regret: Real  # in other states
-    seconds: Real  # wall time
-
-
-class LimitedChannel(StrictModel):
-    """One action channel of a task with limits ℓ, over uniform states of the cube."""
-
-    channel: Integer  # from 1
-    violating_share: Real  # share of states in which a > ℓ
-    optimal_violating_share: Real  # likewise of a*
-    cost: Real  # mean max(0, a − ℓ) / (2τ); the mean over channels is the policy's cost
-
-
-class Limits(StrictModel):
-    """A policy on a task with limits."""
-
-    report: SafetyReport  # of its evaluation: by region, with the references
-    visited: SafetyScore  # in the states of its episodes
-    cut_off: SafetyScore  # in the cube, of the policy with its actions cut off at the limits
-    channels: TupleOf[LimitedChannel]
-
-
-class Distraction(StrictModel):
-    """Regret owed to the distractors, in a few uniform states; see `diagnosis.extended`."""
-
-    states: Integer
-    distractor_draws: Integer  # of the distractors, in each state
-    normalised_regret: Real  # N over states and draws
-    averaged_regret: Real  # N of the mean action over the draws, in each state
-    half_regret: Real  # N with every distractor at ½
-    owed_regret: Real  # N that averaging removes, beyond what it removes of an action noise
-    owed_similarity: Real  # the same in points of similarity
-    distractor_share: Real  # share of the squared error that varies with the distractors
-
-
-class Measurements(StrictModel):
-    """Everything that was measured; None for what is unknown or was not measured.
-
-    `limits` are of a task with `safety`, `observation` is of one with `observation`, and
-    `distraction` of one with distractors; the JSON of other tasks does not have these fields.
-    """
-
-    uniform: dict[str, Score]  # the policy and each reference in the same uniform states
-    channels: TupleOf[Channel]
-    partitions: TupleOf[Partition]
-    shells: TupleOf[Shell]
-    squared_error: SquaredError
-    response: Response
-    time_dependence: TimeDependence
-    on_policy: OnPolicy
-    training: Training | None = None
-    # For each action channel, the standard deviation of exploration around the deterministic action
-    # at the end of training, in the unit range.
-    exploration_sd: TupleOf[Real] | None = None
-    capacity: CapacityProbe | None = None
-    limits: Limits | None = None
-    observation: ObservationReport | None = None  # of the policy's evaluation
-    distraction: Distraction | None = None
-
-    @model_serializer(mode="wrap")
-    def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        plain: dict[str, Any] = handler(self)
-        for field in ("limits", "observation", "distraction"):
-            if plain.get(field, "") is None:
-                del plain[field]
-        return plain
-
-    @property
-    def policy(self) -> Score:
-        """The policy in uniform states."""
-        return self.uniform[POLICY]
-
-
 class Verdict(StrictModel):
-    """The answer to one question, as data; `render.sentence` puts it in words."""
+    """The answer to one question, as data; `render.sentence` puts it in words.
 
-    question: str  # such as "sparsity"
-    kind: Kind  # "where" the error is, "why" it is there, "who" in a team makes it, or "limits"
-    answer: Answer  # "cannot tell" if the evidence does not separate the causes
-    reason: str  # the rule's branch that decided; see `verdicts.QUESTIONS`
-    evidence: dict[str, JsonValue]  # the numbers that the branch compared or reports
-    thresholds: dict[str, Real]  # those that the numbers were compared with
+    Attributes:
+      question: such as "sparsity".
+      kind: "where" the error is, "why" it is there, "who" in a team makes it, or "limits".
+      answer: "cannot tell" if the evidence does not separate the causes.
+      reason: the rule's branch that decided; see `verdicts.QUESTIONS`.
+      evidence: the numbers that the branch compared or reports.
+      thresholds: those that the numbers were compared with.
+    """
+
+    question: str
+    kind: Kind
+    answer: Answer
+    reason: str
+    evidence: dict[str, JsonValue]
+    thresholds: dict[str, Real]
 
 
 class Difference(StrictModel):
-    """A quantity of this run and of the other run."""
+    """A quantity of this run and of the other run.
+
+    Attributes:
+      quantity: its name.
+      value: of this run.
+      other: of the other run.
+    """
 
     quantity: str
     value: Real
@@ -282,13 +76,21 @@ class Difference(StrictModel):
 
 
 class Comparison(StrictModel):
-    """This run compared with another; pairs are (this run, other run)."""
+    """This run compared with another; pairs are (this run, other run).
 
-    name: str  # of the other run
-    spec_fields: dict[str, tuple[JsonValue, JsonValue]]  # those that differ
-    plan_fields: dict[str, tuple[JsonValue, JsonValue]]  # likewise
-    differences: TupleOf[Difference]  # of the main quantities
-    answers: dict[str, tuple[Answer, Answer]]  # to each question whose answers differ
+    Attributes:
+      name: of the other run.
+      spec_fields: those that differ.
+      plan_fields: likewise.
+      differences: of the main quantities.
+      answers: to each question whose answers differ.
+    """
+
+    name: str
+    spec_fields: dict[str, tuple[JsonValue, JsonValue]]
+    plan_fields: dict[str, tuple[JsonValue, JsonValue]]
+    differences: TupleOf[Difference]
+    answers: dict[str, tuple[Answer, Answer]]
 
 
 def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
@@ -309,21 +111,36 @@ def verdict_on(question: str, verdicts: Sequence[Verdict]) -> Verdict:
 
 
 class Diagnosis(StrictModel):
-    """The diagnosis of one policy."""
+    """The diagnosis of one policy.
+
+    Attributes:
+      name: of the run or policy.
+      spec: the task.
+      spec_digest: the task's digest.
+      task: what the task's file calls it.
+      plan: algorithm, seed, steps and so on; empty without a run.
+      checkpoint_step: of an unfinished run, the steps at its checkpoint.
+      level: normalised regret, ranked among the constant ½, the linear policy and 0.
+      verdicts: one for each question, in order.
+      comparison: with another run; null without one.
+      thresholds: all that verdicts use.
+      measurements: what the verdicts rest on.
+      versions: of Python and of the packages that the numbers depend on.
+    """
 
     schema_version: SchemaVersion = 1
-    name: str  # of the run or policy
+    name: str
     spec: SMESpec
     spec_digest: Digest
-    task: str = ""  # what the task's file calls it
-    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
-    checkpoint_step: Integer | None = None  # of an unfinished run, the steps at its checkpoint
-    level: Level  # normalised regret, ranked among the constant ½, the linear policy and 0
-    verdicts: TupleOf[Verdict]  # one for each question, in order
+    task: str = ""
+    plan: dict[str, JsonValue]
+    checkpoint_step: Integer | None = None
+    level: Level
+    verdicts: TupleOf[Verdict]
     comparison: Comparison | None = None
-    thresholds: dict[str, Real]  # all that verdicts use
-    measurements: Measurements  # what the verdicts rest on
-    versions: dict[str, str]  # of Python and of the packages that the numbers depend on
+    thresholds: dict[str, Real]
+    measurements: Measurements
+    versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:
         """The verdict on a question, such as "credit assignment" or "credit_assignment".

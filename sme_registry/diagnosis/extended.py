@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.document import Distraction, LimitedChannel, Limits
 from sme_registry.diagnosis.measure import MAX_NUMBERS, Sample, clipped_actions
+from sme_registry.diagnosis.measurements import Distraction, LimitedChannel, Limits
 from sme_registry.diagnosis.rollouts import Trajectories
 from sme_registry.evaluation import Policy, SafetyReport, SafetyScore
 from sme_registry.evaluation.regions import States, Uniform

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sme_registry.diagnosis.document import Distraction, Limits
+from sme_registry.diagnosis.measurements import Distraction, Limits
 from sme_registry.evaluation import ObservationReport, SafetyScore
 from sme_registry.evaluation.report import LABELS
 from sme_registry.evaluation.tables import SAFETY_REFERENCES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from sme_registry.diagnosis.document import Distraction, Limits
+from sme_registry.diagnosis.measurements import Distraction, Limits
 from sme_registry.diagnosis.questions import EXTENDED_THRESHOLDS as _T
 from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
 from sme_registry.evaluation import ObservationReport

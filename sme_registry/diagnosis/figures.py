@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sme_registry.diagnosis.document import POLICY, Diagnosis, Measurements
+from sme_registry.diagnosis.document import Diagnosis
 from sme_registry.diagnosis.extended_figures import draw_distraction, draw_layers, draw_limits
+from sme_registry.diagnosis.measurements import POLICY, Measurements
 from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.subject import Log
 from sme_registry.evaluation.report import LABELS

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.document import (
+from sme_registry.diagnosis.measurements import (
     POLICY,
     Channel,
     Partition,

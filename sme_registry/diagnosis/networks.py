@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sme_registry.compiled import engine
-from sme_registry.diagnosis.document import CapacityProbe
+from sme_registry.diagnosis.measurements import CapacityProbe
 from sme_registry.envs import arguments
 from sme_registry.envs.types import Observation
 from sme_registry.evaluation import Policy

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from sme_registry.diagnosis.document import Answer, Comparison, Kind, Measurements, Verdict
+from sme_registry.diagnosis.document import Answer, Comparison, Kind, Verdict
+from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.spec import SMESpec
 
 __all__ = [

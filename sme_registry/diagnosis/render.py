@@ -7,7 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sme_registry.diagnosis.document import POLICY, Diagnosis, Verdict
+from sme_registry.diagnosis.document import Diagnosis, Verdict
+from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.diagnosis.verdicts import COMPARISON_REASONS
 from sme_registry.evaluation.report import LABELS

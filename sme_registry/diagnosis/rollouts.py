@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sme_registry.compiled.values import REWARD, STEP_REWARD
-from sme_registry.diagnosis.document import POLICY, OnPolicy, RewardSignal, Score, Training
 from sme_registry.diagnosis.measure import MAX_NUMBERS
+from sme_registry.diagnosis.measurements import POLICY, OnPolicy, RewardSignal, Score, Training
 from sme_registry.diagnosis.subject import Log
 from sme_registry.envs.batch import Batch
 from sme_registry.envs.types import Mask, Observation

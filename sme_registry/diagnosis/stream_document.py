@@ -20,12 +20,20 @@ PhaseOutcome = Literal["retained", "forgotten", "not_learnt"]
 
 
 class NetworkState(StrictModel):
-    """The hidden layers of the policy's network in uniform states; see `hidden_layers`."""
+    """The hidden layers of the policy's network in uniform states; see `hidden_layers`.
 
-    hidden: TupleOf[Integer]  # units of each layer
-    dormant_units: Real  # share of all hidden units
-    saturated_units: Real  # likewise, of tanh
-    effective_rank: Integer  # of the last hidden layer
+    Attributes:
+      hidden: units of each layer.
+      dormant_units: share of all hidden units.
+      saturated_units: likewise, of tanh.
+      effective_rank: of the last hidden layer.
+      weight_norm: Euclidean norm of the weights of all layers, without biases.
+    """
+
+    hidden: TupleOf[Integer]
+    dormant_units: Real
+    saturated_units: Real
+    effective_rank: Integer
     weight_norm: Real
 
     @property
@@ -35,48 +43,88 @@ class NetworkState(StrictModel):
 
 
 class VisitDiagnosis(StrictModel):
-    """One visit of the life."""
+    """One visit of the life.
+
+    Attributes:
+      visit: its number, from 0.
+      phase: the index of its phase.
+      lifetime: environment steps at its end.
+      steps: that it lasts.
+      dynamic_regret: of its steps in the log; None without one.
+      online_regret: its mean; None without a log, and where no step was counted.
+      normalised_regret: at its end, on its own phase.
+      network: at its end; None if unknown.
+    """
 
     visit: Integer
     phase: Integer
-    lifetime: Integer  # environment steps at its end
-    steps: Integer  # that it lasts
-    dynamic_regret: Real | None  # of its steps in the log; None without one
-    online_regret: Real | None  # its mean; None without a log, and where no step was counted
-    normalised_regret: Real  # at its end, on its own phase
-    network: NetworkState | None  # at its end; None if unknown
+    lifetime: Integer
+    steps: Integer
+    dynamic_regret: Real | None
+    online_regret: Real | None
+    normalised_regret: Real
+    network: NetworkState | None
 
 
 class PhaseDiagnosis(StrictModel):
-    """One phase of the stream."""
+    """One phase of the stream.
+
+    Attributes:
+      phase: its index.
+      outcome: whether the agent knows it at the end.
+      best_normalised_regret: lowest at the end of one of its visits.
+      final_normalised_regret: at the end of the life.
+      initial_normalised_regret: before training.
+      fresh_normalised_regret: of an agent that trained on this phase alone.
+      fresh_online_regret: of its training.
+      fresh_network: at the end of its training.
+    """
 
     phase: Integer
     outcome: PhaseOutcome
-    best_normalised_regret: Real  # lowest at the end of one of its visits
-    final_normalised_regret: Real  # at the end of the life
-    initial_normalised_regret: Real | None  # before training
-    fresh_normalised_regret: Real | None  # of an agent that trained on this phase alone
-    fresh_online_regret: Real | None  # of its training
-    fresh_network: NetworkState | None  # at the end of its training
+    best_normalised_regret: Real
+    final_normalised_regret: Real
+    initial_normalised_regret: Real | None
+    fresh_normalised_regret: Real | None
+    fresh_online_regret: Real | None
+    fresh_network: NetworkState | None
 
 
 class StreamDiagnosis(StrictModel):
-    """The diagnosis of a life in a stream."""
+    """The diagnosis of a life in a stream.
+
+    Attributes:
+      name: of the run.
+      stream: the stream.
+      stream_digest: the stream's digest.
+      task: the stream's name.
+      plan: algorithm, seed, steps and so on.
+      average_performance: at the end of the life.
+      forgetting: fall of performance below its best, at the end of the life; null where it is not
+        defined.
+      dynamic_regret: sum over the steps of the log; null without one.
+      verdicts: one for each question, in order.
+      visits: in order.
+      phases: in order.
+      initial_network: before training; null if unknown.
+      thresholds: all that verdicts use.
+      versions: of Python and of the packages that the numbers depend on.
+    """
 
     schema_version: SchemaVersion = 1
-    name: str  # of the run
+    name: str
     stream: StreamSpec
     stream_digest: Digest
-    task: str = ""  # the stream's name
-    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on
-    average_performance: Real  # at the end of the life
+    task: str = ""
+    plan: dict[str, JsonValue]
+    average_performance: Real
     forgetting: Real | None
     dynamic_regret: Real | None
     verdicts: TupleOf[Verdict]
     visits: TupleOf[VisitDiagnosis]
     phases: TupleOf[PhaseDiagnosis]
     initial_network: NetworkState | None
-    thresholds: dict[str, Real]  # all that verdicts use
+    thresholds: dict[str, Real]
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:

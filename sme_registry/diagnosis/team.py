@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sme_registry.diagnosis import measure, rollouts, verdicts
-from sme_registry.diagnosis.document import POLICY, Measurements, Score
+from sme_registry.diagnosis.measurements import POLICY, Measurements, Score
 from sme_registry.diagnosis.questions import answer_all
 from sme_registry.diagnosis.subject import TeamSubject
 from sme_registry.diagnosis.team_document import AgentDiagnosis, Credit, TeamDiagnosis

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Level, Measurements, Score, Verdict, verdict_on
+from sme_registry.diagnosis.document import Level, Verdict, verdict_on
+from sme_registry.diagnosis.measurements import Measurements, Score
 from sme_registry.errors import UnknownNameError, did_you_mean
 from sme_registry.spec import Digest, Integer, Real, SchemaVersion, SMESpec, StrictModel, TupleOf
 
@@ -20,41 +21,73 @@ __all__ = ["AgentDiagnosis", "Credit", "TeamDiagnosis"]
 
 
 class Credit(StrictModel):
-    """An agent's part in the team's regret; means over states."""
+    """An agent's part in the team's regret; means over states.
 
-    regret_share: Real  # in units of regret: over the agents, they add up to the team's regret
-    difference_reward: Real  # in [0, 1]; these do not add up, because the step reward is clipped
+    Attributes:
+      regret_share: in units of regret: over the agents, they add up to the team's regret.
+      difference_reward: in [0, 1]; these do not add up, because the step reward is clipped.
+    """
+
+    regret_share: Real
+    difference_reward: Real
 
 
 class AgentDiagnosis(StrictModel):
-    """One agent of a team, measured over its own action channels."""
+    """One agent of a team, measured over its own action channels.
+
+    Attributes:
+      name: of the agent.
+      state_channels: that it observes, from 1.
+      action_channels: that it owns, from 1.
+      level: its normalised regret, ranked among the constant ½, the linear policy and 0.
+      uniform: in uniform states.
+      visited: in the states that the team visits.
+      verdicts: on its own policy.
+      measurements: what the verdicts rest on.
+    """
 
     name: str
-    state_channels: TupleOf[Integer]  # that it observes, from 1
-    action_channels: TupleOf[Integer]  # that it owns, from 1
+    state_channels: TupleOf[Integer]
+    action_channels: TupleOf[Integer]
     level: Level
-    uniform: Credit  # in uniform states
-    visited: Credit  # in the states that the team visits
-    verdicts: TupleOf[Verdict]  # on its own policy
+    uniform: Credit
+    visited: Credit
+    verdicts: TupleOf[Verdict]
     measurements: Measurements
 
 
 class TeamDiagnosis(StrictModel):
-    """The diagnosis of a team's policies."""
+    """The diagnosis of a team's policies.
+
+    Attributes:
+      name: of the run or policy.
+      spec: the task.
+      spec_digest: the task's digest.
+      task: its name.
+      plan: algorithm, seed, steps and so on; empty without a run.
+      checkpoint_step: of an unfinished run, the steps at its checkpoint.
+      uniform: of the team, in uniform states.
+      visited: of the team, in the states of its own episodes.
+      verdicts: on the team: who.
+      agents: in the order of the channels that they own.
+      left_out: questions of a single agent's diagnosis without an answer for a team.
+      thresholds: all that verdicts use.
+      versions: of Python and of the packages that the numbers depend on.
+    """
 
     schema_version: SchemaVersion = 1
-    name: str  # of the run or policy
+    name: str
     spec: SMESpec
     spec_digest: Digest
-    task: str = ""  # its name
-    plan: dict[str, JsonValue]  # algorithm, seed, steps and so on; empty without a run
-    checkpoint_step: Integer | None = None  # of an unfinished run, the steps at its checkpoint
-    uniform: Score  # of the team, in uniform states
-    visited: Score  # of the team, in the states of its own episodes
-    verdicts: TupleOf[Verdict]  # on the team: who
-    agents: TupleOf[AgentDiagnosis]  # in the order of the channels that they own
-    left_out: TupleOf[str]  # questions of a single agent's diagnosis without an answer for a team
-    thresholds: dict[str, Real]  # all that verdicts use
+    task: str = ""
+    plan: dict[str, JsonValue]
+    checkpoint_step: Integer | None = None
+    uniform: Score
+    visited: Score
+    verdicts: TupleOf[Verdict]
+    agents: TupleOf[AgentDiagnosis]
+    left_out: TupleOf[str]
+    thresholds: dict[str, Real]
     versions: dict[str, str]
 
     def verdict(self, question: str) -> Verdict:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sme_registry.diagnosis.document import POLICY
+from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.render import title
 from sme_registry.diagnosis.team_document import TeamDiagnosis
 from sme_registry.plots.style import (

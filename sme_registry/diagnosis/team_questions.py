@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from sme_registry.diagnosis.document import POLICY, Score
+from sme_registry.diagnosis.measurements import POLICY, Score
 from sme_registry.diagnosis.questions import THRESHOLDS, Outcome, Question, add_to
 from sme_registry.diagnosis.team_document import AgentDiagnosis
 from sme_registry.spec import SMESpec

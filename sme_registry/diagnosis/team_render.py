@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from sme_registry.diagnosis.document import POLICY, Verdict
+from sme_registry.diagnosis.document import Verdict
+from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.render import (
     COLOURS,
     answers,

@@ -11,8 +11,9 @@ from collections.abc import Iterable
 
 from pydantic import JsonValue
 
-from sme_registry.diagnosis.document import Answer, Comparison, Level, Measurements, Verdict
+from sme_registry.diagnosis.document import Answer, Comparison, Level, Verdict
 from sme_registry.diagnosis.extended_questions import DISTRACTORS, LIMITS
+from sme_registry.diagnosis.measurements import Measurements
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
 from sme_registry.diagnosis.questions import Case, Outcome, Question, thresholds_of, verdict
 from sme_registry.diagnosis.where import WHERE

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from sme_registry.diagnosis.document import POLICY, Channel
+from sme_registry.diagnosis.measurements import POLICY, Channel
 from sme_registry.diagnosis.questions import THRESHOLDS as _T
 from sme_registry.diagnosis.questions import Case, Outcome, Question, add_to
 

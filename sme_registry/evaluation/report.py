@@ -72,6 +72,7 @@ class EvaluationReport(ReportFile):
     channels. A single agent's report has no `agents`, and its JSON omits the field.
 
     Attributes:
+      schema_version: version of the report's format.
       policy: the policy's name.
       action_range: of the policy's actions, "unit" or "symmetric"; "mixed" where the agents of a
         team differ.

@@ -29,24 +29,37 @@ _Rate = Annotated[Real, Field(gt=0, le=1)]
 
 
 class BCHyperparameters(StrictModel):
-    """Hyperparameters of behaviour cloning."""
+    """Hyperparameters of behaviour cloning.
 
-    hidden: _Widths = (256, 256)  # of the policy's hidden layers
-    learning_rate: _Rate = 1e-3  # of Adam
+    Attributes:
+      hidden: of the policy's hidden layers.
+      learning_rate: of Adam.
+    """
+
+    hidden: _Widths = (256, 256)
+    learning_rate: _Rate = 1e-3
 
 
 class IQLHyperparameters(StrictModel):
-    """Hyperparameters of implicit Q-learning."""
+    """Hyperparameters of implicit Q-learning.
 
-    hidden: _Widths = (256, 256)  # of the hidden layers of policy, critics and value function
-    learning_rate: _Rate = 3e-4  # of Adam, for all networks
-    discount: Annotated[Real, Field(ge=0, lt=1)] = 0.99  # γ
-    # τ of the value function; ½ gives the mean, values near 1 the maximum.
+    Attributes:
+      hidden: of the hidden layers of policy, critics and value function.
+      learning_rate: of Adam, for all networks.
+      discount: γ.
+      expectile: τ of the value function; ½ gives the mean, values near 1 the maximum.
+      inverse_temperature: β; 0 gives behaviour cloning.
+      max_weight: upper limit of exp(β advantage).
+      target_rate: ρ of the soft update of the target critics in each step.
+    """
+
+    hidden: _Widths = (256, 256)
+    learning_rate: _Rate = 3e-4
+    discount: Annotated[Real, Field(ge=0, lt=1)] = 0.99
     expectile: Annotated[Real, Field(gt=0, lt=1)] = 0.7
-    # β; 0 gives behaviour cloning.
     inverse_temperature: Annotated[Real, Field(ge=0, le=1000)] = 3.0
-    max_weight: Annotated[Real, Field(gt=0, le=1e6)] = 100.0  # upper limit of exp(β advantage)
-    target_rate: _Rate = 0.005  # ρ of the soft update of the target critics in each step
+    max_weight: Annotated[Real, Field(gt=0, le=1e6)] = 100.0
+    target_rate: _Rate = 0.005
 
 
 Hyperparameters = BCHyperparameters | IQLHyperparameters

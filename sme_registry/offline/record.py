@@ -13,45 +13,81 @@ from sme_registry.spec.document import refuse_other_digest
 
 
 class Evaluation(StrictModel):
-    """Episodes of the policy in the task, played during training."""
+    """Episodes of the policy in the task, played during training.
 
-    step: Integer  # gradient steps before it
-    similarity: Real  # mean r̃ over all steps of all episodes
-    similarity_sd: Real  # standard deviation over these steps
-    episode_return: Real  # mean over the episodes
-    losses: dict[str, Real]  # terms of the loss of the last batch, by name
+    Attributes:
+      step: gradient steps before it.
+      similarity: mean r̃ over all steps of all episodes.
+      similarity_sd: standard deviation over these steps.
+      episode_return: mean over the episodes.
+      losses: terms of the loss of the last batch, by name.
+    """
+
+    step: Integer
+    similarity: Real
+    similarity_sd: Real
+    episode_return: Real
+    losses: dict[str, Real]
 
 
 class BehaviourQuality(StrictModel):
-    """Exact statistics of the data set's transitions."""
+    """Exact statistics of the data set's transitions.
 
-    similarity: Real  # mean r̃
+    Attributes:
+      similarity: mean r̃.
+      similarity_sd: standard deviation of r̃.
+      step_reward: mean r.
+    """
+
+    similarity: Real
     similarity_sd: Real
-    step_reward: Real  # mean r
+    step_reward: Real
 
 
 class OfflineRecord(StrictModel):
-    """The arguments, data, evaluations and cost of an offline training."""
+    """The arguments, data, evaluations and cost of an offline training.
+
+    Attributes:
+      schema_version: version of the record's format.
+      algorithm: behaviour cloning or implicit Q-learning.
+      hyperparameters: all of them, as used.
+      seed: of initial weights, shuffles, and starts of the evaluation episodes.
+      steps: of the gradient.
+      batch_size: transitions in each.
+      episodes: of each evaluation.
+      dataset: id of the data set; null if only its arrays were passed.
+      dataset_digest: of its arrays.
+      recipe_digest: the recipe's; null if only the arrays were passed.
+      transitions: N, the size of the data set.
+      spec: the task.
+      spec_digest: the task's digest.
+      behaviour: of the data set's transitions.
+      evaluations: in order; last, the policy's.
+      wall_seconds: of the training and its evaluations.
+      cpu_seconds: processor time of the same.
+      cpu_ms_per_step: of a gradient step, without evaluations.
+      versions: of Python and the packages that the numbers depend on.
+    """
 
     schema_version: Literal[1] = 1
     algorithm: Literal["bc", "iql"]
-    hyperparameters: dict[str, Any]  # all of them, as used
-    seed: Integer  # of initial weights, shuffles, and starts of the evaluation episodes
-    steps: Integer  # of the gradient
-    batch_size: Integer  # transitions in each
-    episodes: Integer  # of each evaluation
-    dataset: str | None  # id of the data set; null if only its arrays were passed
-    dataset_digest: str  # of its arrays
-    recipe_digest: str | None  # null if only the arrays were passed
-    transitions: Integer  # N, the size of the data set
+    hyperparameters: dict[str, Any]
+    seed: Integer
+    steps: Integer
+    batch_size: Integer
+    episodes: Integer
+    dataset: str | None
+    dataset_digest: str
+    recipe_digest: str | None
+    transitions: Integer
     spec: SMESpec
     spec_digest: str
     behaviour: BehaviourQuality
-    evaluations: Annotated[TupleOf[Evaluation], Field(min_length=1)]  # in order; last, the policy's
-    wall_seconds: Real  # of the training and its evaluations
+    evaluations: Annotated[TupleOf[Evaluation], Field(min_length=1)]
+    wall_seconds: Real
     cpu_seconds: Real
-    cpu_ms_per_step: Real  # of a gradient step, without evaluations
-    versions: dict[str, str]  # of Python and the packages that the numbers depend on
+    cpu_ms_per_step: Real
+    versions: dict[str, str]
 
     @property
     def similarity(self) -> float:

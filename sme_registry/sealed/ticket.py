@@ -14,7 +14,7 @@ from sme_registry.errors import OptionError
 from sme_registry.io import integer_in, read_json, to_json
 from sme_registry.io.files import atomic_file, unwritable
 from sme_registry.sealed.signing import Signer
-from sme_registry.spec import Digest, Integer, Name, Setting, StrictModel, TupleOf
+from sme_registry.spec import Digest, Integer, Name, Setting, StrictModel, TupleOf, matching
 
 _Count = Annotated[Integer, Field(ge=0)]
 
@@ -26,6 +26,7 @@ class TicketClass(StrictModel):
       setting: all of a spec but its seed.
       instances: number of hidden tasks.
       budget: steps on each instance, over all lanes.
+      name: of the class.
     """
 
     name: Name
@@ -66,7 +67,7 @@ class Ticket(StrictModel):
 
     season: Name
     ticket: _Count
-    token: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="64 hex digits", repr=False)]
+    token: Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits", repr=False)]
     deadline: Annotated[str, Field(max_length=40)]
     lanes: Annotated[Integer, Field(ge=1)]
     classes: Annotated[TupleOf[TicketClass], Field(min_length=1)]

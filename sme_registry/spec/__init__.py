@@ -9,6 +9,7 @@ from sme_registry.spec.document import (
     SchemaVersion,
     StrictModel,
     TupleOf,
+    matching,
 )
 from sme_registry.spec.envelope import (
     EnvFile,
@@ -75,4 +76,5 @@ __all__ = [
     "TupleOf",
     "as_spec",
     "as_stream",
+    "matching",
 ]

@@ -15,16 +15,19 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    GetJsonSchemaHandler,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
     model_serializer,
     model_validator,
 )
+from pydantic_core import CoreSchema
 
 from sme_registry.errors import DigestMismatchError
 from sme_registry.io import sha256_of
-from sme_registry.spec.validation_errors import spec_error
+from sme_registry.spec.descriptions import describe, describe_schema
+from sme_registry.spec.validation_errors import WORDED, spec_error
 
 
 def plain_number(value: Any) -> Any:
@@ -53,19 +56,35 @@ _Part = TypeVar("_Part")
 Integer = int
 Real = Annotated[float, Field(allow_inf_nan=False)]
 TupleOf = Annotated[tuple[_Part, ...], Field(strict=False)]  # in JSON a list
-SchemaVersion = Annotated[Literal[1], BeforeValidator(_integer_only)]
+SchemaVersion = Annotated[
+    Literal[1],
+    BeforeValidator(_integer_only),
+    Field(description="version of the document's format."),
+]
+
+
+def matching(pattern: str, allowed: str, **limits: Any) -> Any:
+    """The `Field` of a text that matches a pattern.
+
+    Args:
+      pattern: a regular expression.
+      allowed: the same in words, for errors: `64 hex digits`.
+      **limits: further arguments of `pydantic.Field`.
+    """
+    return Field(pattern=pattern, json_schema_extra={WORDED: allowed}, **limits)
+
+
 Name = Annotated[
     str,
-    Field(
-        pattern=r"^[A-Za-z0-9_-]+$",
+    matching(
+        r"^[A-Za-z0-9_-]+$",
+        "a string of 1 to 64 letters, digits, '_' and '-'",
         min_length=1,
         max_length=64,
-        description="a string of 1 to 64 letters, digits, '_' and '-'",
     ),
 ]
 Digest = Annotated[
-    str,
-    Field(pattern=r"^sha256:[0-9a-f]{64}$", description="'sha256:' and 64 lower-case hex digits"),
+    str, matching(r"^sha256:[0-9a-f]{64}$", "'sha256:' and 64 lower-case hex digits")
 ]
 
 
@@ -100,6 +119,19 @@ class StrictModel(BaseModel):
             super().__init__(**data)
         except ValidationError as error:
             raise spec_error(error, type(self).__name__, self.model_json_schema()) from None
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        describe(cls)
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        schema = handler(core_schema)
+        describe_schema(cls, handler.resolve_ref_schema(schema))
+        return schema
 
     # The mark of Pydantic's own constructors: without it, each nested model would be validated by
     # this one, and raise an error without the path that leads to it.
@@ -173,13 +205,10 @@ def without_empty(plain: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 class Document(StrictModel):
-    """A model with an identity: equal documents have equal digests, unequal ones do not.
+    """A model with an identity: equal documents have equal digests, unequal ones do not."""
 
-    Attributes:
-      left_out_by_default: fields younger than the first documents of this kind. While they have
-        their default they are in no JSON, so that the digests of older documents stay the same.
-    """
-
+    # Fields younger than the first documents of this kind. While they have their default they are
+    # in no JSON, so that the digests of older documents stay the same.
     left_out_by_default: ClassVar[tuple[str, ...]] = ()
 
     @model_serializer(mode="wrap")

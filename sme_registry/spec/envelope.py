@@ -51,11 +51,16 @@ class Envelope(StrictModel):
     """The fields of every file next to its document.
 
     Attributes:
-      content: the field that holds the document.
-      remedy: how to write a changed document, or a bare one, as a file; `{source}` is its path.
+      name: a short name, as in ids.
+      version: of the dynamics. A released name and version never change their numbers.
+      description: one or two sentences.
+      tags: short words, to find it by.
+      digest: of the document alone; a file with another one is refused.
     """
 
+    # The field that holds the document.
     content: ClassVar[str]
+    # How to write a changed document, or a bare one, as a file; `{source}` is its path.
     remedy: ClassVar[str] = (
         "write the changed {content} as a new file, in Python "
         "`sme_registry.spec.{kind}(name=…, digest={content}.digest, {content}={content})"
@@ -63,7 +68,7 @@ class Envelope(StrictModel):
     )
 
     name: Name
-    version: Annotated[Integer, Field(ge=1, le=10**6, description="version of the dynamics")] = 1
+    version: Annotated[Integer, Field(ge=1, le=10**6)] = 1
     description: Annotated[str, Field(max_length=2000)] = ""
     tags: Annotated[tuple[Name, ...], Field(strict=False, max_length=64)] = ()
     digest: Digest
@@ -127,7 +132,12 @@ class Envelope(StrictModel):
 
 
 class EnvFile(Envelope):
-    """A task's file: `specs/envs/*.json`, or what `sme_registry.save` writes."""
+    """A task's file: `specs/envs/*.json`, or what `sme_registry.save` writes.
+
+    Attributes:
+      spec: the task.
+      fingerprint: its numbers at fixed probes, compared when the file is read.
+    """
 
     content = "spec"
     remedy = "save the changed spec as a new file, in Python `sme_registry.save(spec, path)`"
@@ -140,6 +150,7 @@ class StreamFile(Envelope):
     """A stream's file: `specs/streams/*.json`, or what `sme_registry.save` writes.
 
     Attributes:
+      stream: the stream.
       fingerprints: of each phase's spec, in order.
     """
 
@@ -160,7 +171,11 @@ class StreamFile(Envelope):
 
 
 class SuiteFile(Envelope):
-    """A suite's file: `specs/suites/*.json`."""
+    """A suite's file: `specs/suites/*.json`.
+
+    Attributes:
+      suite: the suite.
+    """
 
     content = "suite"
 
@@ -168,7 +183,11 @@ class SuiteFile(Envelope):
 
 
 class StudyFile(Envelope):
-    """A study's file: `specs/studies/*.json`."""
+    """A study's file: `specs/studies/*.json`.
+
+    Attributes:
+      plan: the study plan.
+    """
 
     content = "plan"
     remedy = "write the changed plan as a new file: `sme study new NEW.json --from {source}`"
@@ -194,7 +213,11 @@ class StudyFile(Envelope):
 
 
 class ProtocolFile(Envelope):
-    """A protocol's file: `specs/protocols/*.json`."""
+    """A protocol's file: `specs/protocols/*.json`.
+
+    Attributes:
+      protocol: the protocol.
+    """
 
     content = "protocol"
 

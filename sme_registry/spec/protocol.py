@@ -17,13 +17,22 @@ from sme_registry.spec.validation_errors import short_repr
 
 
 class EvaluationProtocol(Document):
-    """How many states, in which regions, with which auxiliary inputs, from which seed."""
+    """How many states, in which regions, with which auxiliary inputs, from which seed.
+
+    Attributes:
+      states_per_region: states drawn in the cube, and in each shell around it.
+      epsilons: outer ε of each shell, increasing: shell m is between the cubes ε_{m−1} and ε_m.
+      sampling: how states are drawn: uniformly by volume in each region.
+      time_input: the entry t/T of an observation: uniform over the steps of an episode.
+      accumulated_reward_input: the entry r_cum/k of an observation: 0.
+      seed: of the states and times.
+    """
 
     schema_version: SchemaVersion = 1
     states_per_region: Annotated[Integer, Field(ge=2, le=10**8)] = 50_000
     epsilons: Annotated[
         tuple[Real, ...],
-        Field(strict=False, min_length=1, max_length=1000, description="outer ε of each OOD shell"),
+        Field(strict=False, min_length=1, max_length=1000),
     ] = (0.2, 0.4, 0.6, 0.8, 1.0)
     sampling: Literal["volume_uniform"] = "volume_uniform"
     time_input: Literal["uniform_over_steps"] = "uniform_over_steps"

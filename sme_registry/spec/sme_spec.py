@@ -28,10 +28,11 @@ from sme_registry.spec.document import (
     NamedDocument,
     Real,
     SchemaVersion,
+    matching,
     plain_number,
     refuse_repeated_names,
 )
-from sme_registry.spec.validation_errors import short_repr
+from sme_registry.spec.validation_errors import WORDED, short_repr
 
 ActionRange: TypeAlias = Literal["unit", "symmetric"]
 """The range of actions: [0, 1], the paper's, or [−1, 1], which Stable-Baselines3 prefers."""
@@ -64,7 +65,11 @@ Seed = Annotated[
         {
             "anyOf": [
                 {"type": "integer", "minimum": 0, "exclusiveMaximum": MAX_SEED},
-                {"type": "string", "pattern": "^0x[0-9a-fA-F]{1,64}$"},
+                {
+                    "type": "string",
+                    "pattern": "^0x[0-9a-fA-F]{1,64}$",
+                    WORDED: "'0x' and 1 to 64 hex digits",
+                },
             ]
         }
     ),
@@ -104,14 +109,20 @@ Observed = Annotated[
 
 
 class AgentSpec(Document):
-    """One agent of a team: the action channels it owns and the state channels it observes."""
+    """One agent of a team: the action channels it owns and the state channels it observes.
+
+    Attributes:
+      name: unique in the team. Without names, agents are `agent_0`, `agent_1`, … as in PettingZoo.
+      action_dim: the number of its action channels. The agents own consecutive ones, in order.
+      observes: the state channels that it sees, in increasing order, or all.
+    """
 
     name: Annotated[
         str,
-        Field(
-            pattern=_AGENT_NAME,
+        matching(
+            _AGENT_NAME,
+            "a word, '_' and a number, such as 'agent_0', of at most 64 characters",
             max_length=64,
-            description="a word, '_' and a number, such as 'agent_0', of at most 64 characters",
         ),
     ]
     action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)]
@@ -119,7 +130,13 @@ class AgentSpec(Document):
 
 
 class TeamSpec(Document):
-    """Which agent owns which action channels: consecutive ones, in the order of the agents."""
+    """Which agent owns which action channels: consecutive ones, in the order of the agents.
+
+    Attributes:
+      agents: in the order of their action channels, which add up to the task's.
+      reward: an agent's reward is that of its own channels ("individual"), or all agents share that
+        of the whole team ("team").
+    """
 
     agents: Annotated[tuple[AgentSpec, ...], Field(min_length=1, max_length=1024, strict=False)]
     reward: Literal["individual", "team"] = "individual"
@@ -148,11 +165,10 @@ class SafetySpec(Document):
     Source: METHOD, section 8.
 
     Attributes:
-      tightness: τ in (0, ½], about the share of states and channels in which the optimum is above
-        its limit.
+      tightness: τ, about the share of states and channels in which the optimum is above its limit.
     """
 
-    tightness: Annotated[Real, Field(gt=0, le=0.5, description="τ, share of limits that bite")]
+    tightness: Annotated[Real, Field(gt=0, le=0.5)]
 
 
 class ObservationSpec(Document):
@@ -167,12 +183,11 @@ class ObservationSpec(Document):
         without distractors.
       mixing: the map: none, a scaled rotation about the centre ("orthogonal"), or `mixing_depth`
         square uniform layers ("nonlinear").
-      mixing_depth: number of layers in [1, 3], 1 by default; None for another mixing.
+      mixing_depth: number of layers; 1 where the mixing is "nonlinear" and none is given, and None
+        for another mixing.
     """
 
-    distractors: Annotated[
-        Integer, Field(ge=0, le=MAX_DIM, description="m, channels without meaning")
-    ] = 0
+    distractors: Annotated[Integer, Field(ge=0, le=MAX_DIM)] = 0
     dynamics: Literal["noise", "autonomous", "driven"] | None = None
     mixing: Literal["none", "orthogonal", "nonlinear"] = "none"
     mixing_depth: Annotated[Integer, Field(ge=1, le=3)] | None = None
@@ -202,28 +217,38 @@ class Setting(Document):
     """One setting of the axes: everything that a task is generated from, except its seed.
 
     Defaults are the paper's (METHOD, section 1), or ours where it has none.
+
+    Attributes:
+      state_dim: S, state channels.
+      action_dim: A, action channels.
+      k: steps between payouts of the reward.
+      r_min: reward threshold: step rewards at or below it are set to 0.
+      D: survival threshold: a step reward below it ends the episode.
+      complexity: L, layers of the optimal policy.
+      horizon: T, steps of an episode.
+      hidden_width: H, width of the optimal policy's inner layers.
+      policy_init: how the optimal policy's layers are drawn where they widen.
+      team: divides the action channels among several agents; none in a single agent's task.
+      rotation: θ, radians by which the optimal policy's input is rotated about the centre of the
+        cube.
+      safety: limits of the actions that depend on the state.
+      observation: what the agent sees in place of the state.
     """
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("rotation", "safety", "observation")
 
     schema_version: SchemaVersion = 1
-    state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="S, state channels")] = 8
-    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM, description="A, action channels")] = 4
-    k: Annotated[Integer, Field(ge=1, le=2**31 - 1, description="reward interval, steps")] = 1
-    r_min: Annotated[Real, Field(ge=0, lt=1, description="reward threshold")] = 0.0
-    D: Annotated[Real, Field(ge=0, lt=1, description="survival threshold")] = 0.0
-    complexity: Annotated[
-        Integer, Field(ge=1, le=10_000, description="L, layers of the optimal policy")
-    ] = 1
-    horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1, description="T, steps")] = 100
-    hidden_width: Annotated[
-        Integer, Field(ge=1, le=4096, description="H, width of the inner layers")
-    ] = 64
+    state_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)] = 8
+    action_dim: Annotated[Integer, Field(ge=1, le=MAX_DIM)] = 4
+    k: Annotated[Integer, Field(ge=1, le=2**31 - 1)] = 1
+    r_min: Annotated[Real, Field(ge=0, lt=1)] = 0.0
+    D: Annotated[Real, Field(ge=0, lt=1)] = 0.0
+    complexity: Annotated[Integer, Field(ge=1, le=10_000)] = 1
+    horizon: Annotated[Integer, Field(ge=1, le=2**31 - 1)] = 100
+    hidden_width: Annotated[Integer, Field(ge=1, le=4096)] = 64
     policy_init: Literal["semi_orthogonal", "unit_variance"] = "semi_orthogonal"
     team: TeamSpec | None = None
-    rotation: Annotated[
-        Real, Field(ge=0, lt=FULL_TURN, description="θ, radians by which π*'s input is rotated")
-    ] = 0.0
+    rotation: Annotated[Real, Field(ge=0, lt=FULL_TURN)] = 0.0
     safety: SafetySpec | None = None
     observation: ObservationSpec | None = None
 
@@ -314,6 +339,9 @@ class SMESpec(Setting, NamedDocument):
 
     Equal specs have equal digests, and equal digests are equal specs. The name that a file or a
     registration gives a spec is presentation: it is in no JSON and makes no two specs unequal.
+
+    Attributes:
+      seed: of all random draws of the task.
     """
 
     seed: Seed = 0

@@ -38,12 +38,12 @@ class Drift(StrictModel):
     """A rotation that moves during a phase, from its spec's angle, in equal increments.
 
     Attributes:
-      rotation: the angle θ towards which it moves, radians in [0, 2π]; 2π is a full turn from 0.
+      rotation: the angle θ towards which it moves, radians; 2π is a full turn from 0.
       increments: n. Piece i of n has the angle θ₀ + i (θ − θ₀)/n, so that the first piece is the
         phase's own spec, and the next phase may go on at θ.
     """
 
-    rotation: Annotated[Real, Field(ge=0, le=FULL_TURN, description="θ to move towards, radians")]
+    rotation: Annotated[Real, Field(ge=0, le=FULL_TURN)]
     increments: Annotated[Integer, Field(ge=2, le=MAX_PIECES)]
 
 

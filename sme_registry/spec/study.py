@@ -103,9 +103,14 @@ class Cell(Document):
     Attributes:
       spec: the task; of a life in a stream that of its first phase.
       stream: the stream; None for a single task.
-      uses: the algorithm; this and the other fields are those of the plan.
+      uses: the algorithm, as in the plan.
+      hyperparameters: where they differ from the algorithm's defaults.
+      action_range: of the environment that the agent acts in.
       seed: of training.
       steps: environment steps; of a life those of the stream.
+      evaluations: evenly spaced over training, the last at its end; 0 for none.
+      evaluation_episodes: in each of them.
+      protocol: of the evaluation within and out of distribution at the end.
     """
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("stream",)

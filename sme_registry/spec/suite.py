@@ -25,7 +25,13 @@ from sme_registry.spec.validation_errors import short_repr
 
 
 class SuiteClass(Document):
-    """One kind of task: a setting of the axes and the seeds of its instances."""
+    """One kind of task: a setting of the axes and the seeds of its instances.
+
+    Attributes:
+      name: of the class, unique in its suite.
+      setting: every field of its tasks except the seed.
+      seeds: of its instances, each once.
+    """
 
     name: Name
     setting: Setting
@@ -93,7 +99,12 @@ StreamClasses = Annotated[tuple[StreamClass, ...], Field(max_length=1000, strict
 
 
 class Suite(Document):
-    """Classes of tasks, of streams, or of both, under different names."""
+    """Classes of tasks, of streams, or of both, under different names.
+
+    Attributes:
+      classes: kinds of tasks; at least one, unless there are streams.
+      streams: kinds of streams.
+    """
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)
 

@@ -17,6 +17,9 @@ _MAX_PATH = 120
 _MAX_FAULTS = 5
 _MAX_TEXT = 2000
 
+WORDED = "$comment"
+"""The keyword under which our JSON Schemas say in words what a pattern allows."""
+
 
 def short_repr(value: Any) -> str:
     """A value as an error repeats it: cut to a length that fits on a line."""
@@ -73,7 +76,7 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
             return f"{path}={value}: {message}"
         return f"{path}.{message}" if path else message  # of a model: names its field
     if kind == "missing":
-        return f"{path}: missing: must be {_allowed(root, schema)}. Add it."
+        return f"{path}: missing: must be {allowed_values(root, schema)}. Add it."
     if kind in ("model_type", "model_attributes_type"):
         fields = _resolved(root, schema).get("properties", {}) if path else {}
         known = f" Known fields: {', '.join(fields)}." if fields else ""
@@ -81,7 +84,7 @@ def _explain(root: dict[str, Any], line: ErrorDetails) -> str:
     fix = "Correct it."
     if schema.get("default") is not None:
         fix = f"Correct it, or leave it out for the default, {short_repr(schema['default'])}."
-    allowed = f"must be {_allowed(root, schema)}" if schema else line["msg"]
+    allowed = f"must be {allowed_values(root, schema)}" if schema else line["msg"]
     return f"{path}={value}: {allowed}. {fix}"
 
 
@@ -107,10 +110,10 @@ def _resolved(root: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
     return schema
 
 
-def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
+def allowed_values(root: dict[str, Any], schema: dict[str, Any]) -> str:
     """What a JSON Schema allows, in words."""
     if "anyOf" in schema:
-        return " or ".join(_allowed(root, option) for option in schema["anyOf"])
+        return " or ".join(allowed_values(root, option) for option in schema["anyOf"])
     if "const" in schema or "enum" in schema:
         return " or ".join(repr(value) for value in schema.get("enum", [schema.get("const")]))
     schema = _resolved(root, schema)
@@ -119,8 +122,8 @@ def _allowed(root: dict[str, Any], schema: dict[str, Any]) -> str:
             return "an integer" + _interval(schema)
         case "number":
             return "a finite number" + _interval(schema)
-        case "string" if "pattern" in schema and "description" in schema:
-            return str(schema["description"])
+        case "string" if WORDED in schema:
+            return str(schema[WORDED])
         case "string":
             return "a string" + _length(schema, "Length", "characters")
         case "array":

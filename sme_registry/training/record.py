@@ -45,40 +45,66 @@ class RunRecord(StrictModel):
 
     A step of a team is one step of all its agents, so the algorithm learns from `agents` times as
     many transitions.
+
+    Attributes:
+      schema_version: version of the record's format.
+      status: whether it is finished; "running" also after a kill.
+      failure: why it failed.
+      spec: the task; of a life in a stream that of its first phase.
+      spec_digest: the task's digest.
+      stream: the stream that the agent lives in; null for a single task.
+      stream_digest: the stream's digest; empty for a single task.
+      task: what the task's file calls it.
+      algorithm: its name, as in `sme train`.
+      hyperparameters: those that differ from the algorithm's defaults. `sme train` sets some for
+        several environments and for teams; see `hyperparameters.for_lanes`.
+      device: of agents in JAX: "cpu", "gpu" or "tpu".
+      seed: of training.
+      action_range: of the environment that the agent acts in.
+      num_envs: environments that step together.
+      agents: of a team; 1 for a single agent.
+      independent: whether it is a team with one model for each agent.
+      steps: requested, of the environment, over all environments.
+      steps_done: at the last checkpoint, and at the end. On-policy algorithms finish their last
+        rollout, so it can exceed `steps`.
+      checkpoint_every: steps between checkpoints.
+      episodes: finished ones, which episodes.csv lists.
+      sessions: 1 plus the number of times the run was resumed.
+      wall_seconds: over all sessions, without evaluation.
+      steps_per_second: environment steps, over all sessions.
+      protocol: of the final evaluation.
+      protocol_digest: the protocol's digest.
+      versions: of Python and the packages that the numbers depend on.
     """
 
     schema_version: Literal[1] = 1
-    status: Literal["running", "finished", "failed"]  # "running" also after a kill
-    failure: str = ""  # why it failed
-    spec: SMESpec  # the task; of a life in a stream that of its first phase
+    status: Literal["running", "finished", "failed"]
+    failure: str = ""
+    spec: SMESpec
     spec_digest: str
     stream: StreamSpec | None = None
     stream_digest: str = ""
-    task: str = ""  # what the task's file calls it
+    task: str = ""
     algorithm: str
-    # Those that differ from the algorithm's defaults. `sme train` sets some for several
-    # environments and for teams; see `hyperparameters.for_lanes`.
     hyperparameters: Annotated[dict[str, JsonValue], BeforeValidator(_from_text)] = Field(
         default_factory=dict
     )
-    device: str = ""  # of agents in JAX: "cpu", "gpu" or "tpu"
+    device: str = ""
     seed: Integer
     action_range: Literal["unit", "symmetric"]
     num_envs: Integer
     agents: Integer = 1
-    independent: bool = False  # a team with one model for each agent
-    steps: Integer  # requested, of the environment, over all environments
-    # At the last checkpoint, and at the end. On-policy algorithms finish their last rollout, so it
-    # can exceed `steps`.
+    independent: bool = False
+    steps: Integer
     steps_done: Integer = 0
-    checkpoint_every: Integer  # steps
-    episodes: Integer = 0  # finished ones, which episodes.csv lists
-    sessions: Integer = 1  # 1 plus the number of times the run was resumed
-    wall_seconds: Annotated[Real, Field(ge=0)] = 0.0  # over all sessions, without evaluation
+    checkpoint_every: Integer
+    episodes: Integer = 0
+    sessions: Integer = 1
+    wall_seconds: Annotated[Real, Field(ge=0)] = 0.0
     steps_per_second: Annotated[Real, Field(ge=0)] = 0.0
-    protocol: EvaluationProtocol  # of the final evaluation
+    protocol: EvaluationProtocol
     protocol_digest: str
-    versions: dict[str, str]  # of Python and the packages that the numbers depend on
+    versions: dict[str, str]
 
     @model_serializer(mode="wrap")
     def _omit_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import pytest
 
 from sme_registry import SMESpec, evaluate
 from sme_registry.diagnosis import Diagnosis, diagnose, load_policy, render
-from sme_registry.diagnosis.document import POLICY
 from sme_registry.diagnosis.figures import draw
+from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.questions import EXTENDED_THRESHOLDS, THRESHOLDS
 from sme_registry.evaluation.references import reference_policy
 from tests.diagnosis.policies import (

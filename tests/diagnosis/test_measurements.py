@@ -10,7 +10,7 @@ import pytest
 
 from sme_registry import evaluate, materialize
 from sme_registry.diagnosis import measure, rollouts
-from sme_registry.diagnosis.document import POLICY
+from sme_registry.diagnosis.measurements import POLICY
 from tests.diagnosis.policies import (
     DEEP,
     SPEC,

@@ -12,13 +12,8 @@ from jinja2 import UndefinedError
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Verdict, render, verdicts
-from sme_registry.diagnosis.document import (
-    CapacityProbe,
-    Comparison,
-    Difference,
-    Measurements,
-    Training,
-)
+from sme_registry.diagnosis.document import Comparison, Difference
+from sme_registry.diagnosis.measurements import CapacityProbe, Measurements, Training
 from tests.diagnosis.policies import EXTENDED, SPEC, diagnosis_of, network, printed, shrunk
 
 DECLARED = {

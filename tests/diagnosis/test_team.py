@@ -19,7 +19,7 @@ from sme_registry.diagnosis import (
     load_policy,
     load_run,
 )
-from sme_registry.diagnosis.document import POLICY
+from sme_registry.diagnosis.measurements import POLICY
 from sme_registry.diagnosis.team_questions import TEAM_QUESTIONS, TEAM_THRESHOLDS
 from sme_registry.diagnosis.team_render import headline, markdown, team_sentence, terminal
 from sme_registry.errors import OptionError, UnknownNameError

@@ -9,7 +9,8 @@ import pytest
 
 from sme_registry import SMESpec
 from sme_registry.diagnosis import Subject, Verdict, diagnose, load_policy, render, verdicts
-from sme_registry.diagnosis.document import CapacityProbe, Comparison, Difference
+from sme_registry.diagnosis.document import Comparison, Difference
+from sme_registry.diagnosis.measurements import CapacityProbe
 from sme_registry.diagnosis.subject import Log
 from sme_registry.diagnosis.where import WHERE
 from sme_registry.diagnosis.why import WHY

@@ -65,7 +65,7 @@ CHECKS = {
         and isinstance(value, bool) == (limit == "boolean")
     ),
 }
-NOTES = {"title", "description", "default", "$defs"}
+NOTES = {"$comment", "title", "description", "default", "$defs"}
 
 
 def follow(schema, value, definitions):

@@ -161,6 +161,7 @@ class StreamReport(ReportFile):
     """An agent in a stream: what it retains after each visit, and what its life cost.
 
     Attributes:
+      schema_version: version of the report's format.
       policy: the agent's name.
       action_range: of its actions, "unit" or "symmetric".
       stream: the stream.

@@ -57,6 +57,13 @@ class Timing(StrictModel):
 
     Of a lane of a program: the program's CPU seconds (on another device, its wall time) divided
     by its cells. `environment` is 0 there: environment and learner are one program.
+
+    Attributes:
+      total: of the whole run.
+      training: of the learner.
+      environment: of the environment's steps.
+      evaluation: of the evaluations.
+      steps_per_second: environment steps for each of these seconds without evaluations.
     """
 
     total: Real
