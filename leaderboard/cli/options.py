@@ -188,9 +188,12 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
     """The policy of each instance, by its name, which replaces `{name}`.
 
     Raises:
-      OptionError: there are several instances, and all would have the same policy.
+      OptionError: there are several instances, and all would have the same policy, which is none
+        of the references that need no task.
     """
-    if len(names) > 1 and "{name}" not in policy:
+    from sme_registry.sealed import WITHOUT_TASK
+
+    if len(names) > 1 and "{name}" not in policy and policy not in WITHOUT_TASK:
         raise OptionError(
             f"policy={policy!r}: must contain {{name}}, the name of the instance, such as "
             f"{next(iter(names))}: each task has a policy of its own."

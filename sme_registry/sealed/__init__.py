@@ -12,7 +12,13 @@
 
 from sme_registry.sealed.connection import PATIENCE
 from sme_registry.sealed.envs import SealedEnv, SealedVectorEnv, make, make_vec
-from sme_registry.sealed.instance import Instance, actions_in, answer, prepare_policy
+from sme_registry.sealed.instance import (
+    WITHOUT_TASK,
+    Instance,
+    actions_in,
+    answer,
+    prepare_policy,
+)
 from sme_registry.sealed.signing import Signer, Statement
 from sme_registry.sealed.ticket import (
     InstanceStatus,
@@ -38,6 +44,7 @@ from sme_registry.sealed.wire import (
 
 __all__ = [
     "PATIENCE",
+    "WITHOUT_TASK",
     "Begun",
     "Instance",
     "InstanceStatus",

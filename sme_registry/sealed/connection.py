@@ -94,7 +94,7 @@ class Connection:
                     f"{self._address.url}: gives no answer: {reason:.500} Check the URL and try "
                     "again: no step is lost, or taken twice.",
                 )
-            _log.warning("%s: %.200s Trying again.", self._address.url, reason)
+            _log.warning("%s: no answer, trying again: %.200s", self._address.url, reason)
             # Clients that lost the same server do not all come back at the same moment.
             _sleep(wait * random.uniform(0.5, 1.0))
             wait = min(2 * wait, _LONGEST_WAIT)

@@ -32,7 +32,8 @@ TicketLike = Ticket | str | os.PathLike[str]
 _Document = TypeVar("_Document", bound=StrictModel)
 _MAX_CHALLENGE = 2**31
 _MAX_STATUS = 2**22
-_WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
+WITHOUT_TASK = ("constant", "constant_half", "random", "uniform_random")
+"""Reference policies that are the same on each task."""
 
 
 def as_ticket(ticket: TicketLike) -> Ticket:
@@ -268,7 +269,7 @@ def prepare_policy(
       PolicyError: the policy cannot be loaded, or is a reference that depends on the hidden task.
       UnknownNameError, OptionError, MissingDependencyError: see `as_policy`.
     """
-    if isinstance(policy, str) and policy in POLICIES and policy not in _WITHOUT_TASK:
+    if isinstance(policy, str) and policy in POLICIES and policy not in WITHOUT_TASK:
         raise PolicyError(
             f"policy={policy!r}: follows from the task, which is hidden. Give a policy of your "
             "own, constant_half or uniform_random."

@@ -118,6 +118,15 @@ def test_a_policy_is_asked_and_stays_at_home(season: Path) -> None:
     np.testing.assert_allclose(actions, expected, atol=1e-6)
 
 
+def test_a_constant_is_entered_for_all_instances_at_once(season: Path) -> None:
+    good("enter", "board", season, "constant_half", *ENTER)
+    with Store.open("board", read_only=True) as store:
+        [row] = store.entrants(read_season(season).digest)
+        for answer in store.entry_of(row).entry.answers:
+            assert answer is not None
+            assert np.unique(unpack_table(store.objects.read(answer.sha256), 1)).tolist() == [0.5]
+
+
 def challenge(season: Path, name: str) -> np.ndarray:
     return unpack_table((season / "challenges" / f"{name}.npy").read_bytes(), 4)
 
