@@ -15,6 +15,7 @@ from leaderboard.scoring.aggregation import class_mean, groups_of, never_listed
 from leaderboard.scoring.ranking import REFERENCES
 from leaderboard.store import EntryRow
 from sme_registry import SMESpec
+from sme_registry.spec import Setting
 
 _INSTANCES = 100  # of a class, on the page of the suite
 SHORT = 16  # hex digits of an id in an address: too many for a deliberate collision
@@ -62,22 +63,27 @@ class TaskRow:
 
 def task_rows(document: BoardDocument) -> list[TaskRow]:
     """The classes of a board's suite."""
-    defaults = SMESpec().to_dict()
     rows = []
     for member in document.suite.classes:
-        fields = member.setting.to_dict().items()
-        changed = [f"{k}={json.dumps(v)}" for k, v in fields if v != defaults.get(k)]
         count, listed = len(member.seeds), member.instances[:_INSTANCES]
         rows.append(
             TaskRow(
                 name=member.name,
-                setting=", ".join(changed) or "the defaults",
+                setting=setting_text(member.setting),
                 runs=count * document.runs_on_each(count),
                 instances=[(spec.seed, spec.digest) for spec in listed],
                 more=count - len(listed),
             )
         )
     return rows
+
+
+def setting_text(setting: Setting) -> str:
+    """The fields of a setting that differ from a spec's defaults."""
+    defaults = SMESpec().to_dict()
+    fields = setting.to_dict().items()
+    changed = [f"{k}={json.dumps(v)}" for k, v in fields if v != defaults.get(k)]
+    return ", ".join(changed) or "the defaults"
 
 
 RunRow = tuple[str, Run | None, RunScore | None]

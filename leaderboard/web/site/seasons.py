@@ -16,6 +16,7 @@ from leaderboard.scoring.ranking import RankedRow
 from leaderboard.scoring.season import OfKey, by_key, counting, season_rankings
 from leaderboard.store import SealedRow, SeasonRow, Store
 from leaderboard.web.site import charts
+from leaderboard.web.site.rows import setting_text
 
 _CURVE_POINTS = 40
 
@@ -42,6 +43,7 @@ class SeasonPage:
     """All that the page of a season shows.
 
     Attributes:
+      settings: of each class, the fields that differ from a spec's defaults.
       rankings: by declared knowledge, of methods with results.
       keys: how often each key takes part.
       master: 64 hex digits after the reveal; empty before.
@@ -49,6 +51,7 @@ class SeasonPage:
 
     row: SeasonRow
     season: Season
+    settings: list[str]
     entrants: list[EntrantRow]
     rankings: dict[Knowledge, list[RankedRow]]
     keys: dict[str, OfKey]
@@ -80,6 +83,7 @@ def season_page(store: Store, row: SeasonRow) -> SeasonPage:
     return SeasonPage(
         row=row,
         season=season,
+        settings=[setting_text(member.setting) for member in season.classes],
         entrants=entrants,
         rankings=season_rankings(store, season, "wd_regret"),
         keys=by_key(store, season),

@@ -62,6 +62,9 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     assert OFFLINE.commitment in before.words
     assert before.words.count("replaced") == 1
     assert before.words.count("waits for the reveal") == 2
+    [member] = OFFLINE.classes
+    assert f"complexity={member.setting.complexity}" in before.words
+    assert f"{member.data.transitions:,}" in before.words
     assert "What this proves, and what it does not" in before.words
     assert MASTER.raw.hex() not in before.words
     assert "Ranked by" not in before.words
