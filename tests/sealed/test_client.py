@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import pickle
 import socket
+import ssl
 import subprocess
 import sys
 import time
@@ -301,6 +302,31 @@ def refused(_: object) -> None:
     raise ConnectionRefusedError("refused")
 
 
+def test_a_certificate_that_is_not_trusted_is_not_tried_again(server, waits, monkeypatch):
+    def untrusted(_: object) -> None:
+        raise ssl.SSLCertVerificationError("self-signed certificate")
+
+    monkeypatch.setattr(connection.http.client.HTTPConnection, "connect", untrusted)
+    with pytest.raises(SealedError, match=r"unreachable: .*self-signed"):
+        sealed.make(server.url, server.ticket).reset()
+    assert waits == []
+
+
+def test_a_connection_that_the_server_has_closed_is_replaced_at_once(server, waits):
+    hidden = sealed.make(server.url, server.ticket)
+    hidden.reset()
+    server.faults = ["lose request"]
+    hidden.step(np.zeros(2))
+    assert waits == []
+
+
+def test_an_answer_that_is_too_long_is_not_read_to_its_end(server, monkeypatch):
+    monkeypatch.setattr(connection, "_JSON_BYTES", 10)
+    path = sealed.ticket_path(server.ticket.season, server.ticket.ticket)
+    with pytest.raises(SealedError, match=r"wire: .* answered with more than 20 bytes"):
+        connection.Connection(server.url, server.ticket.token).request("GET", path, most=20)
+
+
 def test_a_server_that_stops_is_waited_for(server, waits):
     hidden = sealed.make(server.url, server.ticket)
     hidden.reset()
@@ -309,6 +335,7 @@ def test_a_server_that_stops_is_waited_for(server, waits):
     assert len(waits) == 20
     assert waits[0] <= 0.1
     assert 7.5 <= waits[-1] <= 15.0
+    assert len(set(waits[-5:])) == 5  # clients of one server do not come back together
 
 
 def test_patience_ends(server, waits, monkeypatch):

@@ -126,6 +126,13 @@ def other_header(shape: str) -> bytes:
     return data.replace(f"({4}, {A})".encode(), shape.encode())
 
 
+def long_header() -> bytes:
+    """Valid, but longer than `table_bytes` allows for."""
+    header, data = pack_table(random(4, A)).split(b"\n", 1)
+    header = header[10:].ljust(2000) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
+
+
 @pytest.mark.parametrize(
     "data",
     [
@@ -137,6 +144,7 @@ def other_header(shape: str) -> bytes:
         saved(np.array([{"code": 1}, None], dtype=object)),
         pack_table(random(4, A)).replace(b"\x01\x00", b"\x02\x00", 1),
         other_header("(-4, 2)"),
+        long_header(),
     ],
 )
 def test_nothing_but_a_table_of_float32_is_read(data: bytes):
