@@ -113,6 +113,18 @@ def _huge(group: h5py.Group, secret: Path) -> None:
     group.create_dataset("observations", shape=(10**11, 4), dtype="f4", chunks=(1000, 4))
 
 
+def _chunked(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=np.zeros((2, 4), "f4"), chunks=(2, 4))
+
+
+def _unwritten(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", shape=(2, 4), dtype="f4")
+
+
+def _references(group: h5py.Group, secret: Path) -> None:
+    group.create_dataset("observations", data=[group.ref, group.ref], dtype=h5py.ref_dtype)
+
+
 def _texts(group: h5py.Group, secret: Path) -> None:
     group.create_dataset("observations", shape=(2,), dtype=h5py.string_dtype())
 
@@ -140,6 +152,9 @@ def _plain(group: h5py.Group, secret: Path) -> None:
     [
         (_external, "observations: float32"),
         (_huge, "observations: float32"),
+        (_chunked, "observations: float32"),
+        (_unwritten, "observations: float32"),
+        (_references, "observations: object"),
         (_texts, "observations: object"),
         (_unaligned, "observations are float32"),
         (_doubles, "observations are float64"),

@@ -162,6 +162,7 @@ def test_lanes_that_do_not_divide_the_budget_leave_a_rest(played: Played) -> Non
     played.tickets.step(played.number, played.token, 0, body)
     body = wire.pack_request(2, np.zeros((48, 1)))
     refused("budget_spent", played.tickets.step, played.number, played.token, 0, body)
+    assert played.tickets.status(played.number, played.token).instances[0].phase == "answering"
 
 
 @pytest.mark.parametrize("lanes", [0, 65, 2**40])
