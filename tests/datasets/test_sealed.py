@@ -46,6 +46,15 @@ def test_it_holds_what_the_agent_saw(dataset: SealedDataset) -> None:
     )
 
 
+def test_an_episode_that_ends_at_the_horizon_is_truncated_also_where_it_terminates() -> None:
+    spec = SPEC.model_copy(update={"horizon": 3, "D": 0.5})
+    short = SealedDataset.collect(RECIPE.model_copy(update={"spec": spec}))
+    ends = np.flatnonzero(short.terminations | short.truncations)[:-1]
+    lengths = np.diff(ends, prepend=-1)
+    np.testing.assert_array_equal(short.truncations[ends], lengths == 3)
+    assert (short.terminations & short.truncations)[ends].any()
+
+
 def test_it_is_read_back_bit_for_bit(dataset: SealedDataset, tmp_path: Path) -> None:
     path = dataset.write(ID, tmp_path)
     assert SealedDataset.read(path).digest == dataset.digest

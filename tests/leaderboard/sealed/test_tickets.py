@@ -318,12 +318,23 @@ def test_a_deadline_ends_everything(played: Played, monkeypatch: pytest.MonkeyPa
     played.step(1)
     assert played.tickets.over() == []
     clock = tickets_module.time.time
-    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
-    refused("ticket_ended", played.step, 2)
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 23.9 * 3600)
+    played.step(2)
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 24.1 * 3600)
+    refused("ticket_ended", played.step, 3)
     refused("ticket_ended", played.start)
     refused("ticket_ended", played.finish)
     refused("ticket_ended", played.answer, np.full((ROWS, 1), 0.5))
     assert played.tickets.status(played.number, played.token).phase == "ended"
+
+
+def test_a_ticket_is_over_when_its_last_instance_is_answered(played: Played) -> None:
+    for instance, over in ((0, []), (1, [played.number])):
+        played.finish(instance)
+        played.answer(np.full((ROWS, 1), 0.5), instance)
+        assert played.tickets.over() == over
+        phase = played.tickets.status(played.number, played.token).phase
+        assert phase == ("ended" if over else "running")
 
 
 def test_an_altered_request_holds_up_no_other_ticket(
