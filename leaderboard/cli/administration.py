@@ -192,12 +192,24 @@ def site(
     out_folder: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder of the pages; BOARD/site by default.")
     ] = None,
+    explorers: Annotated[
+        bool,
+        typer.Option(
+            "--explorers",
+            help="Also an explorer (`sme explore`) of each policy, in about a second each.",
+        ),
+    ] = False,
 ) -> None:
     """Write the board as static pages: open index.html, or copy them to any web host.
+
+    With --explorers, the page of a submission links to a page for each of its policies, which shows
+    its regret in any state. Files that an explorer does not understand show the task alone.
 
     Examples:
 
       sme-leaderboard site board --out public
+
+      sme-leaderboard site board --explorers
     """
     from leaderboard.web.site import write_site
 
@@ -205,7 +217,7 @@ def site(
     with open_board(board) as store:
         total = len(store.entries())
         with Progress("writing", total, console=err(), unit="pages") as progress:
-            index = write_site(store, target, progress=progress.update_of)
+            index = write_site(store, target, progress=progress.update_of, explorers=explorers)
     out().print(str(index.resolve()), soft_wrap=True, markup=False)
 
 

@@ -11,6 +11,7 @@ from sme_registry.cli.certify import certify
 from sme_registry.cli.demo import demo
 from sme_registry.cli.diagnose import diagnose
 from sme_registry.cli.evaluate import evaluate
+from sme_registry.cli.explore import explore
 from sme_registry.cli.list import list_
 from sme_registry.cli.new import new
 from sme_registry.cli.show import show
@@ -42,7 +43,7 @@ app = application(
     """,
 )
 app.command("list")(list_)
-for _command in (show, new, validate, certify, evaluate, train, diagnose, demo):
+for _command in (show, new, validate, certify, evaluate, train, diagnose, explore, demo):
     app.command()(_command)
 app.add_typer(suite.app, name="suite")
 app.add_typer(study.app, name="study")

@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from sme_registry.cli.arguments import Force
+from sme_registry.cli.files import write_run_explorer
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.io import write_atomically
 from sme_registry.terminal import Table, err, out
@@ -44,7 +45,7 @@ def demo(
     """Train TD3 on SME/Default-v1, show its regret falling, evaluate it in and out of distribution.
 
     Takes less than a minute on one core, with networks of two layers of 64 units. --full takes a
-    few minutes. Writes figures and report.md, and lists them.
+    few minutes. Writes figures, report.md and explorer.html, and lists them.
 
     Examples:
 
@@ -81,14 +82,21 @@ def demo(
     stages = regret_by_stage(result)
     out().print(_stages_table(stages))
     out().print(result.report.table())
-    report = write_atomically(out_folder / REPORT, _report(result, stages))
+    explorer = write_run_explorer(out_folder)
+    report = write_atomically(out_folder / REPORT, _report(result, stages, explorer))
     assert isinstance(result.report, EvaluationReport)  # of a task, not of a stream
     within = result.report.regions[0]
     out().print(
         f"\nWithin distribution: r̃ = {within.similarity:.3f}, normalised regret "
         f"{within.normalised_regret:.3f} (0 is optimal, 1 the constant policy)."
     )
-    for path in (report, *result.figures, result.model_path, out_folder / "episodes.csv"):
+    for path in (
+        report,
+        *explorer,
+        *result.figures,
+        result.model_path,
+        out_folder / "episodes.csv",
+    ):
         out().print(f"  {escape(str(path))}", soft_wrap=True)
 
 
@@ -112,7 +120,11 @@ def _stages_table(stages: list[tuple[int, int, float]]) -> Table:
     return Table("Mean regret during training (0 is optimal)", columns, rows)
 
 
-def _report(result: TrainingResult, stages: list[tuple[int, int, float]]) -> str:
+def _report(
+    result: TrainingResult, stages: list[tuple[int, int, float]], explorer: list[Path]
+) -> str:
     templates = environment(Path(__file__).parent / "templates", autoescape=False)
-    text = templates.get_template("demo.md.jinja").render(task=TASK, result=result, stages=stages)
+    text = templates.get_template("demo.md.jinja").render(
+        task=TASK, result=result, stages=stages, explorer=[path.name for path in explorer]
+    )
     return f"{text}\n"

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from sme_registry.errors import OptionError
+from sme_registry.errors import OptionError, SMEError
 from sme_registry.io import install_command, is_installed, refuse_existing
 from sme_registry.terminal import Table, err, out, print_json
 
@@ -34,6 +34,22 @@ def can_draw() -> bool:
         soft_wrap=True,
     )
     return False
+
+
+def write_run_explorer(folder: Path) -> list[Path]:
+    """Write the explorer of a finished run on one task, where a page can show it.
+
+    Where it cannot, that is printed: the run is complete without.
+    """
+    from sme_registry import explorer
+    from sme_registry.diagnosis import load_run
+
+    try:
+        path, report = folder / explorer.FILE, explorer.run_report(folder)
+        return [explorer.write_explorer(path, load_run(folder), report=report)]
+    except SMEError as error:
+        err().print(f"no explorer: {escape(str(error))}", soft_wrap=True)
+        return []
 
 
 def print_training(

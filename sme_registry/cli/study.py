@@ -193,6 +193,10 @@ def report(
         str,
         typer.Option("--format", metavar="FORMATS", help="Any of these, separated by commas."),
     ] = "html,png,pdf,csv,latex",
+    explorers: Annotated[
+        bool,
+        typer.Option("--explorers", help="Also an explorer (`sme explore`) of each kept model."),
+    ] = False,
 ) -> None:
     """Report which property of the task breaks an algorithm, and how certain that is.
 
@@ -202,19 +206,22 @@ def report(
     LaTeX tables, by default to FOLDER/report. It uses the cells finished so far, so it may be run
     during the study.
 
-    Maps of tasks with two state channels need the models kept by `sme study run --keep-models`.
-    Loading a model can run code: use only models whose author you trust.
+    Maps of tasks with two state channels, and --explorers, need the models kept by `sme study run
+    --keep-models`. The page links to each explorer, a file of 60 kB or more. Loading a model can
+    run code: use only models whose author you trust.
 
     Examples:
 
       sme study report runs/smoke
 
       sme study report runs/all --out paper/study --format pdf,latex
+
+      sme study report runs/smoke --explorers
     """
     from sme_registry.studies import write_report
 
     chosen = [name.strip() for name in formats.split(",") if name.strip()]
-    files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)))
+    files = write_report(folder, out_folder, tuple(dict.fromkeys(chosen)), explorers=explorers)
     for path in files:
         if path.name == "index.html":
             out().print(escape(str(path)), soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from sme_registry.cli.arguments import Force, Json, Out, Protocol, changed, changes
-from sme_registry.cli.files import print_training
+from sme_registry.cli.files import print_training, write_run_explorer
 from sme_registry.cli.study_plan import Jobs
 from sme_registry.cli.train_suite import refuse_fields, refuse_without_suite, train_suite
 from sme_registry.errors import OptionError
@@ -112,8 +112,8 @@ def train(
     The algorithm is one of Stable-Baselines3, or with --agents jax the same in JAX. The former runs
     on one CPU thread, which is fastest for networks of this size. On-policy algorithms finish their
     last rollout. The output folder, by default runs/TASK-ALGORITHM-seedN, contains episodes.csv,
-    checkpoint.zip, model.zip, run.json, evaluation.json, figures, and logs that `tensorboard
-    --logdir runs` shows.
+    checkpoint.zip, model.zip, run.json, evaluation.json, figures, explorer.html (`sme explore`),
+    and logs that `tensorboard --logdir runs` shows.
 
     --set changes a field of the task (`sme show TASK`) or a hyperparameter, whose names and
     defaults are those of the algorithm's class in Stable-Baselines3. Values are JSON or text; dots
@@ -237,6 +237,8 @@ def train(
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(how_to_continue(out_folder)) from None
+    if result.record.stream is None:
+        write_run_explorer(out_folder)
     print_training(result, out_folder, json=json)
 
 

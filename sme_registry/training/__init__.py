@@ -23,12 +23,13 @@ from sme_registry.training.hyperparameters import (
 )
 from sme_registry.training.numpy_policy import numpy_policy
 from sme_registry.training.record import RunRecord
-from sme_registry.training.run import DEFAULT_STEPS, TrainingResult, train
+from sme_registry.training.run import DEFAULT_STEPS, EXPLORER, TrainingResult, train
 from sme_registry.training.snapshots import model_of_cell
 
 __all__ = [
     "ALGORITHMS",
     "DEFAULT_STEPS",
+    "EXPLORER",
     "Episode",
     "RunRecord",
     "TrainingResult",

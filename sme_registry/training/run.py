@@ -65,9 +65,10 @@ from sme_registry.training.record import MODEL, MODELS, RECORD, TENSORBOARD, Run
 from sme_registry.training.snapshots import FOLDER as SNAPSHOTS
 
 REPORT = "report.md"  # written by `sme demo`
+EXPLORER = "explorer.html"  # written by `sme train` and `sme explore`
 _FILES = (
     RECORD, episode_files.FILE, checkpoint.FILE, MODEL, MODELS, SNAPSHOTS, *reports.FILES,
-    REPORT, TENSORBOARD,
+    REPORT, EXPLORER, TENSORBOARD,
 )  # fmt: skip
 
 _LOCK = ".lock"  # held by the process that trains; the file stays

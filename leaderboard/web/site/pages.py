@@ -5,6 +5,7 @@
     compare.html, board-data.js         comparison of chosen entries, drawn by static/board.js
     log.html, log-<n>.html              the log, `LOG_ROWS` entries a page, and how to verify it
     method.html, suite.html             the formulas; the tasks
+    explorers/<64 hex>-<n>.html         on request, the explorer of run n of a scored submission
     seasons.html, seasons/<id>.html     sealed seasons, where the board has any
     suite.json, definition.json         the suite, to train on it, and the board's definition
     board.json, .csv, .tex              the board by N₀ as data; so are ood_regret.*, ood_decay.*
@@ -33,6 +34,7 @@ from leaderboard.store import EntryRow, SeasonRow, Store
 from leaderboard.web.site import charts, rows
 from leaderboard.web.site.rows import SHORT, TABS
 from leaderboard.web.site.seasons import season_page
+from sme_registry import SMESpec
 from sme_registry.io import to_json
 from sme_registry.spec import StrictModel
 
@@ -63,10 +65,15 @@ class Pages:
       store: an open store; it is only read.
       address: the URL at which the board accepts submissions; empty if it is served at an unknown
         URL; None for a copy that accepts none.
+      explorers: whether there is an explorer of each policy. They take a second each, so a server
+        has none.
     """
 
-    def __init__(self, store: Store, address: str | None = None) -> None:
+    def __init__(
+        self, store: Store, address: str | None = None, *, explorers: bool = False
+    ) -> None:
         self.store = store
+        self._explorers = explorers
         self._address = address
         self.document = store.document
         self._latest: tuple[str, tuple[SignedSubmission, Result | None]] | None = None
@@ -189,6 +196,7 @@ class Pages:
             agents=[] if result is None else rows.agent_rows(self.document, submission, result),
             regions=charts.region_labels(edges),
             runs=rows.run_rows(submission, result, self._class_of),
+            explored=self._explored(id),
         )
 
     def compare(self) -> str:
@@ -293,7 +301,7 @@ class Pages:
         """
         folder, _, name = path.rpartition("/")
         if folder == "static":
-            return _static().get(name)
+            return self._static.get(name)
         if path in _DEFINITIONS:  # without scores, and needed to train for the board
             return to_json(_DEFINITIONS[path](self.document).to_dict()).encode()
         if self.preparing and (path.endswith(".html") or folder == "submissions"):
@@ -301,6 +309,8 @@ class Pages:
         self.entries  # noqa: B018  raises if the board may not publish
         if folder in ("submissions", "results"):
             return self._document(folder, name)
+        if folder == "explorers":
+            return self._explorer(name)
         if folder == "seasons":
             id, _, kind = name.rpartition(".")
             return self.season(id).encode() if kind == "html" and id in self._seasons else None
@@ -309,13 +319,14 @@ class Pages:
 
     def paths(self) -> Iterator[str]:
         """The paths of all files of the site; `index.html` last, so that its links work."""
-        yield from (f"static/{name}" for name in _static())
+        yield from (f"static/{name}" for name in self._static)
         yield from _DEFINITIONS
         for entry in self.entries:
             digits = hex_of(entry.id)
             yield f"submissions/{digits}.json"
             if entry.scores is not None or entry.code:
                 yield f"results/{digits}.json"
+            yield from (f"explorers/{digits}-{n}.html" for n in self._explored(entry.id))
             yield f"submissions/{digits}.html"
         yield from (f"seasons/{id}.html" for id in self._seasons)
         yield from self._top
@@ -377,6 +388,50 @@ class Pages:
         if latest is None or latest[0] != id:
             latest = self._latest = id, (self.store.submission(id), self.store.result(id))
         return latest[1]
+
+    def _explored(self, id: str) -> list[int]:
+        """The runs of a submission that have an explorer."""
+        if not self._explorers or self._by_id[id].status != "scored":
+            return []
+        signed, _ = self._documents(id)
+        runs = enumerate(signed.submission.runs)
+        return [n for n, run in runs if run.artefact is not None and run.spec in self._shown]
+
+    def _explorer(self, name: str) -> bytes | None:
+        """The explorer of a run, by its file's name."""
+        digits, _, number = name.removesuffix(".html").rpartition("-")
+        id = f"sha256:{digits}"
+        if id not in self._by_id or number not in map(str, self._explored(id)):
+            return None
+        from leaderboard.web.site import explorers
+
+        submission = self._documents(id)[0].submission
+        run, method = submission.runs[int(number)], submission.method
+        assert run.artefact is not None  # it is explored
+        data = self.store.objects.read(run.artefact.sha256)
+        title = f"{method.name} {method.version}"
+        return explorers.explorer(title, data, self._shown[run.spec]).encode()
+
+    @cached_property
+    def _shown(self) -> dict[str, SMESpec]:
+        """The instances that an explorer can show, by digest."""
+        from leaderboard.web.site import explorers
+
+        instances = self.document.instances.items()
+        return {
+            digest: spec.named(f"{name}, instance {digest[7:19]}")
+            for digest, (name, spec) in instances
+            if explorers.can_show(spec)
+        }
+
+    @cached_property
+    def _static(self) -> dict[str, bytes]:
+        """The files in static/, by name."""
+        if not self._explorers:
+            return _static()
+        from leaderboard.web.site import explorers
+
+        return {**_static(), **{name: text.encode() for name, text in explorers.STATIC.items()}}
 
     @cached_property
     def _seasons(self) -> dict[str, SeasonRow]:

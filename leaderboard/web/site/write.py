@@ -17,7 +17,11 @@ _WRITERS = 8  # threads that wait for the disk
 
 
 def write_site(
-    store: Store, out: str | Path, progress: Callable[[int, int], None] | None = None
+    store: Store,
+    out: str | Path,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    explorers: bool = False,
 ) -> Path:
     """Write the board's pages into a folder. Each file is written completely or not at all.
 
@@ -27,6 +31,8 @@ def write_site(
       store: an open store; it is only read.
       out: the folder; created if it is missing.
       progress: called with the number of files written and of all files.
+      explorers: whether to write an explorer of each run of each scored submission, of 60 kB or
+        more and in a second each.
 
     Returns:
       The path of `index.html`.
@@ -38,7 +44,7 @@ def write_site(
     """
     out = Path(out)
     _refuse_board(out)
-    pages = Pages(store)
+    pages = Pages(store, explorers=explorers)
     paths = list(pages.paths())
 
     def write(path: str, content: bytes) -> None:

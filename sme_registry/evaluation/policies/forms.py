@@ -194,7 +194,7 @@ def _prepare(
         network = sb3.torch_policy(policy)
         hidden = None if network is None else modules.hidden_layers(act, network)
     elif modules.is_module(policy):
-        act = modules.module_predictor(policy)
+        act = modules.ModulePredictor(policy)
         hidden = modules.hidden_layers(act, policy)
     elif isinstance(policy, Perceptron | OfflinePolicy):
         hidden = policy.hidden

@@ -20,11 +20,15 @@ def is_module(policy: Any) -> bool:
     return nn is not None and isinstance(policy, nn.Module)
 
 
-def module_predictor(module: Any) -> Callable[[Observation], Any]:
+class ModulePredictor:
     """A module's actions, in evaluation mode and without gradients."""
-    torch = _torch()
 
-    def act(observations: Observation) -> Any:
+    def __init__(self, module: Any) -> None:
+        self.module = module
+
+    def __call__(self, observations: Observation) -> Any:
+        """Actions `[B, A]`, a tensor; PolicyError if the module returns anything else."""
+        torch, module = _torch(), self.module
         parameter = next(module.parameters(), None)
         x = torch.as_tensor(observations, device=device_of(module))
         with evaluating(module), torch.no_grad():
@@ -38,8 +42,6 @@ def module_predictor(module: Any) -> Callable[[Observation], Any]:
                 "`lambda o: actor(torch.as_tensor(o)).mean` for a distribution."
             )
         return returned
-
-    return act
 
 
 def hidden_layers(

@@ -44,7 +44,7 @@ def load_onnx(path: str | os.PathLike[str], interface: Interface) -> OnnxNetwork
                 f"[batch, {width}] for {interface.description}, the batch of any size. Evaluate it "
                 "on the task it was trained for, and export it with a dynamic batch axis."
             )
-    return OnnxNetwork(session)
+    return OnnxNetwork(session, path)
 
 
 class OnnxNetwork:
@@ -52,10 +52,12 @@ class OnnxNetwork:
 
     Attributes:
       action_range: the range of its actions, if its metadata record one.
+      path: of its file.
     """
 
-    def __init__(self, session: Any) -> None:
+    def __init__(self, session: Any, path: Path) -> None:
         self._session, self._input = session, session.get_inputs()[0].name
+        self.path = path
         recorded = session.get_modelmeta().custom_metadata_map.get(ACTION_RANGE)
         self.action_range = recorded if recorded in ACTION_RANGES else None
 

@@ -21,6 +21,7 @@ from sme_registry.spec.study import in_jax
 from sme_registry.studies.engine.status import run_label
 from sme_registry.studies.report.analysis import Analysis
 from sme_registry.studies.report.classes import AXES, SEVERAL
+from sme_registry.studies.report.explorers import Explorer
 from sme_registry.studies.report.figures import Picture
 from sme_registry.studies.report.findings import Findings
 from sme_registry.studies.report.text import TextTable
@@ -42,6 +43,7 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "learning": ("Learning", ("learning-curves",)),
     "streams": ("Lives in streams", ("stream-",)),
+    "explorers": ("Explorers", ()),
     "absent": ("Figures that could not be drawn", ()),
     "tables": ("Tables", ()),
     "origin": ("Origin of the numbers", ()),
@@ -55,6 +57,7 @@ def page(
     figures: Sequence[Picture],
     absent: Sequence[str],
     tables: Sequence[TextTable],
+    explorers: Sequence[Explorer] = (),
 ) -> str:
     """The whole page; `absent` has a sentence for each figure that could not be drawn."""
     folder = Path(__file__).parent
@@ -72,6 +75,7 @@ def page(
     required |= {"offline"} if findings.offline else set()
     required |= {"streams"} if findings.streams else set()
     required |= {"absent"} if absent else set()
+    required |= {"explorers"} if explorers else set()
     offline = [table for table in tables if table.name.startswith("offline")]
     return templates.get_template("page.html.jinja").render(
         file=analysis.file,
@@ -93,6 +97,7 @@ def page(
         figures=by_section,
         tables={"offline": offline, "tables": [t for t in tables if t not in offline]},
         absent=absent,
+        explorers=explorers,
         origin=_origin(analysis),
         missing=_missing(analysis),
         max_missing=_MAX_MISSING,

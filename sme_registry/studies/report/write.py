@@ -5,6 +5,7 @@
     REPORT/figures/*.png .pdf   the figures, at the width of a printed page
     REPORT/tables/*.csv         every number
     REPORT/tables/*.tex         the tables of a paper
+    REPORT/explorers/*.html     on request, a page for each model that the study kept
 
 The same results give the same files. Other files of an earlier report are kept.
 """
@@ -20,6 +21,7 @@ from sme_registry.io import refuse_unwritable, to_json, write_atomically
 from sme_registry.studies.engine.ledger import REPORT, Ledger
 from sme_registry.studies.engine.status import requested
 from sme_registry.studies.report.analysis import Analysis, analyse
+from sme_registry.studies.report.explorers import Explorer, explorers_of
 from sme_registry.studies.report.exports import csv_tables, text_tables
 from sme_registry.studies.report.figures import draw_figures
 from sme_registry.studies.report.findings import findings
@@ -36,16 +38,19 @@ def write_report(
     folder: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     formats: Sequence[str] = FORMATS,
+    *,
+    explorers: bool = False,
 ) -> list[Path]:
     """Write the report of a study's finished runs.
 
-    The maps of the plane need the models that the study kept, and loading a model can run code of
-    its author. All other files of the folder are read as data.
+    The maps of the plane and the explorers need the models that the study kept, and loading a model
+    can run code of its author. All other files of the folder are read as data.
 
     Args:
       folder: of the study.
       out: the folder to write; None for FOLDER/report.
       formats: of `FORMATS`.
+      explorers: whether to write an explorer of each kept model, to which the page links.
 
     Returns:
       The files written, the page first.
@@ -73,12 +78,16 @@ def write_report(
     failures = {key: failure.error for key, failure in ledger.failures(keys).items()}
     models = {key: path for key in results if (path := ledger.model_path(key)).exists()}
     analysis = analyse(file, results, failures, requested=requested(ledger, file))
-    contents = _contents(analysis, models, formats)
+    pages = explorers_of(ledger, file, models) if explorers else []
+    contents = _contents(analysis, models, formats, pages)
     return [write_atomically(target / name, content) for name, content in contents.items()]
 
 
 def _contents(
-    analysis: Analysis, models: Mapping[str, Path], formats: Sequence[str]
+    analysis: Analysis,
+    models: Mapping[str, Path],
+    formats: Sequence[str],
+    explorers: Sequence[Explorer],
 ) -> dict[str, str | bytes]:
     """The contents of each file, by its name in the report."""
     tables = text_tables(analysis)
@@ -87,7 +96,7 @@ def _contents(
     contents: dict[str, str | bytes] = {}
     if "html" in formats:
         document = findings(analysis)
-        contents["index.html"] = page(analysis, document, figures, absent, tables)
+        contents["index.html"] = page(analysis, document, figures, absent, tables, explorers)
         contents["findings.json"] = to_json(document.to_dict())
     for ending in ("png", "pdf"):
         if ending in formats:
@@ -96,4 +105,4 @@ def _contents(
         contents |= {f"tables/{name}.csv": text for name, text in csv_tables(analysis).items()}
     if "latex" in formats:
         contents |= {f"tables/{table.name}.tex": table.latex() for table in tables}
-    return contents
+    return contents | {each.path: each.content for each in explorers}

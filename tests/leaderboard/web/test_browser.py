@@ -2,9 +2,7 @@
 
 import functools
 import http.server
-import os
 import re
-import shutil
 import threading
 
 import pytest
@@ -14,23 +12,20 @@ from leaderboard import intake
 from leaderboard.documents.board import hex_of
 from leaderboard.scoring.worker import run_scorer
 from leaderboard.web.site import write_site
+from tests.browser import launched, needs_chromium
 from tests.leaderboard.conftest import tiny_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
 
-CHROMIUM = shutil.which("chromium")
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 )
 WIDTHS = {"desktop": 1280, "tablet": 820, "phone": 360}
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
 
 expect.set_options(timeout=30_000)  # Playwright's own 5 s are for machines with nothing else to do
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None and not os.environ.get("CI"), reason="chromium is not installed"
-)
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +59,8 @@ def served(written):
 
 @pytest.fixture(scope="module")
 def chromium():
-    assert CHROMIUM is not None, "CI=true and no chromium: apt-get install chromium"
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = launched(playwright)
         yield browser
         browser.close()
 

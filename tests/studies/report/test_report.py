@@ -245,7 +245,7 @@ def test_a_heat_map_has_one_scale_that_covers_its_values_and_prints_them(
     assert any("colours from 0.90 to 1.00" in axes.get_xlabel() for axes in figures[0].axes)
 
 
-def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):
+def test_maps_and_explorers_show_the_models_that_were_kept(tmp_path: Path):
     pytest.importorskip("stable_baselines3")
     from sme_registry.spec import StudyFile, StudyPlan
     from sme_registry.studies.engine.cell import run_cell
@@ -273,9 +273,14 @@ def test_maps_are_drawn_from_the_models_that_were_kept(tmp_path: Path):
     assert "maps.png" not in {path.name for path in write_report(tmp_path, formats=["png"])}
     ledger.write(result, model.read_bytes())
     assert "maps.png" in {path.name for path in write_report(tmp_path, formats=["png"])}
+    page, *_, explorer = write_report(tmp_path, formats=["html"], explorers=True)
+    assert explorer.parent == page.parent / "explorers"
+    assert f'<a href="explorers/{explorer.name}">PPO on plane, run 0</a>' in page.read_text()
+    assert '"of":"observation"' in explorer.read_text()
     ledger.model_path(result.key).write_bytes(b"no model")
-    page = write_report(tmp_path, formats=["html"])[0].read_text()
-    assert "not a model that Stable-Baselines3 saved" in page
+    text = write_report(tmp_path, formats=["html"], explorers=True)[0].read_text()
+    assert "not a model that Stable-Baselines3 saved" in text
+    assert "explorers/" not in text
 
 
 @pytest.mark.parametrize("formats", [["gif"], []])

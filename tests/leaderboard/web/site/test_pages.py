@@ -670,3 +670,27 @@ def test_a_thousand_entries_take_little_time(board, tmp_path, record_property, m
     print(f"\nboard of 1,000 entries: {board_ms:.0f} ms; site of 1,000 × 30 runs: {site_s:.1f} s")
     assert board_ms < 200
     assert site_s < 20  # on an idle machine half of it; the rest is for a busy one's slower clock
+
+
+def test_explorers_are_written_on_request_and_linked(tmp_path):
+    with Store.open(shutil.copytree(EXAMPLE, tmp_path / "board")) as store:
+        site = write_site(store, tmp_path / "site", explorers=True).parent
+        listed = [*Pages(store, explorers=True).paths()]
+        assert not any("explorer" in path for path in Pages(store).paths())
+        assert Pages(store).read(next(p for p in listed if p.startswith("explorers/"))) is None
+        assert Pages(store, explorers=True).read("explorers/x-0.html") is None
+    pages = {path for path in listed if path.startswith("explorers/")}
+    links = set()
+    for page in (site / "submissions").glob("*.html"):
+        links |= {
+            f"explorers/{name}" for name in re.findall(r"explorers/([^\"]+)", page.read_text())
+        }
+    assert links == pages
+    assert len(pages) > 2
+    known = 0
+    for path in pages:
+        text = (site / path).read_text()
+        known += '"of":"observation"' in text
+        for name in re.findall(r'(?:src|href)="\.\./(static/[^"]+)"', text):
+            assert (site / name).is_file()
+    assert known >= 1

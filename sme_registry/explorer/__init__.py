@@ -1,0 +1,25 @@
+"""The explorer: one HTML file in which a reader sees a policy's regret in any state.
+
+It carries the networks of the task and of the policy and computes them in the browser, loads
+nothing, and works from a file.
+"""
+
+from sme_registry.explorer.collect import EPISODES, facts, refuse_large
+from sme_registry.explorer.graph import GraphNode, program_of_graph
+from sme_registry.explorer.page import STATIC
+from sme_registry.explorer.program import Program
+from sme_registry.explorer.write import FILE, explorer_page, run_report, write_explorer
+
+__all__ = [
+    "EPISODES",
+    "FILE",
+    "STATIC",
+    "GraphNode",
+    "Program",
+    "explorer_page",
+    "facts",
+    "program_of_graph",
+    "refuse_large",
+    "run_report",
+    "write_explorer",
+]

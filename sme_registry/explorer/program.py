@@ -1,0 +1,246 @@
+"""`Program`: a feed-forward network as plain steps, which NumPy and a page's script compute alike.
+
+Value 0 is the input `[B, n]`, and step i computes value i from earlier ones. The last value is the
+output. All sums are in float64; weights keep the type that they were given in.
+
+    dense      x Wᵀ + b, W [out, in], b [out]          constant   the row v
+    columns    some columns of x                        concat     columns side by side
+    add, sub, mul, div    of two values, or of a value and a row v
+    clip       to [low, high]                           normalise  (x − mean x) / √(var x + epsilon)
+    phi        Φ(x), the standard normal CDF            round32    to the nearest float32
+    relu, tanh, sigmoid, softplus, elu (alpha), leaky_relu (alpha), erf, exp, sqrt, abs, neg
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erf, expit, ndtr
+
+from sme_registry.errors import ResourceLimitError
+from sme_registry.task.draw import Array, Layer
+
+__all__ = ["MAX_WEIGHTS", "MAX_WIDTH", "Program", "ProgramBuilder", "Step", "encoded"]
+
+MAX_WEIGHTS = 2**21  # of a program: 22 MB of text as float64, and seconds for a map in a browser
+MAX_WIDTH = 2**13  # columns of a value
+
+_BINARY: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+}
+_UNARY: dict[str, Callable[..., Any]] = {
+    "phi": ndtr,
+    "round32": lambda x: x.astype(np.float32).astype(np.float64),
+    "relu": lambda x: np.maximum(x, 0.0),
+    "tanh": np.tanh,
+    "sigmoid": expit,
+    "softplus": lambda x: np.logaddexp(0.0, x),
+    "elu": lambda x, alpha: np.where(x > 0.0, x, alpha * np.expm1(np.minimum(x, 0.0))),
+    "leaky_relu": lambda x, alpha: np.where(x > 0.0, x, alpha * x),
+    "erf": erf,
+    "exp": np.exp,
+    "sqrt": np.sqrt,
+    "abs": np.abs,
+    "neg": np.negative,
+    "clip": lambda x, low, high: np.clip(x, low, high),
+    "normalise": lambda x, epsilon: (
+        (x - x.mean(axis=1, keepdims=True)) / np.sqrt(x.var(axis=1, keepdims=True) + epsilon)
+    ),
+}
+UNARY = frozenset(_UNARY)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of a program.
+
+    Attributes:
+      op: one of those in the module's first lines.
+      inputs: the values that it reads, by their numbers.
+      arrays: W and b, or v, by these names.
+      numbers: other parameters by name, such as low and high.
+      columns: the columns that `columns` takes.
+      width: columns of its value.
+    """
+
+    op: str
+    inputs: tuple[int, ...]
+    width: int
+    arrays: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    columns: tuple[int, ...] = ()
+
+    def compute(self, values: list[Array]) -> Array:
+        """Its value `[B, width]`, from all earlier values."""
+        x = [values[i] for i in self.inputs]
+        if self.op == "dense":
+            W, b = (self.arrays[name].astype(np.float64) for name in "Wb")
+            return np.asarray(x[0] @ W.T + b)
+        if self.op == "constant":
+            return np.tile(self.arrays["v"].astype(np.float64), (len(values[0]), 1))
+        if self.op == "columns":
+            return np.asarray(x[0][:, list(self.columns)])
+        if self.op == "concat":
+            return np.concatenate(x, axis=1)
+        if self.op in _BINARY:
+            operands = [*x, *(v.astype(np.float64) for v in self.arrays.values())]
+            return np.asarray(_BINARY[self.op](*operands))
+        return np.asarray(_UNARY[self.op](x[0], **self.numbers))
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A function from rows `[B, n]` to rows `[B, width]`; deterministic.
+
+    Attributes:
+      inputs: n.
+      steps: in order.
+    """
+
+    inputs: int
+    steps: tuple[Step, ...]
+
+    @property
+    def width(self) -> int:
+        """Columns of the output."""
+        return self.steps[-1].width if self.steps else self.inputs
+
+    def __call__(self, x: npt.ArrayLike) -> Array:
+        """The output `[B, width]` for inputs `[B, n]`."""
+        values: list[Array] = [np.asarray(x, dtype=np.float64)]
+        with np.errstate(all="ignore"):  # as in the script; the caller checks what comes out
+            for step in self.steps:
+                values.append(step.compute(values))
+        return values[-1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON data, arrays as text."""
+        steps = []
+        for step in self.steps:
+            data: dict[str, Any] = {"op": step.op, "in": list(step.inputs), "width": step.width}
+            data |= {name: encoded(array) for name, array in step.arrays.items()}
+            data |= dict(step.numbers)
+            if step.columns:
+                data["columns"] = list(step.columns)
+            steps.append(data)
+        return {"inputs": self.inputs, "steps": steps}
+
+
+class ProgramBuilder:
+    """A program under construction. Values are referred to by number; 0 is the input.
+
+    Args:
+      inputs: n, columns of the input.
+      what: what error messages call the network.
+    """
+
+    def __init__(self, inputs: int, what: str = "network") -> None:
+        self.inputs, self._what = inputs, what
+        self._steps: list[Step] = []
+        self._weights = 0
+
+    @property
+    def last(self) -> int:
+        """The newest value."""
+        return len(self._steps)
+
+    def width(self, value: int) -> int:
+        """Columns of a value."""
+        return self.inputs if value == 0 else self._steps[value - 1].width
+
+    def dense(self, x: int, W: npt.NDArray[Any], b: npt.NDArray[Any]) -> int:
+        """x Wᵀ + b of weights `[out, in]` and `[out]`."""
+        return self._add("dense", (x,), len(b), arrays={"W": W, "b": b})
+
+    def layers(self, x: int, layers: tuple[Layer, ...]) -> int:
+        """Φ(W x + b) of each layer: a Deep Uniform Network (METHOD, section 1)."""
+        for W, b in layers:
+            x = self.unary("phi", self.dense(x, W, b))
+        return x
+
+    def constant(self, v: npt.NDArray[Any]) -> int:
+        """The same row in every row."""
+        return self._add("constant", (), len(v), arrays={"v": v})
+
+    def columns(self, x: int, columns: tuple[int, ...]) -> int:
+        """Some columns of a value; the value itself where they are all, in order."""
+        if columns == tuple(range(self.width(x))):
+            return x
+        return self._add("columns", (x,), len(columns), columns=columns)
+
+    def concat(self, *values: int) -> int:
+        """Columns side by side."""
+        if len(values) == 1:
+            return values[0]
+        return self._add("concat", values, sum(map(self.width, values)))
+
+    def binary(self, op: str, left: int | npt.NDArray[Any], right: int | npt.NDArray[Any]) -> int:
+        """`add`, `sub`, `mul` or `div` of values, or of a value and a row `[m]` or `[1]`."""
+        if not isinstance(left, int):
+            left = self.constant(left)
+        widths = [self.width(left), self.width(right) if isinstance(right, int) else len(right)]
+        if 1 not in widths and widths[0] != widths[1]:
+            raise ValueError(f"{op} of widths {widths}")
+        if isinstance(right, int):
+            return self._add(op, (left, right), max(widths))
+        return self._add(op, (left,), max(widths), arrays={"v": right})
+
+    def unary(self, op: str, x: int, **numbers: float) -> int:
+        """A function of each entry, or of each row."""
+        return self._add(op, (x,), self.width(x), numbers=numbers)
+
+    def affine(self, x: int, scale: float, shift: float) -> int:
+        """x scale + shift."""
+        return self.binary("add", self.binary("mul", x, np.array([scale])), np.array([shift]))
+
+    def append(self, program: Program, x: int) -> int:
+        """The steps of another program, whose input is the value x."""
+        numbers = [x]
+        for step in program.steps:
+            inputs = tuple(numbers[i] for i in step.inputs)
+            numbers.append(
+                self._add(
+                    step.op, inputs, step.width,
+                    arrays=step.arrays, numbers=step.numbers, columns=step.columns,
+                )
+            )  # fmt: skip
+        return numbers[-1]
+
+    def build(self) -> Program:
+        """The program; its output is the newest value."""
+        return Program(self.inputs, tuple(self._steps))
+
+    def _add(
+        self,
+        op: str,
+        inputs: tuple[int, ...],
+        width: int,
+        *,
+        arrays: Mapping[str, npt.NDArray[Any]] | None = None,
+        numbers: Mapping[str, float] | None = None,
+        columns: tuple[int, ...] = (),
+    ) -> int:
+        arrays = {} if arrays is None else arrays
+        self._weights += sum(array.size for array in arrays.values())
+        if width > MAX_WIDTH or self._weights > MAX_WEIGHTS:
+            raise ResourceLimitError(
+                f"{self._what}: has more than {MAX_WEIGHTS:,} weights, or a layer of more than "
+                f"{MAX_WIDTH:,} units: too large for a page. Use `sme evaluate` or `sme diagnose`."
+            )
+        self._steps.append(Step(op, inputs, width, arrays, numbers or {}, columns))
+        return self.last
+
+
+def encoded(array: npt.NDArray[Any]) -> dict[str, str]:
+    """An array as JSON data: its type, "f4" or "f8", and its little-endian bytes in base 64."""
+    kind = "f4" if array.dtype == np.float32 else "f8"
+    data = np.ascontiguousarray(array, dtype=f"<{kind}").tobytes()
+    return {kind: base64.b64encode(data).decode("ascii")}

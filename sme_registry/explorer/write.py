@@ -1,0 +1,102 @@
+"""`explorer_page` and `write_explorer`: the page of a task, or of a policy on its task."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from sme_registry.diagnosis import AnySubject
+from sme_registry.diagnosis.stream_subject import StreamSubject
+from sme_registry.errors import OptionError
+from sme_registry.evaluation import EvaluationReport
+from sme_registry.explorer.collect import EPISODES, facts
+from sme_registry.explorer.page import page
+from sme_registry.io import write_atomically
+from sme_registry.spec import SMESpec
+from sme_registry.training import EXPLORER as FILE
+from sme_registry.training.reports import EVALUATION
+
+__all__ = ["FILE", "explorer_page", "run_report", "write_explorer"]
+
+
+def write_explorer(
+    path: str | os.PathLike[str],
+    shown: SMESpec | AnySubject,
+    *,
+    report: EvaluationReport | None = None,
+    channels: Sequence[tuple[int, int]] = (),
+    episodes: int = EPISODES,
+    seed: int = 0,
+) -> Path:
+    """Write a page completely or not at all; equal arguments give equal bytes.
+
+    Args:
+      path: the .html file; its folder is created, and an existing file is replaced.
+      shown, report, channels, episodes, seed: see `explorer_page`.
+
+    Returns:
+      The path.
+
+    Raises:
+      OptionError: another ending than .html, or the file cannot be written; and as `explorer_page`.
+      ResourceLimitError, PolicyError: see `explorer_page`.
+    """
+    if Path(path).suffix != ".html":
+        raise OptionError(f"{os.fspath(path)}: must end in .html.")
+    content = explorer_page(shown, report=report, channels=channels, episodes=episodes, seed=seed)
+    return write_atomically(path, content)
+
+
+def explorer_page(
+    shown: SMESpec | AnySubject,
+    *,
+    report: EvaluationReport | None = None,
+    channels: Sequence[tuple[int, int]] = (),
+    episodes: int = EPISODES,
+    seed: int = 0,
+    static: str = "",
+    remark: str = "",
+) -> str:
+    """The page of a task, or of a policy on its task, as HTML; equal arguments give equal text.
+
+    Args:
+      shown: a task; or a policy on its task, as `diagnosis.load_run`, `load_cell` and `load_policy`
+        return it.
+      report: of the policy's evaluation, whose regions and probes the page shows; None for none.
+      channels: pairs of inputs, from 1 (state channels, then distractors), over which a policy is
+        sampled whose network is unknown; empty for the first two.
+      episodes: to run for the regret over the episode, at least 1.
+      seed: of their start states.
+      static: the address of a folder with the files of `STATIC`, relative to the page, for a site
+        that forbids inline code; empty for a page that needs no other file.
+      remark: a text above the map.
+
+    Raises:
+      OptionError: a life in a stream, or other channels than the task has.
+      ResourceLimitError: the networks of the task are too large for a page.
+      PolicyError: the policy fails.
+    """
+    if isinstance(shown, StreamSubject):
+        raise OptionError(
+            f"run={shown.name!r}: is a life in a stream, and an explorer shows one policy on one "
+            "task. Give the model of one visit, such as RUN/snapshots/visit-0.zip, with --task "
+            "FILE, the task of its phase."
+        )
+    spec, subject = (shown, None) if isinstance(shown, SMESpec) else (shown.spec, shown)
+    content = facts(
+        spec,
+        subject,
+        report=report,
+        channels=channels,
+        episodes=episodes,
+        seed=seed,
+        remark=remark,
+    )
+    return page(content, static)
+
+
+def run_report(folder: str | os.PathLike[str]) -> EvaluationReport | None:
+    """The evaluation of a run's folder; None if there is none yet."""
+    path = Path(folder) / EVALUATION
+    return EvaluationReport.read(path) if path.exists() else None

@@ -1,0 +1,290 @@
+"""Pages in a real browser: their numbers are Python's, and every control does what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from sme_registry import SMESpec, load, materialize
+from sme_registry.diagnosis import load_policy
+from sme_registry.evaluation import EvaluationReport, evaluate
+from sme_registry.explorer import write_explorer
+from tests.browser import launched, needs_chromium
+from tests.explorer.networks import fitted, observations, offline, perceptron
+
+pytestmark = needs_chromium
+expect.set_options(timeout=30_000)
+
+TOLERANCE = 1e-5
+HOSTILE = "</script><img src=x onerror=alert(1)><b>bold"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with sync_playwright() as playwright:
+        browser = launched(playwright)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
+    """Opens pages, and fails where one complained or asked for anything but itself."""
+    contexts: list[Any] = []
+    problems: list[str] = []
+    requests: list[str] = []
+
+    def open_(path: Path, width: int = 1280, **options: Any) -> Any:
+        context = chromium.new_context(viewport={"width": width, "height": 900}, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("dialog", lambda dialog: (problems.append("a dialog"), dialog.dismiss()))
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(path.as_uri())
+        ready(page)
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    assert problems == []
+    assert [url for url in requests if not url.startswith("file:")] == []
+    assert len(requests) == len(contexts)
+
+
+def ready(page: Any) -> Any:
+    # Not `wait_for_function`, which evaluates text, as the page forbids.
+    expect(page.locator("html")).to_have_attribute("data-ready", "true")
+    return page
+
+
+def written(tmp_path: Path, spec: SMESpec, policy: Any = None, **options: Any) -> Path:
+    subject = spec if policy is None else load_policy(policy, spec, name="the policy")
+    return write_explorer(tmp_path / "page.html", subject, episodes=8, **options)
+
+
+def points_of(shown: dict[str, Any]) -> Any:
+    """The points of a map `[n², inputs]`, as the page says where it lies."""
+    n, (i, j) = shown["n"], shown["axes"]
+    points = np.tile(shown["point"], (n * n, 1))
+    points[:, i] = np.tile(np.linspace(shown["low"][0], shown["high"][0], n), n)
+    points[:, j] = np.repeat(np.linspace(shown["low"][1], shown["high"][1], n), n)
+    return points
+
+
+def set_slider(page: Any, name: str, value: float) -> None:
+    page.get_by_role("slider", name=name, exact=True).evaluate(
+        "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input')); }",
+        str(value),
+    )
+    ready(page)
+
+
+@pytest.mark.parametrize(
+    ("name", "action_range"),
+    [
+        ("Default", "unit"),
+        ("Complexity50", "symmetric"),
+        ("MinReward50", "unit"),
+        ("Team2", "unit"),
+        ("HardSafeMixed", "symmetric"),
+    ],
+)
+def test_a_map_is_the_tasks_regret(
+    name: str, action_range: str, tmp_path: Path, opened: Callable[..., Any]
+) -> None:
+    spec = load(name, SMESpec)
+    if spec.team is None:
+        policy: Any = fitted(spec, squashed=action_range == "symmetric")
+    else:
+        policy = {each.name: fitted(spec, agent=i) for i, each in enumerate(spec.team.agents)}
+    subject = load_policy(policy, spec, action_range=action_range)
+    page = opened(write_explorer(tmp_path / "page.html", subject, episodes=8))
+    set_slider(page, "state channel 3", 0.8)
+    set_slider(page, "time t/T", 0.25)
+    page.get_by_label("Across").select_option("s4")
+    ready(page)
+    shown = page.evaluate("explorer.map()")
+    assert shown["n"] == 101
+    assert shown["axes"] == [3, 1]
+    assert shown["low"] == [-0.5, -0.5]
+    assert shown["high"] == [1.5, 1.5]
+    assert shown["point"][2] == 0.8
+
+    points, task = points_of(shown), materialize(spec)
+    s = points[:, : spec.state_dim]
+    a = np.clip(subject.policy(observations(spec, points)), 0.0, 1.0)
+    regret = task.regret(s, a)
+    assert 0.05 < regret.mean() < 0.99
+    assert regret.std() > 0.01
+    np.testing.assert_allclose(shown["values"], regret, atol=TOLERANCE)
+
+    some = points[:: 101 * 7 + 3]
+    here = page.evaluate("points => explorer.at(points)", some.tolist())
+    optimal = np.reshape(here["optimal"], (len(some), -1))
+    np.testing.assert_allclose(optimal, task.optimal_action(some[:, : spec.state_dim]), atol=1e-6)
+    if spec.safety is not None:
+        page.get_by_label("Show").select_option("cost")
+        cost = page.evaluate("explorer.map()")["values"]
+        np.testing.assert_allclose(cost, task.cost(s, a), atol=TOLERANCE)
+        page.get_by_label("Show").select_option("safe regret")
+        safe = page.evaluate("explorer.map()")["values"]
+        expected = task.step_reward(s, task.safe_action(s)) - task.step_reward(s, a)
+        np.testing.assert_allclose(safe, expected, atol=TOLERANCE)
+
+
+def test_every_control_is_reached_and_used_by_keyboard(
+    tmp_path: Path, opened: Callable[..., Any]
+) -> None:
+    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
+    page = opened(written(tmp_path, spec, fitted(spec)))
+    page.keyboard.press("Tab")
+    expect(page.get_by_role("link", name="Skip to the map")).to_be_focused()
+    surface = page.get_by_role("application", name="Map")
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        if surface.evaluate("e => e === document.activeElement"):
+            break
+    expect(surface).to_be_focused()
+    assert surface.evaluate("e => getComputedStyle(e).outlineStyle") == "solid"
+    before = page.locator("#reading").inner_text()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Shift+ArrowUp")
+    point = page.evaluate("explorer.map()")["point"]
+    assert point[:2] == pytest.approx([0.52, 0.7])
+    assert page.locator("#reading").inner_text() != before
+    expect(page.get_by_role("status")).to_contain_text("s1 = 0.52, s2 = 0.70")
+    for _ in range(4):
+        page.keyboard.press("Shift+ArrowUp")
+    expect(page.get_by_role("status")).to_contain_text("outside the cube, at ε = 1.00")
+
+    slider = page.get_by_role("slider", name="state channel 3", exact=True)
+    values = page.evaluate("explorer.map()")["values"]
+    slider.focus()
+    page.keyboard.press("ArrowRight")
+    ready(page)
+    shown = page.evaluate("explorer.map()")
+    assert shown["point"][2] == pytest.approx(0.51)
+    assert shown["values"] != values
+    tree = page.locator("body").aria_snapshot()
+    assert '- slider "state channel 3"' in tree
+    for role in ("slider", "combobox", "checkbox", "button", "application"):
+        assert f"- {role}:" not in tree, "a control without a name"
+
+
+def test_the_map_follows_its_controls(tmp_path: Path, opened: Callable[..., Any]) -> None:
+    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
+    page = opened(written(tmp_path, spec, fitted(spec)))
+    task = materialize(spec)
+    page.get_by_label("Show").select_option("optimal action")
+    page.get_by_label("Action channel").select_option("2")
+    shown = page.evaluate("explorer.map()")
+    optimal = task.optimal_action(points_of(shown)[:, :4])
+    np.testing.assert_allclose(shown["values"], optimal[:, 1], atol=1e-8)
+    set_slider(page, "Beyond the cube, ε", 0.4)
+    shown = page.evaluate("explorer.map()")
+    assert shown["low"] == pytest.approx([-0.2, -0.2])
+    page.get_by_label("Show").select_option("regret")
+    page.get_by_label("Policy").select_option("constant ½")
+    ready(page)
+    shown = page.evaluate("explorer.map()")
+    s = points_of(shown)[:, :4]
+    np.testing.assert_allclose(
+        shown["values"], task.regret(s, np.full((len(s), 2), 0.5)), atol=1e-8
+    )
+    box = page.locator("#surface").bounding_box()
+    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
+    assert page.evaluate("explorer.map()")["point"][:2] == pytest.approx([0.85, 0.85], abs=0.02)
+    page.get_by_role("button", name="Centre").click()
+    ready(page)
+    assert page.evaluate("explorer.map()")["point"][:2] == [0.5, 0.5]
+
+
+def test_a_policy_of_an_unknown_network_is_sampled_and_the_page_says_so(
+    tmp_path: Path, opened: Callable[..., Any]
+) -> None:
+    spec = SMESpec(state_dim=4, action_dim=2, complexity=2)
+
+    def act(o: Any) -> Any:
+        return np.abs(np.sin(3.0 * o[:, [0, 2]]))
+
+    page = opened(written(tmp_path, spec, act, channels=[(1, 2), (3, 2)]))
+    expect(page.locator("#notice")).to_contain_text("sampled over s1 and s2; s3 and s2")
+    expect(page.get_by_role("slider", name="state channel 4", exact=True)).to_be_disabled()
+    expect(page.get_by_role("slider", name="state channel 2", exact=True)).to_be_enabled()
+    for across in ("s1", "s3"):
+        page.get_by_label("Across").select_option(across)
+        ready(page)
+        shown = page.evaluate("explorer.map()")
+        points = points_of(shown)
+        regret = materialize(spec).regret(points[:, :4], act(observations(spec, points)))
+        np.testing.assert_allclose(shown["values"], regret, atol=TOLERANCE)
+    page.get_by_label("Policy").select_option("linear (LSQ)")
+    ready(page)
+    expect(page.locator("#notice")).to_be_hidden()
+    expect(page.get_by_role("slider", name="state channel 4", exact=True)).to_be_enabled()
+
+
+def test_a_task_of_one_channel_has_a_map_over_time(
+    tmp_path: Path, opened: Callable[..., Any]
+) -> None:
+    spec = SMESpec(state_dim=1, action_dim=1)
+    page = opened(written(tmp_path, spec, offline(spec)))
+    shown = page.evaluate("explorer.map()")
+    assert shown["axes"] == [0, 1]
+    assert shown["low"] == [-0.5, 0]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_no_page_is_wider_than_the_screen(
+    width: int, scheme: str, tmp_path: Path, opened: Callable[..., Any]
+) -> None:
+    spec = load("HardSafeMixed", SMESpec)
+    policy = perceptron(spec)
+    report = evaluate(policy, spec, {"states_per_region": 200})
+    assert isinstance(report, EvaluationReport)
+    path = written(tmp_path, spec, policy, report=report)
+    page = opened(path, width, color_scheme=scheme)
+    wide, screen = page.evaluate("[document.documentElement.scrollWidth, window.innerWidth]")
+    assert screen == width
+    assert wide <= screen
+    headings = page.get_by_role("heading", level=2).all_inner_texts()
+    assert {"Inside and outside the cube", "What the layers keep"} <= set(headings)
+    colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (int(colour.split("(")[1].split(",")[0]) > 128) == (scheme == "light")
+
+
+def test_a_hostile_name_is_a_name(tmp_path: Path, opened: Callable[..., Any]) -> None:
+    spec = SMESpec(state_dim=2, action_dim=1).named(HOSTILE)
+    subject = load_policy(perceptron(spec), spec, name=HOSTILE)
+    page = opened(write_explorer(tmp_path / "page.html", subject, episodes=8))
+    assert page.evaluate("document.querySelectorAll('b, img').length") == 0
+    expect(page.get_by_role("heading", level=1)).to_contain_text("<img src=x")
+    expect(page.locator("#reading")).to_contain_text(HOSTILE)
+
+
+def test_the_page_may_load_and_run_nothing_else(tmp_path: Path, chromium: Any) -> None:
+    page = chromium.new_page()
+    heard: list[str] = []
+    page.on("console", lambda message: heard.append(message.text))
+    page.goto(written(tmp_path, SMESpec(state_dim=2, action_dim=1)).as_uri())
+    ready(page)
+    assert heard == []
+    for code in (
+        "document.body.append(Object.assign(document.createElement('script'), {text: '1'}))",
+        "document.body.append(Object.assign(new Image(), {src: 'data:,'}))",
+        "fetch('http://127.0.0.1:9/').catch(() => 0)",
+    ):
+        with page.expect_console_message():
+            page.evaluate(code)
+    page.close()
+    assert all("Content Security Policy" in text for text in heard)
+    assert len(heard) >= 3
