@@ -14,13 +14,16 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
+import numpy as np
 import pytest
 
 from leaderboard.documents.keys import SigningKey
 from leaderboard.store import Store
 from leaderboard.web import client, limits, serve
 from leaderboard.web.connections import Connections
+from leaderboard.web.seasons import SeasonRoutes
 from sme_registry import sealed
+from tests.leaderboard.sealed.playing import online_board
 from tests.leaderboard.serving import serving
 from tests.leaderboard.web.site import boards
 from tests.leaderboard.web.test_client import bundle_of
@@ -132,6 +135,22 @@ def test_only_steps_have_a_high_rate_and_no_body_is_larger_than_an_artefact() ->
     assert matched == {"steps"}
     assert not re.search(location, sealed.tickets_path("autumn"))
     assert {int(size) for size in re.findall(r"client_max_body_size (\d+)m;", text)} == {2, 9}
+
+
+def test_steps_pass_through_nginx_without_the_application(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    season = online_board(tmp_path)
+    with (
+        serving(season.path, season_secrets=[season.secret]) as upstream,
+        proxied(tmp_path, urlsplit(upstream).netloc) as url,
+        sealed.Instance(url, season.ticket(upstream, SigningKey.generate()), 0, 4) as instance,
+    ):
+        instance.begin()
+        monkeypatch.delattr(SeasonRoutes, "place")
+        for _ in range(3):
+            instance.step(np.zeros((4, 1), np.float32))
+        assert instance.status().instances[0].used == 12
 
 
 def test_silent_and_slow_clients_of_nginx_do_not_reach_the_board(
