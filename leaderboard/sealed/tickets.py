@@ -67,6 +67,7 @@ class Tickets:
     Args:
       store: the board.
       secret: the path of the season's master.
+      season: digest of the season; by default the first that is committed to the master.
 
     Raises:
       BoardError: no online season of the board is committed to the master, or another server steps
@@ -77,9 +78,12 @@ class Tickets:
       board, secret: paths of the board's folder and of the master.
     """
 
-    def __init__(self, store: Store, secret: str | os.PathLike[str]) -> None:
+    def __init__(
+        self, store: Store, secret: str | os.PathLike[str], season: str | None = None
+    ) -> None:
         self.master = Master.read(secret)
-        self.season = _season_of(store, self.master, secret)
+        seasons = _seasons_of(store, self.master, secret)
+        self.season = seasons[0] if season is None else store.season(season)
         self.digest = self.season.digest
         folder = store.season_folder(self.digest)
         lock = file_lock(folder.stepping)
@@ -95,6 +99,12 @@ class Tickets:
         self._running: dict[int, RunningTicket] = {}
         self._held: OrderedDict[SteppedInstance, int] = OrderedDict()
         self._held_lanes = 0
+
+    @classmethod
+    def of_master(cls, store: Store, secret: str | os.PathLike[str]) -> list[Tickets]:
+        """Those of each online season that is committed to a master; errors as of the class."""
+        seasons = _seasons_of(store, Master.read(secret), secret)
+        return [cls(store, secret, season.digest) for season in seasons]
 
     def ticket(self, number: int) -> RunningTicket:
         """A ticket by its number.
@@ -269,12 +279,12 @@ class Tickets:
             each.release()
 
 
-def _season_of(store: Store, master: Master, secret: str | os.PathLike[str]) -> Season:
-    for row in store.seasons():
-        season = store.season(row.id)
-        if row.track == "sealed-online" and season.is_committed_to(master):
-            return season
-    raise BoardError(
-        f"{secret}: is the master of no sealed-online season of this board. Give the file that "
-        "`sme-leaderboard season new` wrote."
-    )
+def _seasons_of(store: Store, master: Master, secret: str | os.PathLike[str]) -> list[Season]:
+    online = [store.season(row.id) for row in store.seasons() if row.track == "sealed-online"]
+    found = [season for season in online if season.is_committed_to(master)]
+    if not found:
+        raise BoardError(
+            f"{secret}: is the master of no sealed-online season of this board. Give the file that "
+            "`sme-leaderboard season new` wrote."
+        )
+    return found

@@ -65,7 +65,7 @@ class SeasonRoutes:
     def __init__(self, store: Store, secrets: Iterable[str | os.PathLike[str]]) -> None:
         self._store = store
         self._tickets = {
-            each.season.id: each for each in (Tickets(store, path) for path in secrets)
+            each.season.id: each for path in secrets for each in Tickets.of_master(store, path)
         }
         self._threads = CapacityLimiter(_WORKERS)
         self._challenges = limits.Turns(_REQUESTS)

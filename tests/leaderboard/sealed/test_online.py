@@ -169,6 +169,18 @@ def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
     assert [each.steps for each in result.stepping] == [64, 20]
 
 
+def test_all_seasons_of_a_master_are_served(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    second = board._replace(season=tiny_season("sealed-online", id="second"))
+    with Store.open(board.path) as store:
+        store.announce(second.season)
+    with serving(board.path, season_secrets=[board.secret]) as url:
+        for each in (board, second):
+            ticket = each.ticket(url, KEY)
+            assert (ticket.season, ticket.ticket) == (each.season.id, 1)
+            played(url, ticket, 0, 2)
+
+
 def test_the_same_request_has_the_same_ticket_and_another_one_a_new_ticket(tmp_path: Path) -> None:
     board = online_board(tmp_path)
     request = board.request(KEY)
