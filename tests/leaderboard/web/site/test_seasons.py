@@ -68,6 +68,7 @@ def test_the_page_of_a_season_before_and_after_its_reveal(board, key, monkeypatc
     assert "What this proves, and what it does not" in before.words
     assert MASTER.raw.hex() not in before.words
     assert "Ranked by" not in before.words
+    assert "lucky ticket" not in before.words
     assert page(board, "seasons.html").words.count("sealed-offline") == 1
     assert "Seasons" in page(board, "index.html").words
 
@@ -89,6 +90,7 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
     board.start_ticket(request)
     running = page(board, "seasons/winter.html")
     assert "running" in running.words
+    assert "an entrant may stop after a lucky ticket" in running.words
     assert request.ticket.nonce not in running.words
     assert request.signature not in running.words
     board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
