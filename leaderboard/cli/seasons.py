@@ -28,7 +28,7 @@ from sme_registry.terminal import (
 )
 
 if TYPE_CHECKING:
-    from leaderboard.documents.season import Season, Terms
+    from leaderboard.documents.season import Terms
     from leaderboard.store import SeasonRow, Store
 
 SeasonId = Annotated[str, typer.Argument(metavar="SEASON", help="The season's id.")]
@@ -266,6 +266,7 @@ def show(
       sme-leaderboard season show board autumn --metric ood_regret
     """
     from leaderboard.scoring.ranking import REASONS
+    from leaderboard.scoring.season import ranking_facts
 
     with open_board(board) as store:
         if season is None:
@@ -280,7 +281,7 @@ def show(
             out().print(table)
             return
         row, document = store.season_row(season), store.season(season)
-        facts, rankings = _facts(store, row), _rankings(store, document, metric)
+        facts, rankings = _facts(store, row), ranking_facts(store, document, metric)
     if json:
         print_json({**facts, "metric": metric, "ranking": rankings})
         return
@@ -337,32 +338,6 @@ def _facts(store: Store, row: SeasonRow) -> dict[str, Any]:
         "entrants": len(store.entrants(row.digest)),
         "commitment": document.commitment,
         "revealed": row.revealed or None,
-    }
-
-
-def _rankings(store: Store, season: Season, metric: Metric) -> dict[str, list[dict[str, Any]]]:
-    from leaderboard.scoring.season import by_key, season_rankings
-
-    keys = by_key(store, season)
-    return {
-        knowledge: [
-            {
-                "ranks": row.ranks,
-                "reason": row.reason,
-                "method": row.entry.method,
-                "version": row.entry.version,
-                "submitter": row.entry.submitter,
-                "value": row.value.value,
-                "low": row.value.low,
-                "high": row.value.high,
-                "oracle_like": row.entry.oracle_like,
-                "methods_of_key": keys[row.entry.key].methods,
-                "entrants_of_key": keys[row.entry.key].entrants,
-                "id": row.entry.id,
-            }
-            for row in rows
-        ]
-        for knowledge, rows in season_rankings(store, season, metric).items()
     }
 
 

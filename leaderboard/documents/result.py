@@ -16,7 +16,7 @@ how runs become scores. Fields younger than version 1 are left out of the JSON a
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
@@ -34,6 +34,8 @@ from sme_registry.spec import (
 
 Metric = Literal["wd_regret", "ood_regret", "ood_decay"]
 """The metrics that a board ranks by."""
+
+RANKED_METRICS: tuple[Metric, ...] = get_args(Metric)
 
 METRICS = ("wd_regret", "ood_regret", "ood_decay", "regret_slope", "similarity_loss")
 Isolation = Literal["", "bwrap", "process"]

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from leaderboard.artefact.answers import read_answers
 from leaderboard.documents.board import RULES
@@ -107,6 +107,31 @@ def season_rankings(
     return {
         knowledge: ranking([each for each in entries if each.knowledge == knowledge], metric)
         for knowledge in KNOWLEDGE
+    }
+
+
+def ranking_facts(store: Store, season: Season, metric: Metric) -> dict[str, list[dict[str, Any]]]:
+    """The rankings as plain data, one list for each declared knowledge, best first."""
+    keys = by_key(store, season)
+    return {
+        knowledge: [
+            {
+                "ranks": row.ranks,
+                "reason": row.reason,
+                "method": row.entry.method,
+                "version": row.entry.version,
+                "submitter": row.entry.submitter,
+                "value": row.value.value,
+                "low": row.value.low,
+                "high": row.value.high,
+                "oracle_like": row.entry.oracle_like,
+                "methods_of_key": keys[row.entry.key].methods,
+                "entrants_of_key": keys[row.entry.key].entrants,
+                "id": row.entry.id,
+            }
+            for row in rows
+        ]
+        for knowledge, rows in season_rankings(store, season, metric).items()
     }
 
 

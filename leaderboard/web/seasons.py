@@ -2,6 +2,7 @@
 
     GET  /api/seasons                                           the board's seasons
     GET  /api/seasons/{id}                                      one season, its state and its reveal
+    GET  /api/seasons/{id}/ranking?metric=wd_regret             its methods with results
     POST /api/seasons/{id}/entries                              201 an offline entry, 200 known
     POST /api/seasons/{id}/tickets                              201 a ticket, 200 the same again;
                                                                 signed, see `intake.tickets`
@@ -32,14 +33,18 @@ from starlette.types import Scope
 
 from leaderboard import intake
 from leaderboard.documents.entry import SignedEntry, SignedTicketRequest
+from leaderboard.documents.result import RANKED_METRICS
 from leaderboard.documents.submission import Envelope
 from leaderboard.errors import Rejection
+from leaderboard.scoring.memo import Memo
+from leaderboard.scoring.season import ranking_facts
 from leaderboard.sealed import Tickets, attending
 from leaderboard.store import SeasonRow, Store
 from leaderboard.web import limits
 from leaderboard.web.errors import HTTP_CODES, RequestError
 from leaderboard.web.quick import StepRequest
 from sme_registry import sealed
+from sme_registry.io import to_json
 
 _SEASON = "/api/seasons/{season}"
 _TICKET = _SEASON + "/tickets/{ticket}"
@@ -72,6 +77,8 @@ class SeasonRoutes:
         self._requests = limits.Turns(_REQUESTS)
         self._entries = limits.Turns(_REQUESTS)
         self._refusals = intake.Refusals()
+        self._rankings = limits.Turns(_REQUESTS)
+        self._ranked: Memo[bytes] = Memo(16)
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -95,6 +102,7 @@ class SeasonRoutes:
             Route(f"{_INSTANCE}/answers", self.answer, methods=["PUT"]),
             Route("/api/seasons", self.get_seasons, methods=["GET"]),
             Route(_SEASON, self.get_season, methods=["GET"]),
+            Route(f"{_SEASON}/ranking", self.get_ranking, methods=["GET"]),
             Route(f"{_SEASON}/entries", self.post_entry, methods=["POST"]),
             Route(f"{_SEASON}/tickets", self.post_ticket, methods=["POST"]),
             Route(_TICKET, self.get_ticket, methods=["GET"]),
@@ -116,6 +124,25 @@ class SeasonRoutes:
             return {**self._view(row), "document": document, "master": master}
 
         return JSONResponse(await self._in_thread(view))
+
+    async def get_ranking(self, request: Request) -> Response:
+        """The methods with results, ranked: online as tickets end, offline after the reveal."""
+        name = request.path_params["season"]
+        text = request.query_params.get("metric", RANKED_METRICS[0])
+        metric = next((each for each in RANKED_METRICS if each == text), None)
+        if metric is None:
+            names = ", ".join(RANKED_METRICS)
+            raise RequestError("bad_request", f"metric={text!r:.80}: must be one of {names}.")
+
+        def rank() -> bytes:
+            row = self._store.season_row(name)
+            facts = ranking_facts(self._store, self._store.season(row.digest), metric)
+            return to_json({**self._view(row), "metric": metric, "ranking": facts}).encode()
+
+        def ranked() -> bytes:
+            return self._ranked.get((name, metric, self._store.head.digest), rank)
+
+        return Response(await self._rankings.run(ranked), media_type="application/json")
 
     def _view(self, row: SeasonRow) -> dict[str, Any]:
         """What is public of a season in short."""

@@ -169,6 +169,27 @@ def test_a_ticket_is_played_and_then_scored_and_logged(tmp_path: Path) -> None:
     assert [each.steps for each in result.stepping] == [64, 20]
 
 
+def test_the_ranking_grows_as_tickets_end(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        store.start_ticket(board.request(KEY))
+    with serving(board.path) as url:
+        address = f"{url}/api/seasons/{board.season.id}/ranking"
+        empty = httpx.get(address).json()
+        with Store.open(board.path) as store:
+            result = score_ticket(store, board.season, MASTER, 1)
+            store.end_ticket(board.season.digest, 1, result)
+        ranked = httpx.get(address, params={"metric": "ood_regret"}).json()
+        other = httpx.get(address, params={"metric": "luck"})
+        unknown = httpx.get(f"{url}/api/seasons/none/ranking")
+    assert (empty["metric"], empty["ranking"]) == ("wd_regret", {"generic": [], "family": []})
+    [row] = ranked["ranking"]["generic"]
+    assert (row["method"], row["value"], row["entrants_of_key"]) == ("Test", 1.0, 1)
+    assert (ranked["id"], ranked["metric"]) == (board.season.id, "ood_regret")
+    assert (other.status_code, other.json()["code"]) == (400, "bad_request")
+    assert (unknown.status_code, unknown.json()["code"]) == (404, "season_unknown")
+
+
 def test_all_seasons_of_a_master_are_served(tmp_path: Path) -> None:
     board = online_board(tmp_path)
     second = board._replace(season=tiny_season("sealed-online", id="second"))
