@@ -20,10 +20,12 @@ from leaderboard.cli.options import (
     SealedKnowledge,
     Statement,
     SubmitterName,
+    answers_in,
     board_document,
     is_url,
     manifest_fields,
     policy_of_each,
+    read_file,
 )
 from leaderboard.documents.keys import SigningKey
 from sme_registry.errors import OptionError
@@ -125,15 +127,9 @@ def _answers(policy: str, states: Path, setting: Any, action_range: str | None) 
     """The file of answers: the given one, or a policy's actions in the challenge states."""
     from sme_registry.sealed import actions_in, pack_table, prepare_policy, unpack_table
 
-    if policy.endswith(".npy"):
-        return _read(Path(policy))
+    given = answers_in(policy)
+    if given is not None:
+        return given
     prepared = prepare_policy(policy, setting, action_range=action_range)
-    shown = unpack_table(_read(states), setting.state_dim + 2)
+    shown = unpack_table(read_file(states), setting.state_dim + 2)
     return pack_table(actions_in(shown, prepared, setting))
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None

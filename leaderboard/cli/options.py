@@ -201,6 +201,23 @@ def policy_of_each(policy: str, names: Collection[str]) -> dict[str, str]:
     return {name: policy.replace("{name}", name) for name in names}
 
 
+def answers_in(path: str) -> bytes | None:
+    """The bytes of a file of actions, if a policy is given by one; None for other policies.
+
+    Raises:
+      OptionError: the file cannot be read.
+    """
+    return read_file(Path(path)) if path.endswith(".npy") else None
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of a file; raises `OptionError` if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read: {error.strerror}. Correct the path.") from None
+
+
 def manifest_fields(
     key: str,
     *,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -20,13 +20,18 @@ from leaderboard.cli.options import (
     SealedKnowledge,
     Statement,
     SubmitterName,
+    answers_in,
     manifest_fields,
     policy_of_each,
 )
 from leaderboard.documents.keys import SigningKey
 from leaderboard.errors import Rejection
-from sme_registry.io import choice, refuse_existing, write_atomically
+from sme_registry.errors import OptionError
+from sme_registry.io import choice, refuse_existing, refuse_unwritable, write_atomically
 from sme_registry.terminal import Progress, Table, err, out
+
+if TYPE_CHECKING:
+    from sme_registry.sealed import Place, Ticket
 
 ServedBoard = Annotated[
     str, typer.Argument(metavar="URL", help="The URL of the board that serves the season.")
@@ -117,13 +122,13 @@ def answer(
     url: ServedBoard,
     ticket_file: Annotated[Path, typer.Argument(metavar="TICKET", help="The ticket's file.")],
     policy: Annotated[
-        str,
+        str | None,
         typer.Argument(
             metavar="POLICY",
-            help="A policy as `sme evaluate` takes it. {name} stands for the instance, such as "
-            "deep-0.",
+            help="A policy as `sme evaluate` takes it, or an .npy file of actions in the challenge "
+            "states. {name} stands for the instance, such as deep-0.",
         ),
-    ],
+    ] = None,
     instance: Annotated[
         list[str] | None,
         typer.Option(
@@ -133,6 +138,20 @@ def answer(
             help="Only this instance; repeatable. Default: all without answers.",
         ),
     ] = None,
+    challenges: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Instead of answers: write the challenge states of each instance into this "
+            "folder, for .npy files of actions.",
+        ),
+    ] = None,
+    end_steps: Annotated[
+        bool,
+        typer.Option(
+            "--end-steps", help="With --challenges: also of instances with steps left, for good."
+        ),
+    ] = False,
     action_range: ActionRange = None,
     algorithm: Annotated[
         str | None, typer.Option(help="Class of a .zip that does not tell it.")
@@ -147,9 +166,17 @@ def answer(
       sme-leaderboard answer https://board.example ticket.json 'runs/{name}/model.zip'
 
       sme-leaderboard answer https://board.example ticket.json policy.onnx --instance deep-0
-    """
-    from sme_registry.sealed import Instance, Ticket, actions_in, prepare_policy
 
+      sme-leaderboard answer https://board.example ticket.json --challenges challenges
+
+      sme-leaderboard answer https://board.example ticket.json 'actions/{name}.npy'
+    """
+    import numpy as np
+
+    from sme_registry.sealed import Instance, Ticket, actions_in
+
+    if (policy is None) == (challenges is None):
+        raise OptionError("POLICY, --challenges: one of the two must be given.")
     held = Ticket.read(ticket_file)
     places = {place.name: number for number, place in enumerate(held.places)}
     with Instance(url, held) as first:
@@ -157,21 +184,56 @@ def answer(
     for name in instance or ():
         choice("instance", name, places)
     chosen = instance or [name for name in places if phases[places[name]] != "answered"]
+    stepped = [name for name in chosen if phases[places[name]] in ("waiting", "stepping")]
+    if challenges is not None:
+        if stepped and not end_steps:
+            raise OptionError(
+                f"{', '.join(stepped)}: steps are left, which the challenge ends for good. Add "
+                "--end-steps if you want no more of them, or name other instances with --instance."
+            )
+        _write_challenges(url, held, {name: places[name] for name in chosen}, challenges)
+        return
     # All are loaded before the first instance's steps end for good.
+    own = {} if policy is None else policy_of_each(policy, chosen)
     policies = {
-        places[name]: prepare_policy(
-            own,
-            held.place(places[name]).member.setting,
-            action_range=action_range,
-            algorithm=algorithm,
-        )
-        for name, own in policy_of_each(policy, chosen).items()
+        places[name]: _prepared(each, held.place(places[name]), action_range, algorithm)
+        for name, each in own.items()
     }
+    blind = [name for name in stepped if isinstance(policies[places[name]], np.ndarray)]
+    if blind:
+        raise OptionError(
+            f"{', '.join(blind)}: steps are left, so the challenge states are not known yet. Get "
+            "them with --challenges FOLDER before you give .npy files of actions."
+        )
     with Progress("answering", len(policies), console=err(), unit="instances") as progress:
         for done, (number, prepared) in enumerate(policies.items(), start=1):
             with Instance(url, held, number) as hidden:
-                hidden.send_answers(actions_in(hidden.challenge(), prepared, hidden.setting))
+                if not isinstance(prepared, np.ndarray):
+                    prepared = actions_in(hidden.challenge(), prepared, hidden.setting)
+                hidden.send_answers(prepared)
             phases[number] = "answered"
             progress.update(done)
     left = sum(phase != "answered" for phase in phases)
     out().print(f"{left} instances without answers" if left else "The ticket has ended.")
+
+
+def _prepared(policy: str, place: Place, action_range: str | None, algorithm: str | None) -> Any:
+    """A policy, or the array of actions in a file."""
+    from sme_registry.sealed import prepare_policy, unpack_table
+
+    setting, given = place.member.setting, answers_in(policy)
+    if given is not None:
+        return unpack_table(given, setting.action_dim)
+    return prepare_policy(policy, setting, action_range=action_range, algorithm=algorithm)
+
+
+def _write_challenges(url: str, ticket: Ticket, places: dict[str, int], folder: Path) -> None:
+    from sme_registry.sealed import Instance, pack_table
+
+    refuse_unwritable(folder / "challenge.npy")
+    with Progress("writing", len(places), console=err(), unit="challenges") as progress:
+        for done, (name, number) in enumerate(places.items(), start=1):
+            with Instance(url, ticket, number) as hidden:
+                write_atomically(folder / f"{name}.npy", pack_table(hidden.challenge()))
+            progress.update(done)
+    out().print(f"{escape(str(folder))}: {len(places)} challenges", soft_wrap=True)

@@ -79,6 +79,37 @@ def test_a_ticket_is_started_stepped_and_answered(url: str, board: Board) -> Non
         assert [each.phase for each in hidden.status().instances] == ["answered", "answered"]
 
 
+def test_files_of_actions_answer_challenges_that_were_fetched(url: str, board: Board) -> None:
+    start(0, url)
+    ticket = Ticket.read("ticket.json")
+    with Instance(url, ticket, 0, 4) as hidden:
+        hidden.begin()
+    answer = "answer", url, "ticket.json"
+    np.save("deep-0.npy", np.full((300, 1), 0.5, "<f4"))
+    assert "one of the two" in command(2, *answer)
+    assert "one of the two" in command(2, *answer, "{name}.npy", "--challenges", "shown")
+    assert "deep-0: steps are left" in command(2, *answer, "deep-0.npy", "-i", "deep-0")
+    refused = command(2, *answer, "--challenges", "shown")
+    assert "deep-0, deep-1: steps are left" in refused
+    assert not Path("shown").exists()
+    with Instance(url, ticket) as hidden:
+        assert [each.phase for each in hidden.status().instances] == ["stepping", "waiting"]
+
+    command(0, *answer, "--challenges", "shown", "--end-steps", "-i", "deep-0")
+    command(0, *answer, "--challenges", "shown", "-i", "deep-0")  # again: no steps are left
+    assert [path.name for path in Path("shown").iterdir()] == ["deep-0.npy"]
+    states = np.load("shown/deep-0.npy", allow_pickle=False)
+    assert states.shape == (300, 4)
+    np.save("wide.npy", np.full((300, 2), 0.5, "<f4"))
+    assert "must be of shape (300, 1)" in command(2, *answer, "wide.npy", "-i", "deep-0")
+    assert "cannot be read" in command(2, *answer, "none.npy", "-i", "deep-0")
+    np.save("deep-0.npy", states[:, :1])
+    command(0, *answer, "{name}.npy", "-i", "deep-0")
+    with Store.open(board.path, read_only=True) as store:
+        folder = store.season_folder(board.season.digest).ticket(ticket.ticket)
+    np.testing.assert_array_equal(np.load(folder / "0.npy", allow_pickle=False), states[:, :1])
+
+
 def test_an_interrupted_request_gets_the_same_ticket(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
