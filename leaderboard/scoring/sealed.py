@@ -20,8 +20,14 @@ from leaderboard.documents.result import RunScore, SealedResult, Stepping
 from leaderboard.documents.season import Hidden, Season, Terms
 from leaderboard.scoring.aggregation import Groups, class_score, is_oracle_like, method_scores
 from leaderboard.scoring.metrics import failed_run, levels_of, run_metrics
-from sme_registry import EvaluationProtocol, SMESpec, evaluate
-from sme_registry.evaluation import evaluation_observations
+from sme_registry import EvaluationProtocol, SMESpec
+from sme_registry.errors import PolicyError
+from sme_registry.evaluation import (
+    EvaluationReport,
+    as_policy,
+    evaluate_many,
+    evaluation_observations,
+)
 
 # May be loaded in the same process, but no number of a result depends on them.
 _UNUSED = ("stable_baselines3", "torch", "onnxruntime")
@@ -94,29 +100,52 @@ def score_run(
         scores 1 in every metric.
       digest: of the answers' file; None likewise.
     """
-    member = instance.hidden.member
-    if answers is None:
-        return failed_run(instance.protocol, member.name, None), {}
-    replies = _Replies(answers)
-    report = evaluate(
-        replies, instance.spec, instance.protocol, action_range="unit", name="answers"
-    )
-    replies.refuse_unused()
+    [scored] = score_runs(instance, [(answers, digest)])
+    return scored
+
+
+def score_runs(
+    instance: Instance, answered: Sequence[tuple[Float32 | None, str | None]]
+) -> list[tuple[RunScore, dict[str, str]]]:
+    """`score_run` of several answers on an instance, whose optimum takes most of the time."""
+    replies = [None if answers is None else _Replies(answers) for answers, _ in answered]
+    policies = [
+        (as_policy(each, instance.spec, action_range="unit", name="answers"), instance.spec)
+        for each in replies
+        if each is not None
+    ]
+    reports = iter(evaluate_many(policies, instance.protocol))
+    scores: list[tuple[RunScore, dict[str, str]]] = []
+    for each, (_, digest) in zip(replies, answered, strict=True):
+        if each is None:
+            name = instance.hidden.member.name
+            scores.append((failed_run(instance.protocol, name, None), {}))
+            continue
+        report = next(reports)
+        if isinstance(report, PolicyError):
+            raise report
+        each.refuse_unused()
+        scores.append((_run_score(instance, report, digest), _versions(report)))
+    return scores
+
+
+def _run_score(instance: Instance, report: EvaluationReport, digest: str | None) -> RunScore:
     regrets = tuple(region.normalised_regret for region in report.regions)
     similarity = tuple(region.similarity for region in report.regions)
     metrics: dict[str, Any] = {**run_metrics(regrets, similarity, levels_of(instance.protocol))}
-    score = RunScore(
+    return RunScore(
         spec=None,
-        class_name=member.name,
+        class_name=instance.hidden.member.name,
         artefact=digest,
         evaluation_seed=None,
         normalised_regret=regrets,
         similarity=similarity,
         **metrics,
     )
-    return score, {
-        name: version for name, version in report.versions.items() if name not in _UNUSED
-    }
+
+
+def _versions(report: EvaluationReport) -> dict[str, str]:
+    return {name: version for name, version in report.versions.items() if name not in _UNUSED}
 
 
 class _Replies:

@@ -15,22 +15,30 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from leaderboard.artefact.answers import read_answers
+from leaderboard.artefact.answers import Float32, read_answers
 from leaderboard.documents.board import RULES
 from leaderboard.documents.master import Master
 from leaderboard.documents.result import Metric, RunScore, Scores, SealedResult
 from leaderboard.documents.season import Season
-from leaderboard.documents.submission import Knowledge
+from leaderboard.documents.submission import Artefact, Knowledge
 from leaderboard.scoring.aggregation import is_oracle_like, method_scores
 from leaderboard.scoring.memo import Memo
 from leaderboard.scoring.ranking import RankedRow, ranking
-from leaderboard.scoring.sealed import groups_of_season, instances, score_run, sealed_result
+from leaderboard.scoring.sealed import (
+    Instance,
+    groups_of_season,
+    instances,
+    score_runs,
+    sealed_result,
+)
 from leaderboard.store import EntryRow, SealedRow, Store
 
 Progress = Callable[[int, int], None]
 
 KNOWLEDGE: tuple[Knowledge, ...] = ("generic", "family")
 """Ranked apart, in this order."""
+
+_AT_A_TIME = 32  # entries; what an interrupted reveal repeats, and holds in memory
 
 # A bootstrap each, which every page of the season shows. Results never change.
 _TOGETHER: Memo[tuple[Scores, bool]] = Memo(1024)
@@ -84,8 +92,9 @@ def score_entries(store: Store, name: str, progress: Progress | None = None) -> 
     waiting = [row for row in counting(store, season) if row.result is None]
     if season.track == "sealed-online":
         return 0
-    for done, row in enumerate(waiting, start=1):
-        store.rank(scored_entry(store, season, master, row))
+    results = scored_entries(store, season, master, waiting)
+    for done, result in enumerate(results, start=1):
+        store.rank(result)
         if progress is not None:
             progress(done, len(waiting))
     return len(waiting)
@@ -135,21 +144,40 @@ def ranking_facts(store: Store, season: Season, metric: Metric) -> dict[str, lis
     }
 
 
-def scored_entry(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
-    """The result of an offline entry, from its answers."""
-    runs: list[RunScore] = []
-    versions: dict[str, str] = {}
-    answers = store.entry_of(row).entry.answers
-    for instance, answer in zip(instances(season, master), answers, strict=True):
-        if answer is None:
-            run, used = score_run(instance, None, None)
-        else:
-            data = store.objects.read(answer.sha256)
-            actions = read_answers(data, instance.spec, instance.protocol)
-            run, used = score_run(instance, actions, answer.sha256)
-        runs.append(run)
-        versions |= used
-    return sealed_result(season, row.entrant.id, runs, versions, store.document.draws)
+def scored_entries(
+    store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
+) -> Iterator[SealedResult]:
+    """The results of offline entries, from their answers, in order.
+
+    Several at a time are scored on each instance, whose optimum takes most of the time.
+    """
+    for first in range(0, len(rows), _AT_A_TIME):
+        yield from _scored_at_once(store, season, master, rows[first : first + _AT_A_TIME])
+
+
+def _scored_at_once(
+    store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
+) -> Iterator[SealedResult]:
+    answers = [store.entry_of(row).entry.answers for row in rows]
+    runs: list[list[RunScore]] = [[] for _ in rows]
+    versions: list[dict[str, str]] = [{} for _ in rows]
+    for number, instance in enumerate(instances(season, master)):
+        answered = [_read(store, instance, of[number]) for of in answers]
+        for entry, (run, used) in enumerate(score_runs(instance, answered)):
+            runs[entry].append(run)
+            versions[entry] |= used
+    draws = store.document.draws
+    for row, of_entry, used in zip(rows, runs, versions, strict=True):
+        yield sealed_result(season, row.entrant.id, of_entry, used, draws)
+
+
+def _read(
+    store: Store, instance: Instance, answer: Artefact | None
+) -> tuple[Float32 | None, str | None]:
+    if answer is None:
+        return None, None
+    data = store.objects.read(answer.sha256)
+    return read_answers(data, instance.spec, instance.protocol), answer.sha256
 
 
 def _methods(

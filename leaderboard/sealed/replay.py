@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -22,7 +22,7 @@ from leaderboard.errors import BoardError, TamperedError
 from leaderboard.scoring.publication import follows
 from leaderboard.scoring.rescore import RESCORED
 from leaderboard.scoring.sealed import instances, sealed_result
-from leaderboard.scoring.season import counting, scored_entry
+from leaderboard.scoring.season import counting, scored_entries
 from leaderboard.scoring.verify import EXACT, close
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.ticket import RunningTicket, deadline
@@ -92,18 +92,20 @@ def verify_season(
                 message = "its data set or challenge states do not follow from the master"
                 _refuse(store, folder.season, f"{where}: {message}")
             advance()
-    results = 0
     for row in rows:
         _check_signature(store, season, row)
+        if row.result is not None and row not in counted:
+            path = folder.result(row.entrant.id)
+            _refuse(store, path, "is of an entry that does not count")
+        if row.result is None:
+            advance()
+    results = [row for row in rows if row.result is not None]
+    for row, again in zip(results, _scored(store, season, master, results), strict=True):
         stored = store.sealed_result(row)
-        if stored is not None:
-            if row not in counted:
-                path = folder.result(row.entrant.id)
-                _refuse(store, path, "is of an entry that does not count")
-            _compare(store, season, stored, _scored(store, season, master, row))
-            results += 1
+        assert stored is not None
+        _compare(store, season, stored, again)
         advance()
-    return SeasonReport(len(season.published), rounded, len(rows), results)
+    return SeasonReport(len(season.published), rounded, len(rows), len(results))
 
 
 def _check_rules(store: Store, season: Season, rows: Sequence[SealedRow]) -> None:
@@ -149,11 +151,16 @@ def _check_signature(store: Store, season: Season, row: SealedRow) -> None:
         _refuse(store, path, "its signature does not match the entrant's key")
 
 
-def _scored(store: Store, season: Season, master: Master, row: SealedRow) -> SealedResult:
-    if season.track == "sealed-online":
+def _scored(
+    store: Store, season: Season, master: Master, rows: Sequence[SealedRow]
+) -> Iterator[SealedResult]:
+    """The results, computed again."""
+    if season.track == "sealed-offline":
+        yield from scored_entries(store, season, master, rows)
+        return
+    for row in rows:
         _check_answers(store, season, master, row)
-        return score_ticket(store, season, master, row.number)
-    return scored_entry(store, season, master, row)
+        yield score_ticket(store, season, master, row.number)
 
 
 def _check_answers(store: Store, season: Season, master: Master, row: SealedRow) -> None:

@@ -28,13 +28,14 @@ from leaderboard.scoring.publication import (
     refuse_large_answers,
     refuse_unrankable,
 )
-from leaderboard.scoring.sealed import instances, sealed_result
+from leaderboard.scoring.sealed import instances, score_run, sealed_result
 from leaderboard.scoring.season import by_key, counting, score_entries, season_rankings
 from leaderboard.sealed import verify_season
 from leaderboard.store import Store
 from sme_registry import evaluate, materialize
 from sme_registry.datasets import SealedDataset
 from sme_registry.errors import SMEError
+from sme_registry.evaluation import evaluate_many
 from sme_registry.io import sha256_of
 from sme_registry.sealed import pack_table, unpack_table
 from tests.leaderboard.conftest import tiny_board
@@ -214,6 +215,39 @@ def test_a_season_is_scored_ranked_and_replayed(store, key, published, later) ->
     report = verify_season(store, season.id)
     assert (report.instances, report.rounded, report.entries, report.results) == (2, 0, 6, 3)
     assert by_key(store, season) == {key.public: (1, 3), friend.public: (2, 3)}
+
+
+def test_entries_share_the_optimum_of_an_instance(
+    store, key, published, later, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    season = read_season(published)
+    store.announce(season)
+    for share in (0.25, 0.5, 0.75):
+        answers = [share * each for each in optima(season, published)]
+        enter(store, season, key, answers, method=method(f"Share {share}"))
+    later()
+    store.reveal(Reveal(season=season.digest, master=MASTER.raw.hex()))
+    passes = []
+
+    def counted(policies: Any, *arguments: Any) -> Any:
+        passes.append(len(policies))
+        return evaluate_many(policies, *arguments)
+
+    monkeypatch.setattr("leaderboard.scoring.sealed.evaluate_many", counted)
+    assert score_entries(store, season.id) == 3
+    assert verify_season(store, season.id).results == 3
+    assert passes == 2 * [3, 3]  # scored and verified, on each of two instances
+    regrets = [
+        result.scores.wd_regret.value
+        for result in map(store.sealed_result, store.entrants(season.digest))
+        if result is not None
+    ]
+    assert regrets == sorted(regrets, reverse=True)
+    instance = next(instances(season, MASTER))
+    alone, _ = score_run(instance, 0.5 * optima(season, published)[0], None)
+    together = store.sealed_result(store.entrants(season.digest)[1])
+    assert together is not None
+    assert together.runs[0].normalised_regret == alone.normalised_regret
 
 
 def test_a_score_is_that_of_the_open_board(store, key, published, later) -> None:
