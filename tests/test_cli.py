@@ -33,7 +33,7 @@ SME = [sys.executable, "-c", "from sme_registry.cli import main; main()"]
 KINDS = (EnvFile, StreamFile, SuiteFile, ProtocolFile, StudyFile)
 COMMANDS = [
     *("list", "show", "new", "suite", "validate", "certify"),
-    *("evaluate", "train", "diagnose", "study", "demo"),
+    *("evaluate", "train", "diagnose", "explore", "study", "demo"),
 ]
 
 
@@ -873,6 +873,7 @@ class TestDemo:
         result = good("demo", "--steps", "200", "--out", "demo")
         names = {path.name for path in (tmp_path / "demo").iterdir()}
         assert names >= {"report.md", "training_curve.png", "decay_curve.png", "model.zip"}
+        assert "explorer.html" in names
         text = (tmp_path / "demo/report.md").read_text()
         linked = {part.split(")")[0] for part in text.split("](")[1:]}
         assert linked <= names

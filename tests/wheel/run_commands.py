@@ -27,6 +27,7 @@ ARGUMENTS = {
         "train task.json --steps 0",
         "diagnose constant --task task.json --states 64 --episodes 2 --out diagnosis",
         "diagnose constant --task task.json --states 64 --episodes 2 --probe-capacity",
+        "explore constant --task task.json --episodes 2",
         "demo --steps 0",
         "study new plan.json --task task.json -a PPO -n 1",
         "study plan smoke",
