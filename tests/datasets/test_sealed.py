@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -61,6 +62,21 @@ def test_it_is_read_back_bit_for_bit(dataset: SealedDataset, tmp_path: Path) -> 
     assert SealedDataset.collect(RECIPE).digest == dataset.digest
     other = SealedDataset.collect(RECIPE.model_copy(update={"seed": 1}))
     assert other.digest != dataset.digest
+
+
+def test_data_sets_agree_up_to_rounding(dataset: SealedDataset) -> None:
+    rounded = dataclasses.replace(dataset, rewards=dataset.rewards + 1e-14)
+    assert dataset.agrees_with(rounded)
+    assert rounded.digest != dataset.digest
+    shorter = {name: column[:-1] for name, column in dataset.columns().items()}
+    ends = dataset.truncations.copy()
+    ends[0] ^= True
+    for other in (
+        dataclasses.replace(dataset, rewards=dataset.rewards + 1e-5),
+        dataclasses.replace(dataset, truncations=ends),
+        SealedDataset(**shorter),
+    ):
+        assert not dataset.agrees_with(other)
 
 
 def test_minari_loads_it(dataset: SealedDataset, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from sme_registry.errors import UnknownNameError
@@ -13,7 +14,7 @@ from sme_registry.studies.report import exports
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.compare import compare
 from sme_registry.studies.report.frames import study_frames
-from sme_registry.studies.report.tables import METRICS
+from sme_registry.studies.report.tables import METRICS, layers
 from tests.studies.cells import small_file
 
 SMALL = {"state_dim": 2, "action_dim": 2}
@@ -96,6 +97,13 @@ def test_tables_for_people_show_them_and_what_the_layers_keep(analysis: Analysis
         ["driven", "1", "−0.50, 0.25", "−0.50, 0.25"],
     ]
     assert "layers" in exports.csv_tables(analysis)
+
+
+def test_what_layers_keep_is_the_iqm_over_runs() -> None:
+    probes = pd.DataFrame({"run": range(4), "state_r2": [0.2, -100.0, 0.6, 0.4]})
+    kept = layers(probes.assign(class_name="driven", algorithm="PPO", layer=0, distractor_r2=0.25))
+    assert kept.state_r2.tolist() == pytest.approx([0.3])
+    assert kept.runs.tolist() == [4]
 
 
 def test_a_study_of_plain_tasks_has_none_of_them() -> None:
