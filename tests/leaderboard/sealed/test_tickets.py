@@ -170,6 +170,15 @@ def test_lanes_have_a_range(played: Played, lanes: int) -> None:
     refused("lanes_invalid", played.start, lanes)
 
 
+def test_a_large_budget_has_no_more_than_256_lanes(tmp_path: Path) -> None:
+    member = {"name": "deep", "setting": SETTING, "instances": 1, "budget": 1000}
+    played = Played(online_board(tmp_path, classes=[member]))
+    refused("lanes_invalid", played.start, 257)
+    played.start(256)
+    played.tickets.close()
+    played.store.close()
+
+
 def test_an_instance_keeps_its_lanes(played: Played) -> None:
     played.start(4)
     refused("start_conflict", played.start, 5)
