@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+import rfc8785
 
 from leaderboard import intake
 from leaderboard.documents.entry import Entry, SignedEntry
@@ -184,6 +186,32 @@ def test_refused_entries_of_a_server_count_for_their_key(tmp_path: Path, key):
                 intake.receive_entry(store, envelope, SEASON.digest, refusals)
             codes.append(error.value.code)
         assert codes == ["artefact_missing", "artefact_missing", "quota"]
+
+
+def test_what_is_no_entry_counts_for_its_key_too(tmp_path: Path, key):
+    refusals = intake.Refusals()
+    with tiny_board(tmp_path / "small", limits={"submissions_per_day": 2}) as store:
+        codes = []
+        for note in ("1", "2", "3"):
+            plain = manifest(SEASON, key, answers=[], statement=note)
+            digest, board = sha256_of(rfc8785.dumps(plain)), store.document.key
+            document = {"entry": plain, "signature": key.sign("entry", digest, board)}
+            text = json.dumps({**document, "board": board}).encode()
+            with pytest.raises(Rejection) as error:
+                intake.receive_entry(
+                    store, Envelope.read(text, SignedEntry), SEASON.digest, refusals
+                )
+            codes.append(error.value.code)
+        assert codes == ["schema", "schema", "quota"]
+
+
+def test_an_entry_that_is_sent_to_another_season_is_refused(store, key):
+    other = tiny_season(id="other")
+    store.announce(other)
+    envelope = Envelope.read(entry(store, key, None, None).to_bytes(), SignedEntry)
+    with pytest.raises(Rejection, match="season_unknown"):
+        intake.receive_entry(store, envelope, other.digest, intake.Refusals())
+    assert intake.receive_entry(store, envelope, SEASON.digest, intake.Refusals())
 
 
 def test_entries_over_http_have_the_same_codes(store, key):

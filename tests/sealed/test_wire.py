@@ -58,6 +58,13 @@ def test_the_answer_to_start_arrives():
     assert np.array_equal(begun.observation, random(LANES, S + 2))
 
 
+def test_an_answer_to_start_of_another_size_is_refused():
+    data = FORMAT.pack_begun(Begun(7, random(LANES, S + 2)))
+    for other in (b"", data[:-4], data + bytes(4 * LANES)):
+        with pytest.raises(WireError, match="start: has"):
+            FORMAT.unpack_begun(other)
+
+
 def test_numbers_and_actions_arrive_from_double_precision_too():
     body = FORMAT.pack_request(9, random(LANES, A).astype(np.float64))
     number, actions = FORMAT.unpack_request(body)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from leaderboard.scoring import tables
 from leaderboard.scoring.tables import EASY, table_regret
 from sme_registry.spec import Setting
 
@@ -18,3 +21,12 @@ def test_few_state_channels_are_filled_by_a_table_and_many_are_not() -> None:
 def test_more_rows_make_a_better_table_and_one_row_is_enough() -> None:
     one, hundred, thousands = (table_regret(setting(2), rows) for rows in (1, 100, 3000))
     assert thousands < hundred < one < 2
+
+
+def test_the_number_of_neighbours_that_answers_best_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    each = []
+    for count in (1, 8):
+        with monkeypatch.context() as patch:
+            patch.setattr(tables, "_NEIGHBOURS", (count,))
+            each.append(table_regret(setting(8), 300))
+    assert table_regret(setting(8), 300) <= min(each) < max(each)

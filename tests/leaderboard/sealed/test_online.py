@@ -262,9 +262,21 @@ def test_a_request_of_one_season_opens_no_ticket_of_another(tmp_path: Path) -> N
         store.announce(other)
         envelope = Envelope.read(board.request(KEY).to_bytes(), SignedTicketRequest)
         assert start_ticket(store, envelope, board.season.digest) == (1, True)
-        with pytest.raises(Rejection, match="season_unknown"):
-            start_ticket(store, envelope, other.digest)
+        new = Envelope.read(board.request(KEY, 1).to_bytes(), SignedTicketRequest)
+        for each in (envelope, new):
+            with pytest.raises(Rejection, match="season_unknown"):
+                start_ticket(store, each, other.digest)
         assert start_ticket(store, envelope, board.season.digest) == (1, False)
+        assert len(store.entrants(board.season.digest)) == 1
+
+
+def test_a_request_for_another_board_starts_no_ticket(tmp_path: Path) -> None:
+    board = online_board(tmp_path)
+    with Store.open(board.path) as store:
+        elsewhere = board.request(KEY).ticket.signed(KEY, "ab" * 32)
+        envelope = Envelope.read(elsewhere.to_bytes(), SignedTicketRequest)
+        with pytest.raises(Rejection, match="wrong_board"):
+            start_ticket(store, envelope, board.season.digest)
 
 
 def test_a_name_belongs_to_one_key(tmp_path: Path) -> None:

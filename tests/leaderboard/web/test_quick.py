@@ -98,6 +98,19 @@ def answer_on(connection: socket.socket) -> tuple[int, bytes]:
         return answer.status, answer.read()
 
 
+def test_no_cache_keeps_an_answer_and_no_browser_guesses_its_type(stepped: Stepped) -> None:
+    with stepped.connect() as connection:
+        connection.sendall(stepped.request(1))
+        with http.client.HTTPResponse(connection) as answer:
+            answer.begin()
+            headers = dict(answer.headers)
+    assert {
+        "content-type": "application/octet-stream",
+        "cache-control": "no-store",
+        "x-content-type-options": "nosniff",
+    }.items() <= headers.items()
+
+
 def test_a_plain_request_is_read() -> None:
     extra = b"content-type: x\r\nX-Forwarded-For: 203.0.113.7\r\nConnection: Keep-Alive\r\n\r\n"
     for head in (HEAD, HEAD[:-2] + extra):

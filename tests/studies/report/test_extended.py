@@ -10,7 +10,7 @@ import pytest
 from sme_registry.errors import UnknownNameError
 from sme_registry.evaluation.observation import LayerProbe
 from sme_registry.studies.engine.cell import run_cell
-from sme_registry.studies.report import exports
+from sme_registry.studies.report import exports, frames
 from sme_registry.studies.report.analysis import Analysis, analyse
 from sme_registry.studies.report.compare import compare
 from sme_registry.studies.report.frames import study_frames
@@ -75,6 +75,28 @@ def test_levels_are_the_iqm_of_the_reports(analysis: Analysis) -> None:
     ).itertuples()
     assert row.iqm == pytest.approx(sum(costs) / 2)
     assert row.iqm > 0
+
+
+def test_columns_of_a_run_are_those_of_the_cube_and_of_its_training() -> None:
+    file, results = finished("safe", "driven")
+    costs = {key: number / 100 for number, key in enumerate(results)}
+    for planned in file.plan.cells:
+        key = planned.cell.digest
+        if planned.cell.spec.safety is not None:
+            results[key] = results[key].model_copy(update={"online_cost": costs[key]})
+    runs = frames.runs(study_frames(file.plan, results).results).set_index("key")
+    for planned in file.plan.cells:
+        key, report = planned.cell.digest, results[planned.cell.digest].report
+        assert report is not None
+        row = runs.loc[key]
+        if report.safety is not None:
+            inside = report.safety.regions[0]
+            assert (row.online_cost, row.wd_cost) == (costs[key], inside.cost)
+            assert row.wd_safe_regret == inside.safe_regret != inside.cost
+        else:
+            assert report.observation is not None
+            assert row.wd_invariance == report.observation.invariance[0].invariance
+            assert row.distractor_regret == report.distractor_regret
 
 
 def test_differences_and_comparisons_have_the_metrics_too() -> None:
