@@ -159,9 +159,19 @@ KeyFile = Annotated[
 ]
 
 MethodName = Annotated[
-    str, typer.Option("--method", help="Name of the method, as the board shows it.")
+    str,
+    typer.Option(
+        "--method",
+        help="Name of the method: letters a–z, digits, single spaces and ._+-().",
+    ),
 ]
-SubmitterName = Annotated[str, typer.Option("--submitter", help="Your name or your lab's.")]
+SubmitterName = Annotated[
+    str,
+    typer.Option(
+        "--submitter",
+        help="Your name or your lab's; on a board it belongs to the first key that uses it.",
+    ),
+]
 MethodVersion = Annotated[str, typer.Option(help="Version of the method.")]
 Family = Annotated[
     str | None, typer.Option(help="Family such as PPO; the method's name by default.")

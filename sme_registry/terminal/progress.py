@@ -205,5 +205,6 @@ class Progress:
 def _rate(rate: float, unit: str) -> str:
     """`280 steps/s`; where a step takes longer than a second, `3 s per run`."""
     if rate < 1 and unit.endswith("s"):
-        return f"{duration(1 / rate)} per {unit[:-1]}"
+        one = f"{unit[:-3]}y" if unit.endswith("ies") else unit[:-1]
+        return f"{duration(1 / rate)} per {one}"
     return f"{rate:,.0f} {unit}/s"
