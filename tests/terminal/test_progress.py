@@ -77,6 +77,16 @@ def test_what_precedes_the_first_steps_is_shown_at_once_and_slows_no_estimate(cl
     ]
 
 
+@pytest.mark.parametrize(("unit", "one"), [("steps", "step"), ("entries", "entry")])
+def test_a_slow_rate_names_one_of_the_unit(clock: Clock, unit: str, one: str) -> None:
+    text = io.StringIO()
+    with Progress("scoring", 10, console=Console(file=text, width=200), unit=unit) as progress:
+        for done in (1, 2):
+            clock.now += 30.0
+            progress.update(done)
+    assert f"30 s per {one} " in text.getvalue()
+
+
 @pytest.mark.parametrize(("hours", "most"), [(0.05, 7), (1, 20), (24, 25), (24 * 30, 30)])
 def test_a_log_stays_short_however_long_the_job_takes(
     clock: Clock, hours: float, most: int
