@@ -129,10 +129,15 @@ class Pages:
             ),
         )
 
-    def preparation(self) -> str:
-        """The page of a board whose reference rows wait, which reloads itself."""
+    def preparation(self, root: str = "") -> str:
+        """The page of a board whose reference rows wait, which reloads itself.
+
+        Args:
+          root: the path from the page's folder to the top one.
+        """
+        here = "" if root else "index.html"
         return self._render(
-            "preparing.html", here="index.html", title="Preparing", **self._overview
+            "preparing.html", here=here, root=root, title="Preparing", **self._overview
         )
 
     @cached_property
@@ -355,8 +360,13 @@ class Pages:
         """A file without scores, while the reference rows wait."""
         if folder == "submissions":
             return self._document(folder, name)
-        if folder == "seasons" and name.removesuffix(".html") in self._seasons:
-            return self.preparation().encode()  # the same scorer scores them
+        if folder == "seasons":
+            id, _, kind = name.rpartition(".")
+            if kind != "html" or id not in self._seasons:
+                return None
+            # The scorer of the reference rows has scored the entries, too.
+            scored = any(season_page(self.store, self._seasons[id]).rankings.values())
+            return (self.preparation("../") if scored else self.season(id)).encode()
         if folder or name not in self._top:
             return None
         render = self.preparation if name in _NEED_SCORES else self._top[name]

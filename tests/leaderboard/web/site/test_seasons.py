@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from leaderboard import intake
 from leaderboard.documents.keys import SigningKey
 from leaderboard.documents.result import Stepping
 from leaderboard.documents.season import Reveal, Season
@@ -44,6 +45,12 @@ def board(tmp_path: Path) -> Iterator[Store]:
 
 def page(store: Store, path: str) -> Page:
     content = Pages(store).read(path)
+    assert content is not None
+    return Page(content.decode())
+
+
+def served_page(store: Store, path: str) -> Page:
+    content = Pages(store, address="http://board.test").read(path)
     assert content is not None
     return Page(content.decode())
 
@@ -98,6 +105,24 @@ def test_a_tickets_learning_curve_is_shown_when_it_ends(board, key) -> None:
     assert "0.625" in ended.words
     labels = [svg.get("aria-label", "") for svg in ended.all("svg")]
     assert sum(label.startswith("From the first step: 1.00") for label in labels) == 1
+
+
+def test_a_season_is_shown_before_the_boards_reference_rows_but_not_its_scores(
+    tmp_path, key, monkeypatch
+) -> None:
+    monkeypatch.setattr(boards, "submit", lambda *args, **fields: None)
+    with boards.create(tmp_path / "board", classes=1) as board:
+        intake.submit_references(board)
+        board.announce(ONLINE)
+        request = signed_request(board, ONLINE, key)
+        board.start_ticket(request)
+        assert "running" in served_page(board, "seasons/winter.html").words
+        board.end_ticket(ONLINE.digest, 1, result(ONLINE, request.id))
+        prepares = served_page(board, "seasons/winter.html")
+    assert "Preparing." in prepares.words
+    assert "0.625" not in prepares.words
+    links = [each["href"] for each in prepares.all("link") + prepares.all("a") if "href" in each]
+    assert [link for link in links if not link.startswith(("../", "#"))] == []
 
 
 def test_a_result_is_read_once_however_often_the_page_is(board, key, monkeypatch) -> None:
