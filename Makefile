@@ -50,7 +50,7 @@ lowest:          ## run the core's tests with the lowest versions that pyproject
 
 docs: $(INSTALLED)     ## regenerate the generated pages of docs/, run the tutorials, build docs/_build/html
 	$(PY) docs/generate.py
-	$(PY) -m sphinx -q -W --keep-going $(SPHINX) docs docs/_build/html
+	$(PY) -m sphinx -q -W --keep-going -j auto $(SPHINX) docs docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
 frameworks: $(FRAMEWORKS:%=framework-%)  ## run the examples for gymnax, RLlib, sbx and Tianshou, each in an environment of its own

@@ -26,8 +26,13 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "sphinx_design",
+    "code_links",
+    "command_reference",
     "contents",
-    "outside_links",
+    "docstrings",
+    "links",
+    "python_reference",
+    "schema_files",
     "tutorial_cells",
 ]
 exclude_patterns = ["_build", "_extensions", "**/.ipynb_checkpoints"]
@@ -46,9 +51,12 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
 
+highlight_language = "text"  # of blocks without a language
+
 html_theme = "furo"
 html_title = f"SME Registry {release}"
 html_static_path = ["_static"]
+html_favicon = "../leaderboard/web/site/static/icon.svg"
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
@@ -57,3 +65,14 @@ pygments_style = "default"
 pygments_dark_style = "github-dark"
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
+
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_class_signature = "mixed"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 80
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False

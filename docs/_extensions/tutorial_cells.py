@@ -11,14 +11,23 @@ can be run by a test, and the site shows what they print and draw. A line above 
     <!-- cell: hide-output -->
 
 gives the cell MyST-NB's tags, separated by spaces: `hide-input`, `hide-output`, `remove-output`,
-`raises-exception`, `skip-execution` and others.
+`raises-exception`, `skip-execution` and others. The site offers each tutorial as a notebook too,
+whose first cell installs the package where it is missing, with the extras that the page names:
+
+    <!-- extras: plot,train -->
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
+import nbformat
+from nbformat import NotebookNode, v4
 from sphinx.application import Sphinx
+
+from sme_registry.io import write_atomically
 
 FOLDER = "tutorials/"
 _HEADER = """---
@@ -33,26 +42,82 @@ _BLOCK = re.compile(
     r"(?:^<!-- cell: (?P<tags>[a-z -]+?) -->\n+)?^```(?P<language>python|sh)\n(?P<code>.*?)^```$",
     re.M | re.S,
 )
+_EXTRAS = re.compile(r"^<!-- extras: ([a-z, ]+?) -->$", re.M)
+_RELATIVE_LINK = re.compile(r"!?\[([^\]]*)\]\((?!https?:)[^)]*\)")
+_COMMENT = re.compile(r"^<!--.*?-->\n?", re.M | re.S)
+_INSTALL = """# Installs the package where it is missing.
+import importlib.util
+
+if importlib.util.find_spec("sme_registry") is None:
+    %pip install --quiet "sme-registry{extras}"
+"""
 
 
-def as_notebook(text: str) -> str:
-    """A tutorial as a MyST text notebook; unchanged if it has no block to execute."""
+def as_page(text: str, name: str) -> str:
+    """A tutorial as a MyST text notebook with a link to its notebook file.
+
+    Args:
+      text: the tutorial; unchanged if it has no block to execute.
+      name: the file's name without `.md`.
+    """
     cells, count = _BLOCK.subn(_cell, text)
-    return _HEADER + cells if count else text
+    if not count:
+        return text
+    link = (
+        f'\n\n<a href="../notebooks/{name}.ipynb" download>Download this page as a notebook</a>\n'
+    )
+    title, _, rest = cells.partition("\n")
+    return f"{_HEADER}{title}\n{link}{rest}"
+
+
+def _code(block: re.Match[str]) -> str:
+    shell = "%%sh\n" if block["language"] == "sh" else ""
+    return shell + block["code"]
 
 
 def _cell(block: re.Match[str]) -> str:
     tags = f":tags: [{', '.join(block['tags'].split())}]\n" if block["tags"] else ""
-    shell = "%%sh\n" if block["language"] == "sh" else ""
-    return f"```{{code-cell}} python3\n{tags}{shell}{block['code']}```"
+    return f"```{{code-cell}} python3\n{tags}{_code(block)}```"
+
+
+def as_notebook(text: str) -> NotebookNode:
+    """A tutorial as a notebook for Jupyter, without outputs."""
+    extras = _EXTRAS.search(text)
+    install = _INSTALL.format(extras=f"[{extras[1].replace(' ', '')}]" if extras else "")
+    title, _, rest = text.partition("\n")
+    cells = [v4.new_markdown_cell(title), v4.new_code_cell(install), *_cells(rest)]
+    for number, cell in enumerate(cells):
+        cell["id"] = f"cell-{number}"  # else random: equal pages give equal files
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    return v4.new_notebook(cells=cells, metadata={"kernelspec": kernel})
+
+
+def _cells(text: str) -> Iterator[NotebookNode]:
+    end = 0
+    for block in _BLOCK.finditer(text):
+        yield from _prose(text[end : block.start()])
+        yield v4.new_code_cell(_code(block).rstrip("\n"))
+        end = block.end()
+    yield from _prose(text[end:])
+
+
+def _prose(text: str) -> Iterator[NotebookNode]:
+    """A cell of text: its links to other pages would lead nowhere."""
+    if plain := _RELATIVE_LINK.sub(r"\1", _COMMENT.sub("", text)).strip():
+        yield v4.new_markdown_cell(plain)
 
 
 def _on_read(app: Sphinx, name: str, source: list[str]) -> None:
     if name.startswith(FOLDER):
-        source[0] = as_notebook(source[0])
+        text, file = source[0], name.removeprefix(FOLDER)
+        source[0] = as_page(text, file)
+        if source[0] != text:
+            folder = Path(app.outdir, "notebooks")
+            folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / f"{file}.ipynb", nbformat.writes(as_notebook(text)) + "\n")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register with Sphinx."""
-    app.connect("source-read", _on_read)
+    """Register with Sphinx: before `links`, so that notebooks get the page as it is written."""
+    app.connect("source-read", _on_read, priority=300)
     return {"parallel_read_safe": True}

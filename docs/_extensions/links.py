@@ -1,7 +1,9 @@
-"""Links from a page to files outside `docs/`, which work on GitHub, work on the site as well.
+"""Links that work on GitHub work on the site as well.
 
-A link to a page of the repository that the site contains (`_PAGES`) leads there. MyST makes a link
-to any other file a download. A folder cannot be downloaded: its link becomes plain text.
+- A link to a page outside `docs/` that the site contains (`_PAGES`) leads there. MyST makes a link
+  to any other file a download. A folder cannot be downloaded: its link becomes plain text.
+- A link whose text is a file's name, such as `[teams.md](teams.md)`, has the page's title as its
+  text: the site has no such file.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ _PAGES = {
     "CHANGELOG.md": "project/changelog.md",
     "CONTRIBUTING.md": "project/contributing.md",
 }
+_FILE_NAME = re.compile(r"(?<!!)\[[\w/-]+\.md\](?=\([^):\s]+\))")
 _LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<path>\.\./[^)#\s]*)(?P<anchor>#[^)\s]*)?\)")
 
 
 def rewrite(text: str, folder: str, root: Path) -> str:
-    """The Markdown of a page with its links to files outside `docs/` made links of the site.
+    """The Markdown of a page with its links made links of the site.
 
     Args:
       text: Markdown.
@@ -36,7 +39,7 @@ def rewrite(text: str, folder: str, root: Path) -> str:
             return f"[{link['text']}]({page}{link['anchor'] or ''})"
         return link["text"] if (root.parent / path).is_dir() else link[0]
 
-    return _LINK.sub(replaced, text)
+    return _FILE_NAME.sub("[]", _LINK.sub(replaced, text))
 
 
 def _on_read(app: Sphinx, name: str, source: list[str]) -> None:

@@ -1,0 +1,174 @@
+"""The site as a reader sees it: built without a warning, whole without a network, at two widths."""
+
+import functools
+import html.parser
+import http.server
+import json
+import os
+import re
+import shutil
+import threading
+
+import pytest
+
+from tests.docs.conftest import ROOT
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+WIDTHS = {"phone": 400, "desktop": 1280}
+SAMPLE = (
+    "index", "tutorials/own_agents", "guides/studies", "guides/frameworks", "explanation/method",
+    "results/ablations_in_jax", "reference/catalogue", "reference/sme", "reference/schemas",
+    "reference/python/sme_registry", "reference/python/sme_registry.spec", "genindex",
+)  # fmt: skip
+
+in_chromium = pytest.mark.skipif(
+    CHROMIUM is None and not os.environ.get("CI"), reason="chromium is not installed"
+)
+
+
+class Loaded(html.parser.HTMLParser):
+    """What a page loads by itself, unlike what it links to."""
+
+    def __init__(self):
+        super().__init__()
+        self.addresses = []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag in ("script", "img", "iframe", "source"):
+            self.addresses.append(values.get("src") or "")
+        elif tag == "link" and values.get("rel") not in ("next", "prev", "index", "search"):
+            self.addresses.append(values.get("href") or "")
+
+
+def test_no_page_loads_anything_from_another_host(site):
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 80
+    for page in pages:
+        parser = Loaded()
+        parser.feed(page.read_text(encoding="utf-8"))
+        outside = [a for a in parser.addresses if re.match(r"(https?:)?//", a)]
+        assert outside == [], page
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"url\(['\"]?(https?:)?//|@import", sheet.read_text()), sheet
+
+
+def test_every_page_of_the_sources_is_in_the_site(site):
+    hidden = {"_build", "_extensions", "python"}
+    sources = [p.relative_to(ROOT / "docs") for p in (ROOT / "docs").rglob("*.md")]
+    pages = [p for p in sources if not hidden.intersection(p.parts)]
+    assert len(pages) > 40
+    assert [p for p in pages if not (site / p).with_suffix(".html").exists()] == []
+
+
+def test_a_schema_is_a_file_and_a_tutorial_a_notebook(site):
+    schema = json.loads((site / "schemas" / "SMESpec.schema.json").read_text())
+    assert schema["properties"]["k"]["minimum"] == 1
+    notebook = json.loads((site / "notebooks" / "own_agents.ipynb").read_text())
+    assert notebook["nbformat"] == 4
+    page = (site / "tutorials" / "own_agents.html").read_text()
+    assert "../notebooks/own_agents.ipynb" in page
+
+
+def test_names_and_commands_in_code_lead_to_their_reference(site):
+    page = (site / "guides" / "training.html").read_text()
+    assert re.search(r'href="\.\./reference/sme\.html#sme-train"', page)
+    page = (site / "guides" / "studies.html").read_text()
+    assert re.search(r'href="\.\./reference/python/sme_registry\.studies\.html#sme_reg', page)
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    sync_api = pytest.importorskip("playwright.sync_api")
+    assert CHROMIUM is not None, "CI=true and no chromium: apt-get install chromium"
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+class _Handler(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def origin(site):
+    """The address at which the site is served: a search reads pages, which a file may not do."""
+    handler = functools.partial(_Handler, directory=str(site))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def opened(chromium, origin):
+    """Opens pages, and fails where one complained or asked for anything from another host."""
+    contexts, problems = [], []
+
+    def requested(request):
+        if not request.url.startswith((origin, "data:")):
+            problems.append(request.url)
+
+    def complained(message):
+        if message.type in ("error", "warning"):
+            problems.append(f"{message.location['url']}: {message.text}")
+
+    def open_(name, width="desktop", **options):
+        size = {"width": WIDTHS[width], "height": 800}
+        context = chromium.new_context(viewport=size, **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(60_000)  # for machines with other things to do
+        page.on("console", complained)
+        page.on("pageerror", lambda error: problems.append(f"{page.url}: {error}"))
+        page.on("request", requested)
+        page.goto(f"{origin}{name}.html")
+        return page
+
+    yield open_
+    for context in contexts:
+        context.close()
+    assert problems == []
+
+
+@in_chromium
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_page_is_wider_than_the_screen(origin, width, opened):
+    page = opened("index", width)
+    too_wide = {}
+    for name in SAMPLE:
+        page.goto(f"{origin}{name}.html")
+        # On a phone, Furo's text scrolls within `.content`, and the document is never too wide.
+        widths = "[document.documentElement, document.querySelector('.content')]"
+        wide = max(page.evaluate(f"{widths}.map(element => element.scrollWidth)"))
+        assert page.evaluate("window.innerWidth") == WIDTHS[width]
+        if wide > WIDTHS[width]:
+            too_wide[name] = wide
+    assert too_wide == {}
+
+
+@in_chromium
+def test_search_finds_a_word_and_leads_to_its_page(opened):
+    page = opened("index")
+    page.get_by_role("textbox", name="Search").fill("plasticity")
+    page.keyboard.press("Enter")
+    page.locator("ul.search li a", has_text="What an agent retains").first.click()
+    assert "/guides/retention.html" in page.url
+
+
+@in_chromium
+def test_dark_is_dark_and_light_is_light_and_a_button_changes_it(opened):
+    def brightness(page):
+        colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        return sum(map(int, re.findall(r"\d+", colour)[:3])) / 3
+
+    light = opened("index", color_scheme="light")
+    assert brightness(light) > 230
+    assert brightness(opened("index", color_scheme="dark")) < 40
+    light.locator("button.theme-toggle:visible").click()
+    assert brightness(light) < 40
