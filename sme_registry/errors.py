@@ -32,7 +32,15 @@ from collections.abc import Iterable
 
 
 class SMEError(Exception):
-    """Base of every error that this package raises on invalid input."""
+    """Base of every error that this package raises on invalid input.
+
+    Examples:
+      >>> try:
+      ...     sme_registry.load("Defualt")
+      ... except sme_registry.SMEError as error:
+      ...     print(type(error).__name__)
+      UnknownNameError
+    """
 
 
 class SpecError(SMEError, ValueError):

@@ -94,6 +94,12 @@ def register(spec: SMESpec | StreamSpec, name: str) -> str:
     Raises:
       OptionError: the name has invalid characters, or ends with "Symmetric".
       NameTakenError: the id stands for another spec; a released id never changes its numbers.
+
+    Examples:
+      >>> sme_registry.register(sme_registry.SMESpec(k=3), "EveryThird")
+      'SME/EveryThird-v1'
+      >>> sme_registry.load("EveryThird").k
+      3
     """
     from sme_registry.envs.base import argument_of
     from sme_registry.spec import StreamSpec, as_spec, as_stream
@@ -164,6 +170,12 @@ def load(id_or_path_or_digest: str | os.PathLike[str], kind: Any = None) -> Any:
       MalformedDocumentError, SpecError, DigestMismatchError: the file is invalid.
       FingerprintMismatchError: this machine draws other numbers than the file publishes.
       ResourceLimitError: the file's task would not fit in memory.
+
+    Examples:
+      >>> sme_registry.load("Complexity10").complexity
+      10
+      >>> sme_registry.load("sha256:66e9b7a9a266").content_name
+      'sha256-66e9b7a9a266'
     """
     from sme_registry.spec import SMESpec, StreamSpec
     from sme_registry.task import load_document, load_spec, load_stream
@@ -197,6 +209,12 @@ def save(
       SpecError: the name or a tag has invalid characters.
       ResourceLimitError: the task would not fit in memory.
       OptionError: the file cannot be written; an existing file is unchanged.
+
+    Examples:
+      >>> spec = sme_registry.SMESpec(state_dim=16, complexity=10, seed=7)
+      >>> path = sme_registry.save(spec, "Deep16.json", description="Sixteen channels, ten layers.")
+      >>> sme_registry.load(path) == spec
+      True
     """
     from sme_registry.spec import EnvFile, StreamFile, as_spec, as_stream
     from sme_registry.spec.resolve import names_stream
@@ -236,6 +254,12 @@ def env_spec(spec: SpecLike | StreamLike, **kwargs: Any) -> EnvSpec:
     Raises:
       UnknownNameError, SpecError: see `load`. A stream has no fields of a spec to override.
       FingerprintMismatchError: this machine draws other numbers than the spec's file publishes.
+
+    Examples:
+      >>> import gymnasium
+      >>> derived = sme_registry.env_spec("Default", complexity=10)
+      >>> gymnasium.make(derived).unwrapped.sme_spec.complexity
+      10
     """
     from sme_registry.envs import SMEStreamEnv, arguments
     from sme_registry.envs.base import content_id
@@ -268,6 +292,13 @@ def make(spec_or_id: SpecLike | StreamLike, **kwargs: Any) -> gymnasium.Env[Any,
 
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEEnv`.
+
+    Examples:
+      >>> env = sme_registry.make("Default", horizon=20)
+      >>> observation, info = env.reset(seed=0)
+      >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+      >>> bool(0 <= info["regret"] <= 1)
+      True
     """
     return gymnasium.make(registered_or_new(spec_or_id), **kwargs)
 
@@ -287,6 +318,12 @@ def make_vec(
 
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
+
+    Examples:
+      >>> envs = sme_registry.make_vec("Default", 64)
+      >>> observations, infos = envs.reset(seed=0)
+      >>> observations.shape
+      (64, 10)
     """
     return gymnasium.make_vec(registered_or_new(spec_or_id), num_envs=num_envs, **kwargs)
 
@@ -310,6 +347,12 @@ def make_parallel(spec_or_id: SpecLike, **kwargs: Any) -> SMETeamEnv:
 
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+
+    Examples:
+      >>> team = sme_registry.make_parallel("Team4")
+      >>> observations, infos = team.reset(seed=0)
+      >>> team.agents
+      ['agent_0', 'agent_1', 'agent_2', 'agent_3']
     """
     from sme_registry.teams import parallel_env
 
@@ -320,6 +363,12 @@ def make_aec(spec_or_id: SpecLike, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """The same as a PettingZoo AEC environment: agents act in turn, the step is joint.
 
     Arguments and errors are those of `make_parallel`.
+
+    Examples:
+      >>> team = sme_registry.make_aec("Team4")
+      >>> team.reset(seed=0)
+      >>> team.agent_selection
+      'agent_0'
     """
     from sme_registry.teams import env
 

@@ -70,6 +70,11 @@ class Estimate:
       value: `[K]`.
       low: `[K]` lower ends; NaN where each class has a single run.
       high: `[K]` upper ends; NaN likewise.
+
+    Examples:
+      >>> from sme_registry.statistics import Estimate
+      >>> Estimate(value=np.array([0.5]), low=np.array([0.4]), high=np.array([0.6])).low
+      array([0.4])
     """
 
     value: Array
@@ -85,6 +90,11 @@ def iqm(runs: npt.ArrayLike) -> Array:
 
     Returns:
       `[…]`, in the runs' units.
+
+    Examples:
+      >>> from sme_registry.statistics import iqm
+      >>> float(iqm([0.0, 1.0, 2.0, 100.0]))
+      1.5
     """
     ordered = np.sort(np.asarray(runs, dtype=np.float64), axis=0)
     cut = len(ordered) // 4
@@ -92,12 +102,24 @@ def iqm(runs: npt.ArrayLike) -> Array:
 
 
 def mean(runs: npt.ArrayLike) -> Array:
-    """The mean over the first axis: `[n, …]` to `[…]`."""
+    """The mean over the first axis: `[n, …]` to `[…]`.
+
+    Examples:
+      >>> from sme_registry.statistics import mean
+      >>> mean([[1.0, 2.0], [3.0, 4.0]])
+      array([2., 3.])
+    """
     return np.asarray(np.mean(np.asarray(runs, dtype=np.float64), axis=0))
 
 
 def median(runs: npt.ArrayLike) -> Array:
-    """The median over the first axis: `[n, …]` to `[…]`."""
+    """The median over the first axis: `[n, …]` to `[…]`.
+
+    Examples:
+      >>> from sme_registry.statistics import median
+      >>> float(median([0.0, 1.0, 100.0]))
+      1.0
+    """
     return np.asarray(np.median(np.asarray(runs, dtype=np.float64), axis=0))
 
 
@@ -110,12 +132,23 @@ def optimality_gap(scores: npt.ArrayLike, target: float = 1.0) -> Array:
 
     Returns:
       `[…]`, at least 0, in the scores' units.
+
+    Examples:
+      >>> from sme_registry.statistics import optimality_gap
+      >>> float(optimality_gap([0.5, 1.5]))
+      0.25
     """
     return mean(np.maximum(0.0, target - np.asarray(scores, dtype=np.float64)))
 
 
 def smoothing_window(rows: int) -> int:
-    """The entries in a median of a training curve of this many: a tenth, in [1, 50]."""
+    """The entries in a median of a training curve of this many: a tenth, in [1, 50].
+
+    Examples:
+      >>> from sme_registry.statistics import smoothing_window
+      >>> [smoothing_window(rows) for rows in (5, 200, 10_000)]
+      [1, 20, 50]
+    """
     return min(50, max(1, rows // 10))
 
 
@@ -128,6 +161,11 @@ def running_median(values: Array, window: int) -> Array:
 
     Returns:
       `[N]` medians of the last `window` entries up to each, of fewer at the beginning.
+
+    Examples:
+      >>> from sme_registry.statistics import running_median
+      >>> running_median(np.array([4.0, 2.0, 0.0, 8.0]), 3)
+      array([4., 3., 2., 2.])
     """
     N = len(values)
     medians = [np.median(values[:end]) for end in range(1, min(window, N + 1))]
@@ -152,6 +190,14 @@ def smoothed(step: Array, values: Array, window: int | None = None) -> tuple[Arr
 
     Raises:
       OptionError: `window` is not a positive integer.
+
+    Examples:
+      >>> from sme_registry.statistics import smoothed
+      >>> step, regret, window = smoothed(np.array([100, 200, 300]), np.array([0.9, 0.5, 0.7]), 2)
+      >>> step
+      array([200, 300])
+      >>> regret.round(2)
+      array([0.7, 0.6])
     """
     order = np.argsort(step, kind="stable")
     x, y = step[order], values[order]
@@ -177,6 +223,12 @@ def aggregate(
 
     Returns:
       `[K]`, in the scores' units.
+
+    Examples:
+      >>> from sme_registry.statistics import aggregate
+      >>> classes = {"easy": np.array([[1.0], [3.0]]), "hard": np.array([[0.0]])}
+      >>> aggregate(classes)
+      array([1.])
     """
     values, shares = _statistics(classes, statistic), _weights(classes, weights)
     weighted = [shares[name] * values[name](runs) for name, runs in classes.items()]
@@ -205,6 +257,13 @@ def stratified_bootstrap(
     Returns:
       The lower and upper ends, `[K]` each, in the scores' units; NaN where each class has a
       single run.
+
+    Examples:
+      >>> from sme_registry.statistics import stratified_bootstrap
+      >>> classes = {"easy": np.array([[1.0], [3.0]]), "hard": np.array([[0.0], [1.0]])}
+      >>> low, high = stratified_bootstrap(classes, 1000, "any text")
+      >>> bool(low[0] < 1.25 < high[0])
+      True
     """
     value = aggregate(classes, statistic, weights)
     if max(map(len, classes.values())) == 1:
@@ -244,6 +303,12 @@ def performance_profile(
 
     Returns:
       `[K]` shares in [0, 1], which never rise with τ, with pointwise intervals.
+
+    Examples:
+      >>> from sme_registry.statistics import performance_profile
+      >>> scores = {"easy": np.array([0.2, 0.6, 0.9]), "hard": np.array([0.1, 0.3])}
+      >>> performance_profile(scores, [0.0, 0.5], 1000, "any text").value.round(2)
+      array([1.  , 0.33])
     """
     tau = np.asarray(thresholds, dtype=np.float64)
     above = {name: (np.asarray(x)[:, None] > tau).astype(float) for name, x in classes.items()}
@@ -268,6 +333,12 @@ def probability_of_improvement(
 
     Returns:
       `[1]`, in [0, 1]; ½ if neither is better.
+
+    Examples:
+      >>> from sme_registry.statistics import probability_of_improvement
+      >>> ours, theirs = {"easy": np.array([0.8, 0.9])}, {"easy": np.array([0.5, 0.85])}
+      >>> probability_of_improvement(ours, theirs, 1000, "any text").value
+      array([0.75])
     """
     value, deviation = np.zeros(1), np.zeros((1, draws))
     pairs, unanimous, known = 0, True, False

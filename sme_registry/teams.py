@@ -38,6 +38,15 @@ def parallel_env(
     Raises:
       UnknownNameError, SpecError, ResourceLimitError, OptionError: see `SMETeamEnv`.
       OptionError: `max_cycles` and `horizon` differ.
+
+    Examples:
+      >>> from sme_registry import teams
+      >>> team = teams.parallel_env("Team2", max_cycles=10)
+      >>> observations, infos = team.reset(seed=0)
+      >>> actions = {agent: team.action_space(agent).sample() for agent in team.agents}
+      >>> observations, rewards, terminations, truncations, infos = team.step(actions)
+      >>> sorted(rewards)
+      ['agent_0', 'agent_1']
     """
     if max_cycles is not None and kwargs.setdefault("horizon", max_cycles) != max_cycles:
         raise OptionError(
@@ -50,7 +59,16 @@ def parallel_env(
 def env(
     spec: SpecLike = "Team2-v1", **kwargs: Any
 ) -> AECEnv[str, Observation, npt.NDArray[np.float64]]:
-    """A team's task as a PettingZoo AEC environment; arguments and errors as in `parallel_env`."""
+    """A team's task as a PettingZoo AEC environment; arguments and errors as in `parallel_env`.
+
+    Examples:
+      >>> from sme_registry import teams
+      >>> team = teams.env("Team2")
+      >>> team.reset(seed=0)
+      >>> team.step(team.action_space("agent_0").sample())
+      >>> team.agent_selection
+      'agent_1'
+    """
     return TurnBasedTeam(parallel_env(spec, **kwargs))
 
 

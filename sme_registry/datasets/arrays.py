@@ -130,6 +130,12 @@ def to_d3rlpy(
       `observations` `[N, O]` float32, `actions` `[N, A]` float32, `rewards` `[N]` float32,
       `terminals` `[N]` and `timeouts` `[N]` float32 of 0 and 1; with `final_observations` one more
       row for each timeout. All arrays are copies.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset, to_d3rlpy
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> sorted(to_d3rlpy(data.transitions()))
+      ['actions', 'observations', 'rewards', 'terminals', 'timeouts']
     """
     arrays: dict[str, npt.NDArray[Any]] = {
         "observations": transitions.observations,

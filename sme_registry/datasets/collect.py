@@ -84,6 +84,16 @@ def collect(
       OptionError: the sub-cube is too small.
       ResourceLimitError: the data set would not fit in memory.
       PolicyError, MissingDependencyError: a policy cannot be used.
+
+    Examples:
+      >>> from sme_registry.datasets import DatasetRecipe, collect
+      >>> recipe = DatasetRecipe(
+      ...     spec=sme_registry.load("Default"),
+      ...     behaviours=[{"kind": "mixture", "nu": 0.5}],
+      ...     transitions=100,
+      ... )
+      >>> collect(recipe, sme_registry.materialize(recipe.spec)).actions.shape
+      (100, 4)
     """
     spec = recipe.spec
     S, A, n, m = spec.state_dim, spec.action_dim, len(task.policies), spec.distractors

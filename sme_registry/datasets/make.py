@@ -78,6 +78,12 @@ def make_dataset(
       PolicyError: a policy cannot be used.
       ResourceLimitError: the data set would not fit in memory.
       MissingDependencyError: Minari or h5py is not installed.
+
+    Examples:
+      >>> from sme_registry.datasets import make_dataset
+      >>> data = make_dataset("Default", 0.3, transitions=200, folder="mine", protocol="quick-v1")
+      >>> len(data.transitions())
+      200
     """
     require_minari()
     if nu is not None and mix is not None:

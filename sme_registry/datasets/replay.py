@@ -32,6 +32,11 @@ def replay(transitions: Transitions, recipe: DatasetRecipe, task: Task) -> None:
 
     Raises:
       FingerprintMismatchError: names the first array and row that differ from the task's.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset, replay
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> replay(data.transitions(), data.recipe, sme_registry.materialize(data.recipe.spec))
     """
     spec, n = recipe.spec, len(task.policies)
     S, T, N = spec.state_dim, spec.horizon, len(transitions)

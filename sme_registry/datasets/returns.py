@@ -125,6 +125,14 @@ def exact_return(
       OptionError: another argument is out of range, or `rollouts` is 1 and the policy is
         stochastic or the task has distractors.
       PolicyError: the policy cannot be used.
+
+    Examples:
+      >>> from sme_registry.datasets import exact_return, open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> where = positions(data.transitions(), data.recipe.spec, [0, 90])
+      >>> result = exact_return("optimal", data.recipe.spec, **where)
+      >>> result.undiscounted.mean.round(3).tolist()
+      [100.0, 10.0]
     """
     task = load_task(spec)
     if task.spec.team is not None:
@@ -171,6 +179,12 @@ def positions(
     Returns:
       `states` `[M, S]` and `t` `[M]`, exact, and `r_cum` `[M]` as an observation stores it, to a
       relative precision of 6e-8.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset, positions
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> positions(data.transitions(), data.recipe.spec, [0, 10])["t"].tolist()
+      [0, 10]
     """
     chosen = slice(None) if rows is None else np.asarray(rows)
     seen = transitions.observations[chosen].astype(np.float64)

@@ -46,7 +46,14 @@ _ID = re.compile(r"([A-Za-z0-9_-]+/)*[A-Za-z0-9_-]+-v[0-9]+")
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set on disk, with its metadata read and checked."""
+    """A data set on disk, with its metadata read and checked.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset
+      >>> data = open_dataset("sme/Default-v1-nu50-seed0-v0", "data")
+      >>> data.transitions().observations.shape
+      (200, 10)
+    """
 
     id: str  # Minari's, such as `sme/Default-v1-nu50-seed7-v0`
     path: Path  # its folder, which contains `data/`
@@ -98,7 +105,13 @@ class Dataset:
 
 
 def datasets_folder(folder: str | os.PathLike[str] | None = None) -> Path:
-    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets."""
+    """The folder passed, else Minari's: MINARI_DATASETS_PATH, else ~/.minari/datasets.
+
+    Examples:
+      >>> from sme_registry.datasets import datasets_folder
+      >>> datasets_folder("data").name
+      'data'
+    """
     default = os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari" / "datasets")
     return Path(default if folder is None else folder)
 
@@ -220,6 +233,11 @@ def open_dataset(
       MalformedDocumentError: it was not written by this package, or its metadata cannot be read.
       SpecError: a field of its record is invalid, or its schema version is not supported.
       DigestMismatchError: its spec, recipe or protocol was changed.
+
+    Examples:
+      >>> from sme_registry.datasets import open_dataset
+      >>> open_dataset("sme/Default-v1-nu50-seed0-v0", "data").recipe.transitions
+      200
     """
     root = datasets_folder(folder)
     path = Path(id_or_path)
@@ -272,6 +290,10 @@ def check_location(dataset: Dataset, folder: str | os.PathLike[str] | None = Non
 
     Raises:
       SpecError: they differ, so the id would open another data set or none.
+
+    Examples:
+      >>> from sme_registry.datasets import check_location, open_dataset
+      >>> check_location(open_dataset("sme/Default-v1-nu50-seed0-v0", "data"), "data")
     """
     # Not resolved: a symbolic link in the right place is correct.
     path, root = Path(os.path.abspath(dataset.path)), Path(os.path.abspath(datasets_folder(folder)))
@@ -293,6 +315,12 @@ def list_datasets(
     Returns:
       The valid data sets in order of their ids, and by its path the error of each broken or
       misplaced one.
+
+    Examples:
+      >>> from sme_registry.datasets import list_datasets
+      >>> valid, broken = list_datasets("data")
+      >>> [dataset.id for dataset in valid], broken
+      (['sme/Default-v1-nu50-seed0-v0'], {})
     """
     root = datasets_folder(folder)
     datasets: list[Dataset] = []

@@ -102,6 +102,13 @@ def diagnose(
       PolicyError: the policy's actions are invalid.
       MissingDependencyError: the probe needs PyTorch, which is not installed.
       ResourceLimitError: the task does not fit in memory.
+
+    Examples:
+      >>> from sme_registry.diagnosis import diagnose, load_policy
+      >>> subject = load_policy("constant", sme_registry.load("Default"))
+      >>> diagnosis = diagnose(subject, states=64, episodes=8)
+      >>> diagnosis.level
+      'no_better_than_constant'
     """
     states = integer_in("states", states, 64, 1_000_000)
     episodes = integer_in("episodes", episodes, 8, 10_000)

@@ -94,6 +94,11 @@ def load_policy(
     Raises:
       OptionError: the log has other columns, or cannot be read.
       PolicyError, OptionError, MissingDependencyError: see `as_policy`.
+
+    Examples:
+      >>> from sme_registry.diagnosis import load_policy
+      >>> load_policy("linear", sme_registry.load("Default")).name
+      'linear'
     """
     if spec.team is not None:
         if log is not None:
@@ -115,6 +120,11 @@ def load_run(folder: str | Path) -> AnySubject:
       OptionError: the folder holds no run, or the run has neither a model nor a checkpoint yet.
       MalformedDocumentError, SpecError: run.json is damaged.
       PolicyError, MissingDependencyError: its model cannot be loaded.
+
+    Examples:
+      >>> from sme_registry.diagnosis import load_run
+      >>> load_run("runs/ppo").plan["algorithm"]
+      'PPO'
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -180,6 +190,14 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
       UnknownNameError: no finished cell, or more than one, has such a key.
       MalformedDocumentError, SpecError: its result is damaged.
       PolicyError, MissingDependencyError: its model cannot be loaded.
+
+    Examples:
+      >>> from sme_registry.diagnosis import load_cell
+      >>> from sme_registry.studies import study_status
+      >>> cells = study_status("study").cells
+      >>> key = next(cell.key for cell in cells if cell.planned.algorithm == "PPO")
+      >>> load_cell("study", key).plan["algorithm"]
+      'PPO'
     """
     study = Path(study)
     path = _cell_path(study, key)

@@ -53,6 +53,15 @@ class SMEEnv(GymnasiumMixin, RenderMixin, gymnasium.Env[Observation, Action]):
       SpecError, UnknownNameError: no such task, or a field out of range.
       ResourceLimitError: the task would not fit in memory.
       OptionError: another argument is outside its range.
+
+    Examples:
+      >>> from sme_registry.envs import SMEEnv
+      >>> env = SMEEnv("Default")
+      >>> observation, info = env.reset(seed=0)
+      >>> best = env.task.optimal_action(env.state)
+      >>> observation, reward, terminated, truncated, info = env.step(best)
+      >>> round(float(info["regret"]), 6)
+      0.0
     """
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 10}  # noqa: RUF012

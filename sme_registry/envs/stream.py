@@ -39,6 +39,13 @@ class SMEStreamEnv(SMEEnv):
       SpecError, UnknownNameError: no such stream, or a field out of range.
       ResourceLimitError: its tasks would not fit in memory.
       OptionError: another argument is outside its range.
+
+    Examples:
+      >>> from sme_registry.envs import SMEStreamEnv
+      >>> env = SMEStreamEnv("Switch5")
+      >>> observation, info = env.reset(seed=0)
+      >>> int(env.step(env.action_space.sample())[4]["phase"])
+      0
     """
 
     def __init__(

@@ -32,6 +32,13 @@ class SMEStreamVectorEnv(SMEVectorEnv):
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEStreamEnv`.
       WrapperError: `max_episode_steps` is below the horizon.
+
+    Examples:
+      >>> from sme_registry.envs import SMEStreamVectorEnv
+      >>> envs = SMEStreamVectorEnv("Switch5", num_envs=2)
+      >>> observations, infos = envs.reset(seed=0)
+      >>> observations.shape
+      (2, 10)
     """
 
     _batch: StreamBatch

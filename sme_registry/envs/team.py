@@ -58,6 +58,14 @@ class SMETeamEnv(RenderMixin, ParallelEnv[str, Observation, npt.NDArray[Any]]): 
 
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
+
+    Examples:
+      >>> from sme_registry.teams import SMETeamEnv
+      >>> team = SMETeamEnv("Team2")
+      >>> observations, infos = team.reset(seed=0)
+      >>> actions = {agent: team.action_space(agent).sample() for agent in team.agents}
+      >>> sorted(team.step(actions)[4])
+      ['agent_0', 'agent_1']
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012

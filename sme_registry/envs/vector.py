@@ -46,6 +46,13 @@ class SMEVectorEnv(GymnasiumMixin, VectorEnv[Observation, Array, Array]):
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: as `SMEEnv`.
       WrapperError: `max_episode_steps` is below the horizon.
+
+    Examples:
+      >>> from sme_registry.envs import SMEVectorEnv
+      >>> envs = SMEVectorEnv("Default", num_envs=3)
+      >>> observations, infos = envs.reset(seed=0)
+      >>> envs.step(envs.action_space.sample())[1].shape
+      (3,)
     """
 
     def __init__(

@@ -83,6 +83,13 @@ def evaluate(
       OptionError: `action_range` is invalid, or a shell is too thin for float32 observations.
       MissingDependencyError: the library that loads the policy is not installed.
       ResourceLimitError: the task would not fit in memory.
+
+    Examples:
+      >>> def half(observations):  # [B, 10] to [B, 4]
+      ...     return np.full((len(observations), 4), 0.5)
+      >>> report = sme_registry.evaluate(half, "Default", "quick-v1")
+      >>> round(report.regions[0].normalised_regret, 6)  # in the cube
+      1.0
     """
     spec = load_spec(spec_or_id)
     protocol = resolve_protocol(protocol)
@@ -116,6 +123,12 @@ def evaluate_many(
 
     Raises:
       As `evaluate`, except for invalid actions.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluate_many
+      >>> reports = evaluate_many([("linear", "Default"), ("linear", "Interval5")], "quick-v1")
+      >>> [report.spec.k for report in reports]
+      [1, 5]
     """
     protocol = resolve_protocol(protocol)
     subjects: list[Subject] = []
@@ -151,6 +164,11 @@ def evaluation_observations(
       SpecError: the task is for a team, whose agents see observations of their own; or as
         `evaluate`.
       UnknownNameError, OptionError, ResourceLimitError: as `evaluate`.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluation_observations
+      >>> evaluation_observations("Default", {"states_per_region": 10}).shape
+      (60, 10)
     """
     task, protocol = materialize(load_spec(spec_or_id)), resolve_protocol(protocol)
     arguments.single_agent(task)
@@ -169,6 +187,11 @@ def resolve_protocol(protocol: ProtocolLike) -> EvaluationProtocol:
     Raises:
       UnknownNameError: no protocol has this name; suggests near ones.
       SpecError: a file or mapping is not a valid protocol.
+
+    Examples:
+      >>> from sme_registry.evaluation import resolve_protocol
+      >>> resolve_protocol("paper-v1").states_per_region
+      50000
     """
     if isinstance(protocol, EvaluationProtocol):
         return protocol

@@ -147,6 +147,12 @@ def reference_policy(name: str, spec: SMESpec) -> Act | dict[str, Act]:
 
     Raises:
       SpecError: a policy of `SAFE_NAMES`, and the task has no limits.
+
+    Examples:
+      >>> from sme_registry.evaluation import reference_policy
+      >>> optimal = reference_policy("optimal", sme_registry.load("Default"))
+      >>> optimal(np.full((3, 10), 0.5, np.float32)).shape
+      (3, 4)
     """
     joint, S = _joint_policy(SHORT_NAMES.get(name, name), spec), spec.state_dim
     task = materialize(spec)

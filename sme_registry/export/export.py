@@ -74,6 +74,13 @@ def export_onnx(
         the file's actions differ from its own by more than 1e-6 beyond float32 rounding.
       OptionError: `action_range` is invalid, or the file cannot be written.
       MissingDependencyError: onnx, ONNX Runtime or the policy's library is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import Perceptron
+      >>> policy = Perceptron([(np.zeros((10, 4)), np.full(4, 0.5), "identity")])
+      >>> path = sme_registry.export_onnx(policy, "Default", "half.onnx", action_range="unit")
+      >>> sme_registry.evaluate("half.onnx", "Default", "quick-v1").policy
+      'half'
     """
     if not os.fspath(path).endswith(".onnx"):
         raise OptionError(f"path={os.fspath(path)!r}: must end in .onnx.")
@@ -102,6 +109,13 @@ def onnx_bytes(
     """The content of the file that `export_onnx` writes.
 
     `spec` may be None for an SB3 model and for a policy of arrays, which know their widths.
+
+    Examples:
+      >>> from sme_registry.evaluation import Perceptron
+      >>> from sme_registry.export import onnx_bytes
+      >>> policy = Perceptron([(np.zeros((10, 4)), np.full(4, 0.5), "identity")])
+      >>> len(onnx_bytes(policy, None, action_range="unit")) > 100
+      True
     """
     libraries = {"onnx": "onnx", "onnxruntime": "ONNX Runtime"}
     require_packages("exporting a policy", libraries, "onnx")

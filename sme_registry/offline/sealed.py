@@ -48,6 +48,19 @@ def train_sealed(
       MalformedDocumentError: the data set cannot be read.
       PolicyError: the training diverged.
       MissingDependencyError: PyTorch, or for a path Minari, is not installed.
+
+    Examples:
+      >>> from sme_registry.datasets import DatasetRecipe, SealedDataset
+      >>> from sme_registry.offline import train_sealed
+      >>> recipe = DatasetRecipe(
+      ...     spec=sme_registry.load("Default"),
+      ...     behaviours=[{"kind": "mixture", "nu": 0.5}],
+      ...     transitions=100,
+      ... )
+      >>> data = SealedDataset.collect(recipe)
+      >>> policy = train_sealed(data, algorithm="bc", steps=10, batch_size=32)
+      >>> policy(data.observations[:2]).shape
+      (2, 4)
     """
     algorithm = known_algorithm(algorithm, ALGORITHMS)
     settings = resolve_hyperparameters(algorithm, hyperparameters)

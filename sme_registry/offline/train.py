@@ -109,6 +109,20 @@ def train_offline(
       MalformedDocumentError, DigestMismatchError: the data set cannot be read, or was changed.
       PolicyError: the training diverged.
       MissingDependencyError: PyTorch is not installed, or Minari, which files require.
+
+    Examples:
+      >>> from sme_registry.offline import train_offline
+      >>> result = train_offline(
+      ...     "data/sme/Default-v1-nu50-seed0-v0",
+      ...     algorithm="bc",
+      ...     steps=10,
+      ...     batch_size=32,
+      ...     evaluations=1,
+      ...     episodes=2,
+      ...     protocol="quick-v1",
+      ... )
+      >>> result.record.steps
+      10
     """
     algorithm = known_algorithm(algorithm, ALGORITHMS)
     settings = resolve_hyperparameters(algorithm, hyperparameters)

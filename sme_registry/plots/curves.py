@@ -73,6 +73,13 @@ def training_curve(
     Raises:
       OptionError: no finished episode, missing columns, or an argument is out of range.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import training_curve
+      >>> steps = np.arange(100, 2100, 100)
+      >>> figure = training_curve({"step": steps, "regret": 100 / steps}, "regret.png")
+      >>> figure.axes[0].get_xlabel()
+      'environment steps'
     """
     step, regret = _points(episodes)
     with canvas(ax, (6.2, 4.0), path) as (axes,):
@@ -107,6 +114,11 @@ def cost_curve(
 
     Raises:
       OptionError, MissingDependencyError: see `training_curve`.
+
+    Examples:
+      >>> from sme_registry.plots import cost_curve
+      >>> steps = np.arange(100, 2100, 100)
+      >>> figure = cost_curve({"step": steps, "cost": 10 / steps}, "cost.pdf")
     """
     step, cost = _points(episodes, "cost")
     with canvas(ax, (6.2, 4.0), path) as (axes,):
@@ -147,6 +159,12 @@ def learning_curve(
       OptionError: no method or no run, missing columns, runs of a method that share no steps, or an
         argument is out of range.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import learning_curve
+      >>> steps = np.arange(100, 2100, 100)
+      >>> runs = [{"step": steps, "regret": (100 + 10 * seed) / steps} for seed in range(3)]
+      >>> figure = learning_curve({"mine": runs, "PPO": "runs/ppo"}, "regret.png")
     """
     methods = _methods(runs)
     if not methods or not all(methods.values()):

@@ -70,6 +70,14 @@ def decay_curve(
         suffix, another number of axes than of measures, or the file cannot be written.
       SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import decay_curve
+      >>> names = ("linear", "random")
+      >>> reports = [sme_registry.evaluate(name, "Default", "quick-v1") for name in names]
+      >>> figure = decay_curve(reports, "decay.png")
+      >>> len(figure.axes)
+      2
     """
     methods = methods_of(reports)
     everything = [report for method in methods for report in method.reports]

@@ -62,6 +62,10 @@ def similarity_map(
       PolicyError: the policy cannot be loaded, or its actions are invalid.
       UnknownNameError, SpecError: the task does not exist, or a field is out of range.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import similarity_map
+      >>> figure = similarity_map("linear", "Plane10", "map.png", resolution=20)
     """
     spec = load_spec(spec_or_id)
     if spec.state_dim != 2:

@@ -65,6 +65,11 @@ def sensitivity_bars(
         file cannot be written.
       SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import sensitivity_bars
+      >>> report = sme_registry.evaluate("linear", "Distract8Noise", "quick-v1")
+      >>> figure = sensitivity_bars(report, "sensitivity.png")
     """
     methods = methods_of(reports)
     everything = [report for method in methods for report in method.reports]
@@ -124,6 +129,15 @@ def layer_probes(
         layers, an unknown suffix, another number of axes than two, or the file cannot be written.
       SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import Perceptron
+      >>> from sme_registry.plots import layer_probes
+      >>> rng = np.random.default_rng(0)
+      >>> hidden = rng.normal(size=(18, 16)), np.zeros(16), "tanh"
+      >>> policy = Perceptron([hidden, (np.zeros((16, 4)), np.full(4, 0.5), "identity")])
+      >>> report = sme_registry.evaluate(policy, "Distract8Noise", "quick-v1", action_range="unit")
+      >>> figure = layer_probes(report, "probes.png")
     """
     methods = methods_of(reports)
     everything = [report for method in methods for report in method.reports]

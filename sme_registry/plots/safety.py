@@ -51,6 +51,11 @@ def reward_against_cost(
         of axes than two, or the file cannot be written.
       SpecError: a file is not a report; see `EvaluationReport.read`.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.plots import reward_against_cost
+      >>> report = sme_registry.evaluate("linear", "Safety20", "quick-v1")
+      >>> figure = reward_against_cost(report, "cost.png")
     """
     methods = methods_of(reports)
     everything = [report for method in methods for report in method.reports]

@@ -80,6 +80,14 @@ def retention_map(
       UnknownNameError: no region has this name.
       SpecError: a file is not a report.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluate_stream
+      >>> from sme_registry.plots import retention_map
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> report = evaluate_stream(["linear", "linear"], stream, "quick-v1")
+      >>> figure = retention_map(report, "retention_map.png")
     """
     reports = _runs(runs)
     agents = [report.region(region).agent for report in reports]
@@ -124,6 +132,14 @@ def performance_curve(
 
     Raises:
       As `retention_map`.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluate_stream
+      >>> from sme_registry.plots import performance_curve
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> report = evaluate_stream(["linear", "linear"], stream, "quick-v1")
+      >>> figure = performance_curve(report, "performance_curve.png")
     """
     reports = _runs(runs)
     agents = [report.region(region).agent for report in reports]
@@ -172,6 +188,11 @@ def dynamic_regret_curve(
       OptionError: a report without a dynamic regret; and as `retention_map`.
       SpecError: a file is not a report.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import StreamReport
+      >>> from sme_registry.plots import dynamic_regret_curve
+      >>> figure = dynamic_regret_curve("runs/life", "dynamic_regret.png")
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))
@@ -217,6 +238,14 @@ def plasticity_curve(
       UnknownNameError: no region has this name.
       SpecError: a file is not a report.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluate_stream
+      >>> from sme_registry.plots import plasticity_curve
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> report = evaluate_stream(["linear", "linear"], stream, "quick-v1", fresh=["linear"] * 2)
+      >>> figure = plasticity_curve(report, "plasticity_curve.png")
     """
     methods = _methods(runs)
     first = next(iter(methods.values()))

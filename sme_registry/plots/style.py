@@ -130,6 +130,12 @@ def save_figure(
 
     Raises:
       OptionError: an unknown format, or a file cannot be written.
+
+    Examples:
+      >>> from matplotlib.figure import Figure
+      >>> from sme_registry.plots import save_figure
+      >>> [path.name for path in save_figure(Figure(), "empty", ["png", "pdf"])]
+      ['empty.png', 'empty.pdf']
     """
     path = Path(path)
     if formats is None:

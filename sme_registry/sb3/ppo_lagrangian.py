@@ -49,6 +49,13 @@ class PPOLagrangian(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
 
     Attributes:
       multiplier: the present λ.
+
+    Examples:
+      >>> from sme_registry.sb3 import PPOLagrangian, SMEVecEnv
+      >>> env = SMEVecEnv("Safety20")
+      >>> model = PPOLagrangian("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1).learn(64)
+      >>> model.num_timesteps
+      64
     """
 
     def __init__(

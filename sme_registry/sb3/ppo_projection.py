@@ -108,6 +108,13 @@ class PPOProjection(PPO):  # type: ignore[misc, unused-ignore]  # an untyped cla
     Raises:
       OptionError: the task has no `safety`, or its observations mix the state; the environment is
         wrapped such that observations do not begin with the state; in `set_env`, another task.
+
+    Examples:
+      >>> from sme_registry.sb3 import PPOProjection, SMEVecEnv
+      >>> env = SMEVecEnv("Safety20")
+      >>> model = PPOProjection("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1).learn(64)
+      >>> model.num_timesteps
+      64
     """
 
     policy_aliases = {"MlpPolicy": ProjectedPolicy}  # noqa: RUF012  # as in PPO

@@ -53,6 +53,13 @@ class EpisodeSums:
       lanes: of the environment; those of a team's agents are adjacent, and end together.
       agents: of each team; 1 for a single agent.
       spec: gives that of the task, at the first step of one with `safety`, which needs it.
+
+    Examples:
+      >>> from sme_registry.sb3 import EpisodeSums
+      >>> sums = EpisodeSums(lanes=1)
+      >>> info = {"regret": 0.25, "similarity": 0.9}
+      >>> sums.add(1, np.array([0.75]), np.array([True]), [info])[0].regret
+      0.25
     """
 
     def __init__(
@@ -134,6 +141,15 @@ class RegretCallback(BaseCallback):  # type: ignore[misc, unused-ignore]  # unty
 
     Attributes:
       episodes: the finished episodes, oldest first. `plots.training_curve` draws them.
+
+    Examples:
+      >>> from stable_baselines3 import PPO
+      >>> from sme_registry.sb3 import RegretCallback, SMEVecEnv
+      >>> callback = RegretCallback()
+      >>> model = PPO("MlpPolicy", SMEVecEnv("Default"), n_steps=128, batch_size=64, n_epochs=1)
+      >>> model = model.learn(128, callback=callback)
+      >>> callback.episodes[0].step
+      100
     """
 
     def __init__(self, verbose: int = 0) -> None:

@@ -42,6 +42,11 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc, unused-ignore]  # an untyped cl
 
     Args:
       lanes: the lanes, each with its attributes, such as its spaces.
+
+    Examples:
+      >>> from sme_registry.sb3 import LanesVecEnv, SMEVecEnv
+      >>> isinstance(SMEVecEnv("Default"), LanesVecEnv)
+      True
     """
 
     def __init__(self, lanes: list[Any]) -> None:
@@ -343,6 +348,12 @@ class SMEVecEnv(_BatchVecEnv):
 
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMEVectorEnv`.
+
+    Examples:
+      >>> from sme_registry.sb3 import SMEVecEnv
+      >>> env = SMEVecEnv("Default", num_envs=4)
+      >>> env.reset().shape
+      (4, 10)
     """
 
     _lane_type = _SingleLane
@@ -392,6 +403,11 @@ class SMETeamVecEnv(_BatchVecEnv):
 
     Raises:
       SpecError, UnknownNameError, ResourceLimitError, OptionError: see `SMETeamEnv`.
+
+    Examples:
+      >>> from sme_registry.sb3 import SMETeamVecEnv
+      >>> SMETeamVecEnv("Team4", num_envs=2).num_envs  # teams times agents
+      8
     """
 
     def __init__(

@@ -80,6 +80,12 @@ class SealedEnv(gymnasium.Env[Observation, Action]):
     Args:
       instance: the hidden task, with one lane.
       action_range: "unit" or "symmetric".
+
+    Examples:
+      >>> from sme_registry.sealed import Instance, SealedEnv
+      >>> env = SealedEnv(Instance("https://board.example", "ticket.json"), "symmetric")
+      >>> float(env.action_space.low[0])
+      -1.0
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
@@ -156,6 +162,12 @@ class SealedVectorEnv(VectorEnv[Observation, Array, Array]):
     Args:
       instance: the hidden task.
       action_range: "unit" or "symmetric".
+
+    Examples:
+      >>> from sme_registry.sealed import Instance, SealedVectorEnv
+      >>> envs = SealedVectorEnv(Instance("https://board.example", "ticket.json", lanes=4))
+      >>> envs.num_envs
+      4
     """
 
     def __init__(self, instance: Instance, action_range: ActionRange = "unit") -> None:
@@ -248,6 +260,12 @@ def make(
     Raises:
       OptionError: the URL is invalid, or an argument is out of range.
       SpecError: the ticket's file is missing, or is no ticket.
+
+    Examples:
+      >>> from sme_registry import sealed
+      >>> env = sealed.make("https://board.example", "ticket.json")
+      >>> env.observation_space.shape
+      (10,)
     """
     hidden = Instance(url, ticket, instance, insecure=insecure, patience=patience)
     return SealedEnv(hidden, action_range)
@@ -272,6 +290,12 @@ def make_vec(
 
     Raises:
       OptionError, SpecError: see `make`.
+
+    Examples:
+      >>> from sme_registry import sealed
+      >>> envs = sealed.make_vec("https://board.example", "ticket.json", num_envs=4)
+      >>> envs.observation_space.shape
+      (4, 10)
     """
     hidden = Instance(url, ticket, instance, num_envs, insecure=insecure, patience=patience)
     return SealedVectorEnv(hidden, action_range)

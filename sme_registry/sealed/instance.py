@@ -67,6 +67,11 @@ class Instance:
     Raises:
       OptionError: the URL is invalid, or a number is out of range.
       SpecError: the ticket's file is missing, or is no ticket.
+
+    Examples:
+      >>> from sme_registry.sealed import Instance
+      >>> Instance("https://board.example", "ticket.json", lanes=4).setting.complexity
+      10
     """
 
     def __init__(
@@ -242,6 +247,13 @@ def answer(
     Raises:
       SealedError: the server refuses it, or gives no answer.
       PolicyError, OptionError, SpecError: see `prepare_policy` and `Instance`.
+
+    Examples:
+      >>> from sme_registry.sealed import answer
+      >>> answer("https://board.example", "ticket.json", "constant", instance=2)
+      Traceback (most recent call last):
+      ...
+      sme_registry.errors.OptionError: instance=2: must be an integer in [0, 1].
     """
     with Instance(url, ticket, instance, insecure=insecure, patience=patience) as hidden:
         prepared = prepare_policy(  # before the stepping ends for good
@@ -268,6 +280,12 @@ def prepare_policy(
     Raises:
       PolicyError: the policy cannot be loaded, or is a reference that depends on the hidden task.
       UnknownNameError, OptionError, MissingDependencyError: see `as_policy`.
+
+    Examples:
+      >>> from sme_registry.sealed import prepare_policy
+      >>> from sme_registry.spec import Setting
+      >>> prepare_policy("constant", Setting())(np.zeros((1, 10), np.float32))
+      array([[0.5, 0.5, 0.5, 0.5]])
     """
     if isinstance(policy, str) and policy in POLICIES and policy not in WITHOUT_TASK:
         raise PolicyError(
@@ -294,6 +312,12 @@ def actions_in(states: Float32, policy: Any, setting: Setting) -> Float32:
     Raises:
       PolicyError: the actions are invalid; or see `prepare_policy`.
       UnknownNameError, OptionError, MissingDependencyError: see `prepare_policy`.
+
+    Examples:
+      >>> from sme_registry.sealed import actions_in
+      >>> from sme_registry.spec import Setting
+      >>> actions_in(np.zeros((3, 10), np.float32), "constant", Setting()).shape
+      (3, 4)
     """
     prepared, rows = prepare_policy(policy, setting), batch_rows(_any_spec(setting))
     batches = [prepared(states[at : at + rows].copy()) for at in range(0, len(states), rows)]

@@ -13,9 +13,9 @@ from typing import Annotated
 from pydantic import Field
 
 from sme_registry.io import require_packages
-from sme_registry.spec import Digest, Document, Integer
+from sme_registry.spec import Digest, Document, Integer, matching
 
-_Hex = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="64 hex digits")]
+_Hex = Annotated[str, matching(r"^[0-9a-f]{64}$", "64 hex digits")]
 _Secret = Annotated[_Hex, Field(repr=False)]
 _Number = Annotated[Integer, Field(ge=0)]
 

@@ -36,7 +36,13 @@ class TicketClass(StrictModel):
 
 
 def instance_name(class_name: str, instance: int) -> str:
-    """What files and commands call a hidden instance: its class and its number in it, from 0."""
+    """What files and commands call a hidden instance: its class and its number in it, from 0.
+
+    Examples:
+      >>> from sme_registry.sealed import instance_name
+      >>> instance_name("deep", 0)
+      'deep-0'
+    """
     return f"{class_name}-{instance}"
 
 
@@ -63,6 +69,11 @@ class Ticket(StrictModel):
       lanes: the most copies of an instance that are stepped together.
       classes: instance i of the ticket counts over all of them, class by class.
       signer: signs the answers; null in a server's answer, which does not know the key.
+
+    Examples:
+      >>> from sme_registry.sealed import Ticket
+      >>> [place.name for place in Ticket.read("ticket.json").places]
+      ['deep-0', 'deep-1']
     """
 
     season: Name

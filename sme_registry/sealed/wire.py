@@ -52,22 +52,46 @@ _HEADER = re.compile(
 
 
 def tickets_path(season: str) -> str:
-    """Where tickets of a season are requested."""
+    """Where tickets of a season are requested.
+
+    Examples:
+      >>> from sme_registry.sealed import tickets_path
+      >>> tickets_path("winter")
+      '/api/seasons/winter/tickets'
+    """
     return f"/api/seasons/{season}/tickets"
 
 
 def ticket_path(season: str, ticket: int) -> str:
-    """The address of a ticket."""
+    """The address of a ticket.
+
+    Examples:
+      >>> from sme_registry.sealed import ticket_path
+      >>> ticket_path("winter", 3)
+      '/api/seasons/winter/tickets/3'
+    """
     return f"{tickets_path(season)}/{ticket}"
 
 
 def instance_path(season: str, ticket: int, instance: int, action: str) -> str:
-    """The address of an action on an instance, such as `start` or `steps`."""
+    """The address of an action on an instance, such as `start` or `steps`.
+
+    Examples:
+      >>> from sme_registry.sealed import instance_path
+      >>> instance_path("winter", 3, 0, "steps")
+      '/api/seasons/winter/tickets/3/instances/0/steps'
+    """
     return f"{ticket_path(season, ticket)}/instances/{instance}/{action}"
 
 
 def bearer(token: str) -> str:
-    """The value of the header `Authorization`."""
+    """The value of the header `Authorization`.
+
+    Examples:
+      >>> from sme_registry.sealed import bearer
+      >>> bearer("a token")
+      'Bearer a token'
+    """
     return f"Bearer {token}"
 
 
@@ -107,6 +131,11 @@ class StepFormat:
     Attributes:
       lanes: L.
       state_dim, action_dim: S and A.
+
+    Examples:
+      >>> from sme_registry.sealed import StepFormat
+      >>> StepFormat(lanes=4, state_dim=8, action_dim=2).lanes
+      4
     """
 
     lanes: int
@@ -195,7 +224,13 @@ class StepFormat:
 
 
 def pack_table(table: npt.NDArray[np.floating]) -> bytes:
-    """A table `[rows, columns]` as the bytes of an .npy file of float32."""
+    """A table `[rows, columns]` as the bytes of an .npy file of float32.
+
+    Examples:
+      >>> from sme_registry.sealed import pack_table, unpack_table
+      >>> unpack_table(pack_table(np.ones((1, 2))), columns=2)
+      array([[1., 1.]], dtype=float32)
+    """
     rows, columns = table.shape
     text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}"
     # The data begin at a multiple of 64 bytes, as the format asks.
@@ -205,7 +240,13 @@ def pack_table(table: npt.NDArray[np.floating]) -> bytes:
 
 
 def table_bytes(rows: int, columns: int) -> int:
-    """The most bytes that the .npy file of a table of this shape has."""
+    """The most bytes that the .npy file of a table of this shape has.
+
+    Examples:
+      >>> from sme_registry.sealed import pack_table, table_bytes
+      >>> len(pack_table(np.zeros((3, 2)))) <= table_bytes(3, 2)
+      True
+    """
     return len(_MAGIC) + 2 + _MAX_HEADER + _FLOAT.itemsize * rows * columns
 
 
@@ -223,6 +264,11 @@ def unpack_table(data: bytes, columns: int, rows: int | None = None) -> Float32:
     Raises:
       WireError: not an .npy file of version 1.0, type `<f4`, C order and this shape.
       ActionError: an entry is not finite.
+
+    Examples:
+      >>> from sme_registry.sealed import pack_table, unpack_table
+      >>> unpack_table(pack_table(np.zeros((3, 2))), columns=2, rows=3).shape
+      (3, 2)
     """
     start = len(_MAGIC) + 2
     size = int.from_bytes(data[len(_MAGIC) : start], "little")

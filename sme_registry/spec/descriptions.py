@@ -54,9 +54,9 @@ def describe(kind: type[BaseModel]) -> None:
 
 
 def summary(kind: type[BaseModel]) -> str:
-    """A class's docstring without its fields."""
+    """A class's docstring without its fields and examples."""
     before, _, after = _sections(kind.__doc__ or "")
-    return f"{before}\n\n{after}".strip()
+    return f"{before}\n\n{after}".partition("\n\nExamples:\n")[0].strip()
 
 
 def describe_schema(kind: type[BaseModel], schema: dict[str, Any]) -> None:

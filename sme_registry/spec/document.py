@@ -70,6 +70,16 @@ def matching(pattern: str, allowed: str, **limits: Any) -> Any:
       pattern: a regular expression.
       allowed: the same in words, for errors: `64 hex digits`.
       **limits: further arguments of `pydantic.Field`.
+
+    Examples:
+      >>> from typing import Annotated
+      >>> from sme_registry.spec import StrictModel, matching
+      >>> class Colour(StrictModel):
+      ...     code: Annotated[str, matching("^#[0-9a-f]{6}$", "'#' and 6 hex digits")]
+      >>> Colour(code="red")
+      Traceback (most recent call last):
+      ...
+      sme_registry.errors.SpecError: Colour: code='red': must be '#' and 6 hex digits. Correct it.
     """
     return Field(pattern=pattern, json_schema_extra={WORDED: allowed}, **limits)
 

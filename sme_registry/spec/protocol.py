@@ -26,6 +26,11 @@ class EvaluationProtocol(Document):
       time_input: the entry t/T of an observation: uniform over the steps of an episode.
       accumulated_reward_input: the entry r_cum/k of an observation: 0.
       seed: of the states and times.
+
+    Examples:
+      >>> from sme_registry import EvaluationProtocol
+      >>> EvaluationProtocol(states_per_region=1000, epsilons=[0.5, 1.0]).edges
+      ((0.0, 0.0), (0.0, 0.5), (0.5, 1.0))
     """
 
     schema_version: SchemaVersion = 1

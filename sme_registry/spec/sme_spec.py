@@ -136,6 +136,12 @@ class TeamSpec(Document):
       agents: in the order of their action channels, which add up to the task's.
       reward: an agent's reward is that of its own channels ("individual"), or all agents share that
         of the whole team ("team").
+
+    Examples:
+      >>> from sme_registry.spec import TeamSpec
+      >>> agents = [{"action_dim": 3}, {"action_dim": 1, "observes": [0, 1]}]
+      >>> sme_registry.SMESpec(team=TeamSpec(agents=agents)).team.agents[1].name
+      'agent_1'
     """
 
     agents: Annotated[tuple[AgentSpec, ...], Field(min_length=1, max_length=1024, strict=False)]
@@ -166,6 +172,11 @@ class SafetySpec(Document):
 
     Attributes:
       tightness: τ, about the share of states and channels in which the optimum is above its limit.
+
+    Examples:
+      >>> from sme_registry.spec import SafetySpec
+      >>> sme_registry.SMESpec(safety=SafetySpec(tightness=0.2)).safety.tightness
+      0.2
     """
 
     tightness: Annotated[Real, Field(gt=0, le=0.5)]
@@ -185,6 +196,12 @@ class ObservationSpec(Document):
         square uniform layers ("nonlinear").
       mixing_depth: number of layers; 1 where the mixing is "nonlinear" and none is given, and None
         for another mixing.
+
+    Examples:
+      >>> from sme_registry.spec import ObservationSpec
+      >>> sees = ObservationSpec(distractors=32, dynamics="driven", mixing="nonlinear")
+      >>> sme_registry.SMESpec(observation=sees).observation_dim
+      42
     """
 
     distractors: Annotated[Integer, Field(ge=0, le=MAX_DIM)] = 0
@@ -342,6 +359,16 @@ class SMESpec(Setting, NamedDocument):
 
     Attributes:
       seed: of all random draws of the task.
+
+    Examples:
+      >>> from sme_registry import SMESpec
+      >>> spec = SMESpec(state_dim=16, complexity=10, k=5, seed=7)
+      >>> spec.derive(k=1).k
+      1
+      >>> SMESpec(hidden_width=0)
+      Traceback (most recent call last):
+      ...
+      sme_registry.errors.SpecError: SMESpec: hidden_width=0: must be an integer in [1, 4096]. ...
     """
 
     seed: Seed = 0
@@ -377,6 +404,11 @@ def as_spec(value: SMESpec | dict[str, Any]) -> SMESpec:
 
     Raises:
       SpecError: a field is wrong, missing or unknown, or `value` is neither.
+
+    Examples:
+      >>> from sme_registry.spec import as_spec
+      >>> as_spec({"state_dim": 16}).state_dim
+      16
     """
     if isinstance(value, SMESpec):
         return value

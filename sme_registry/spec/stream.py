@@ -161,6 +161,13 @@ class StreamSpec(NamedDocument):
       switch: when a phase that is over is left: at the next reset ("episode"), or at once ("step");
         then the state and r_cum carry over.
       observes_phase: whether the observation ends with the phase's index, one-hot.
+
+    Examples:
+      >>> from sme_registry import StreamSpec
+      >>> phases = [{"spec": "Default", "steps": 500}, {"spec": "Complexity10", "steps": 500}]
+      >>> stream = StreamSpec(phases=phases, cycles=2)
+      >>> stream.steps, stream.visits
+      (2000, 4)
     """
 
     schema_version: SchemaVersion = 1
@@ -338,6 +345,11 @@ def as_stream(value: StreamSpec | dict[str, Any]) -> StreamSpec:
 
     Raises:
       SpecError: a field is wrong, missing or unknown, or `value` is neither.
+
+    Examples:
+      >>> from sme_registry.spec import as_stream
+      >>> as_stream({"phases": [{"spec": "Default", "steps": 500}]}).steps
+      500
     """
     if isinstance(value, StreamSpec):
         return value

@@ -209,6 +209,16 @@ class StudyPlan(Document):
       evaluations: evenly spaced over training, the last at its end; 0 for none.
       evaluation_episodes: in each of them.
       protocol: of the evaluation within and out of distribution at the end.
+
+    Examples:
+      >>> from sme_registry.spec import Setting, StudyAlgorithm, StudyPlan, SuiteClass
+      >>> plan = StudyPlan(
+      ...     classes=[SuiteClass(name="default", setting=Setting(), seeds=[1, 2])],
+      ...     algorithms=[StudyAlgorithm(name="PPO", uses="PPO")],
+      ...     seeds=5,
+      ... )
+      >>> len(plan.cells)
+      5
     """
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)

@@ -104,6 +104,13 @@ class Suite(Document):
     Attributes:
       classes: kinds of tasks; at least one, unless there are streams.
       streams: kinds of streams.
+
+    Examples:
+      >>> from sme_registry.spec import Setting, Suite, SuiteClass
+      >>> easy = SuiteClass(name="easy", setting=Setting(), seeds=[1, 2, 3])
+      >>> deep = SuiteClass(name="deep", setting=Setting(complexity=20), seeds=[1, 2, 3])
+      >>> len(Suite(classes=[easy, deep]).instances)
+      6
     """
 
     left_out_by_default: ClassVar[tuple[str, ...]] = ("streams",)

@@ -37,6 +37,11 @@ def sweep(
     Raises:
       OptionError: an axis has no values or the same value twice, or is the seed.
       SpecError: no such field, or a value outside its range.
+
+    Examples:
+      >>> from sme_registry.studies import sweep
+      >>> [each.name for each in sweep(sme_registry.SMESpec(), {"k": [1, 5, 10]})]
+      ['k-1', 'k-5', 'k-10']
     """
     fields = spec.to_dict()
     seeds = instance_seeds(fields.pop("seed"), instances)

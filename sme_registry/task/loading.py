@@ -42,6 +42,12 @@ def materialize(spec: SMESpec, fingerprint: Fingerprint | None = None) -> Task:
       SpecError: `spec` is not an SMESpec or a mapping of its fields.
       ResourceLimitError: it would not fit in memory; the message says how much it needs.
       FingerprintMismatchError: the numbers drawn on this machine differ from the published ones.
+
+    Examples:
+      >>> task = sme_registry.materialize(sme_registry.SMESpec(seed=3))
+      >>> s = np.full(8, 0.5)
+      >>> float(task.regret(s, task.optimal_action(s)))
+      0.0
     """
     spec = as_spec(spec)
     sizes = ("state_dim", "action_dim", "complexity", "hidden_width")
@@ -68,6 +74,11 @@ def load_task(task: SpecLike, **overrides: Any) -> Task:
     Raises:
       UnknownNameError, SpecError: no such task, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize`.
+
+    Examples:
+      >>> from sme_registry.task import load_task
+      >>> load_task("Default", action_dim=2).W.shape
+      (2, 8)
     """
     resolved = resolve(task).derive(**overrides)
     return materialize(resolved.spec, resolved.fingerprint)
@@ -82,6 +93,11 @@ def load_spec(task: SpecLike) -> SMESpec:
     Raises:
       UnknownNameError, SpecError: no such task, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize`.
+
+    Examples:
+      >>> from sme_registry.task import load_spec
+      >>> load_spec("Interval5").k
+      5
     """
     return _checked_spec(resolve(task))
 
@@ -98,6 +114,12 @@ def materialize_stream(
     Raises:
       ResourceLimitError: all phases together would not fit in memory.
       FingerprintMismatchError: a phase's numbers differ from the published ones; it is named.
+
+    Examples:
+      >>> from sme_registry.task import load_stream, materialize_stream
+      >>> tasks = materialize_stream(load_stream("Switch5"))
+      >>> len(tasks)
+      5
     """
     tasks = materialize_together(stream, [piece.spec for piece in stream.pieces])
     drawn = {task.spec: task for task in tasks}
@@ -114,6 +136,13 @@ def materialize_together(stream: StreamSpec, specs: Sequence[SMESpec]) -> tuple[
 
     Raises:
       ResourceLimitError: together they would not fit in memory.
+
+    Examples:
+      >>> from sme_registry.task import load_stream, materialize_together
+      >>> stream = load_stream("Switch5")
+      >>> first, again = materialize_together(stream, [stream.phases[0].spec] * 2)
+      >>> first is again
+      True
     """
     different = dict.fromkeys(specs)
     held = sum(map(memory.parameter_bytes, different))
@@ -135,12 +164,23 @@ def load_stream(stream: StreamLike) -> StreamSpec:
     Raises:
       UnknownNameError, SpecError: no such stream, or a field is out of range.
       ResourceLimitError, FingerprintMismatchError: see `materialize_stream`.
+
+    Examples:
+      >>> from sme_registry.task import load_stream
+      >>> len(load_stream("Switch5").phases)
+      5
     """
     return _checked_stream(resolve_stream(stream))
 
 
 def load_document(name: SpecLike | StreamLike) -> SMESpec | StreamSpec:
-    """The stream of a name, or the spec; see `load_stream` and `load_spec` for errors."""
+    """The stream of a name, or the spec; see `load_stream` and `load_spec` for errors.
+
+    Examples:
+      >>> from sme_registry.task import load_document
+      >>> type(load_document("Switch5")).__name__
+      'StreamSpec'
+    """
     found = resolve_document(name)
     return _checked_stream(found) if isinstance(found, ResolvedStream) else _checked_spec(found)
 

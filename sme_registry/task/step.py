@@ -62,6 +62,13 @@ def step(
       t: `[B]` steps completed before this one.
       accumulated_reward: `[B, n]` r_cum before this step.
       a: `[B, A]` actions, finite; clipped to [0, 1].
+
+    Examples:
+      >>> from sme_registry.task import load_task, step
+      >>> task, states, begin = load_task("Default"), np.full((2, 8), 0.5), np.zeros(2, np.int64)
+      >>> result = step(task, states, begin, np.zeros((2, 1)), task.optimal_action(states))
+      >>> result.reward.ravel().tolist()
+      [1.0, 1.0]
     """
     spec = task.spec
     a = np.clip(a, 0.0, 1.0)
@@ -95,6 +102,12 @@ def observe(
 
     r_cum/k is at most 1: it exceeds 1 only where a stream carries r_cum over to a smaller k.
     A single agent observes all of it, an agent of a team only its part; see `envs.team`.
+
+    Examples:
+      >>> from sme_registry.task import load_spec, observe
+      >>> states, steps, rewards = np.full((2, 8), 0.5), np.array([0, 50]), np.zeros((2, 1))
+      >>> observe(load_spec("Default"), states, steps, rewards)[:, 8].tolist()
+      [0.0, 0.5]
     """
     columns = [s, (t / spec.horizon)[:, None], np.minimum(accumulated_reward / spec.k, 1.0)]
     return np.concatenate(columns, axis=-1).astype(np.float32)

@@ -54,6 +54,15 @@ class Task:
       limiting: the layers of v; empty without `safety`.
       distractor_transition: W `[A, m]` and b `[m]` of autonomous and driven distractors; else None.
       mixing: the layers of M, from `[S + m]` to `[S + m]`; empty without a mixing.
+
+    Examples:
+      >>> task = sme_registry.materialize(sme_registry.SMESpec())
+      >>> states = np.random.default_rng(0).random((100, 8))
+      >>> actions = np.full((100, 4), 0.5)
+      >>> task.regret(states, actions).shape
+      (100,)
+      >>> task.transition(states, actions).shape
+      (100, 8)
     """
 
     spec: SMESpec

@@ -14,7 +14,19 @@ TOLERANCE = 1e-12  # of optimal actions and rewards between back-ends; states ar
 
 
 class ConformanceError(AssertionError):
-    """An environment violates a guarantee of SME environments."""
+    """An environment violates a guarantee of SME environments.
+
+    Examples:
+      >>> from sme_registry.envs import SMEEnv
+      >>> from sme_registry.testing import check_optimum
+      >>> class Frozen(SMEEnv):
+      ...     def step(self, action):
+      ...         return super().step(0 * action)
+      >>> check_optimum(sme_registry.SMESpec(horizon=5), single=Frozen)
+      Traceback (most recent call last):
+      ...
+      sme_registry.testing.comparing.ConformanceError: ...
+    """
 
 
 def expect_equal(what: str, got: Any, expected: Any) -> None:

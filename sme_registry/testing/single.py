@@ -53,6 +53,10 @@ def check_sme(
 
     Raises:
       ConformanceError: the first check that fails.
+
+    Examples:
+      >>> from sme_registry.testing import check_sme
+      >>> check_sme(sme_registry.SMESpec(horizon=5))
     """
     check_gymnasium(task, single=single)
     for check in (check_info, check_definition, check_optimum, check_determinism):
@@ -73,6 +77,10 @@ def check_gymnasium(task: SpecLike | StreamLike, *, single: Make = SMEEnv) -> No
     """Gymnasium's own `check_env` passes without warnings in both action ranges.
 
     It treats an episode of one step as an error, so tasks of horizon 1 are skipped.
+
+    Examples:
+      >>> from sme_registry.testing import check_gymnasium
+      >>> check_gymnasium(sme_registry.SMESpec(horizon=5))
     """
     document = load_document(task)
     if document.horizon == 1:
@@ -91,6 +99,10 @@ def check_info(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
     """`info` is flat and numeric, has the documented keys and ranges, and is new at each step.
 
     At reset it has the same keys, with NaN of the same type.
+
+    Examples:
+      >>> from sme_registry.testing import check_info
+      >>> check_info(sme_registry.SMESpec(horizon=5))
     """
     spec = load_spec(task)
     for action_range in ACTION_RANGES:
@@ -143,6 +155,10 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
     States are compared bit for bit, optimal actions, rewards, limits and costs to 1e-12, and what
     the agent sees of a mixing to the rounding of float32. Distractors stay in [0, 1]; driven ones
     move by their own transition.
+
+    Examples:
+      >>> from sme_registry.testing import check_definition
+      >>> check_definition(sme_registry.SMESpec(horizon=5))
     """
     spec = load_spec(task)
     definition, rng = materialize(spec), np.random.default_rng(seed)
@@ -181,7 +197,12 @@ def check_definition(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) ->
 
 
 def check_optimum(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
-    """The optimal policy reaches the horizon T with return T, in both action ranges."""
+    """The optimal policy reaches the horizon T with return T, in both action ranges.
+
+    Examples:
+      >>> from sme_registry.testing import check_optimum
+      >>> check_optimum(sme_registry.SMESpec(horizon=5))
+    """
     spec = load_spec(task)
     optimal = materialize(spec).optimal_action
     spec = spec.derive(horizon=min(spec.horizon, LONGEST_HORIZON))
@@ -191,7 +212,12 @@ def check_optimum(task: SpecLike, *, single: Make = SMEEnv, seed: int = 0) -> No
 
 
 def check_determinism(task: SpecLike | StreamLike, *, single: Make = SMEEnv, seed: int = 0) -> None:
-    """A seed fixes the episode and the following ones; another seed gives another episode."""
+    """A seed fixes the episode and the following ones; another seed gives another episode.
+
+    Examples:
+      >>> from sme_registry.testing import check_determinism
+      >>> check_determinism(sme_registry.SMESpec(horizon=5))
+    """
     episodes.expect_determinism(functools.partial(single, load_document(task)), seed)
 
 
@@ -202,7 +228,12 @@ def check_pickling(
     vector: Make = SMEVectorEnv,
     seed: int = 0,
 ) -> None:
-    """Pickled and deep copies taken in mid-episode continue as the original does."""
+    """Pickled and deep copies taken in mid-episode continue as the original does.
+
+    Examples:
+      >>> from sme_registry.testing import check_pickling
+      >>> check_pickling(sme_registry.SMESpec(horizon=5))
+    """
     document = load_document(task)
     batch = vector(document, 3, autoreset_mode=AutoresetMode.NEXT_STEP.value)
     episodes.expect_same_copies("single environment", single(document), document.horizon, seed)
@@ -219,6 +250,10 @@ def check_vector(
     """A batch equals single environments bit for bit, in all three autoreset modes.
 
     Gymnasium's `SyncVectorEnv` steps the single environments, for more than one episode each.
+
+    Examples:
+      >>> from sme_registry.testing import check_vector
+      >>> check_vector(sme_registry.SMESpec(horizon=5))
     """
     document, lanes = load_document(task), 3
     steps = min(document.horizon + 5, MAX_STEPS)
@@ -247,7 +282,12 @@ def check_vector(
 
 
 def check_env_spec(task: SpecLike | StreamLike) -> None:
-    """`gymnasium.make` recreates the task or stream from its `EnvSpec` as JSON."""
+    """`gymnasium.make` recreates the task or stream from its `EnvSpec` as JSON.
+
+    Examples:
+      >>> from sme_registry.testing import check_env_spec
+      >>> check_env_spec(sme_registry.SMESpec(horizon=5))
+    """
     expected = load_document(task)
     for action_range in ACTION_RANGES:
         env = _recreated(env_spec(expected, action_range=action_range))

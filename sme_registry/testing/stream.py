@@ -38,6 +38,12 @@ def check_stream(
 
     Raises:
       ConformanceError: the first check that fails.
+
+    Examples:
+      >>> from sme_registry.testing import check_stream
+      >>> task = sme_registry.SMESpec(horizon=5)
+      >>> phases = [dict(spec=task, steps=10), dict(spec=task.derive(k=5), steps=10)]
+      >>> check_stream(sme_registry.StreamSpec(phases=phases))
     """
     check_gymnasium(stream, single=single)
     check_stream_definition(stream, single=single, seed=seed)
@@ -54,6 +60,12 @@ def check_stream_definition(
 
     Pieces change when METHOD, section 7, says. States, ends, phases and lifetimes are compared
     exactly, optimal actions and rewards to 1e-12.
+
+    Examples:
+      >>> from sme_registry.testing import check_stream_definition
+      >>> task = sme_registry.SMESpec(horizon=5)
+      >>> phases = [dict(spec=task, steps=10), dict(spec=task.derive(k=5), steps=10)]
+      >>> check_stream_definition(sme_registry.StreamSpec(phases=phases))
     """
     stream = load_stream(stream)
     tasks, env, rng = materialize_stream(stream), single(stream), np.random.default_rng(seed)

@@ -43,6 +43,10 @@ def check_team(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) ->
 
     Raises:
       ConformanceError: the first check that fails.
+
+    Examples:
+      >>> from sme_registry.testing import check_team
+      >>> check_team(sme_registry.load("Team2").derive(horizon=5))
     """
     check_pettingzoo(task, parallel=parallel)
     for check in (
@@ -59,6 +63,10 @@ def check_pettingzoo(task: SpecLike, *, parallel: Make = SMETeamEnv) -> None:
     """PettingZoo's tests of API, seed and state pass without warnings, parallel and AEC.
 
     Its warnings that agents' spaces differ in size are ignored if they do differ.
+
+    Examples:
+      >>> from sme_registry.testing import check_pettingzoo
+      >>> check_pettingzoo(sme_registry.load("Team2").derive(horizon=5))
     """
     spec = load_spec(task)
     definition = materialize(spec)
@@ -90,6 +98,10 @@ def check_team_definition(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: 
     """Each step equals `sme_registry.task.step` for each agent, which observes only its channels.
 
     States and ends are compared bit for bit, optimal actions and rewards to 1e-12.
+
+    Examples:
+      >>> from sme_registry.testing import check_team_definition
+      >>> check_team_definition(sme_registry.load("Team2").derive(horizon=5))
     """
     spec = load_spec(task)
     definition, rng = materialize(spec), np.random.default_rng(seed)
@@ -140,7 +152,12 @@ def _check_agent(
 
 
 def check_team_optimum(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
-    """An agent that acts by its own layers on only what it observes has return T."""
+    """An agent that acts by its own layers on only what it observes has return T.
+
+    Examples:
+      >>> from sme_registry.testing import check_team_optimum
+      >>> check_team_optimum(sme_registry.load("Team2").derive(horizon=5))
+    """
     spec = load_spec(task)
     definition = materialize(spec)
 
@@ -160,18 +177,33 @@ def check_team_optimum(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int
 
 
 def check_team_determinism(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
-    """A seed fixes whole consecutive episodes; PettingZoo's own tests compare only one step."""
+    """A seed fixes whole consecutive episodes; PettingZoo's own tests compare only one step.
+
+    Examples:
+      >>> from sme_registry.testing import check_team_determinism
+      >>> check_team_determinism(sme_registry.load("Team2").derive(horizon=5))
+    """
     episodes.expect_determinism(functools.partial(parallel, load_spec(task)), seed)
 
 
 def check_team_pickling(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
-    """Pickled and deep copies taken in mid-episode continue as the original does."""
+    """Pickled and deep copies taken in mid-episode continue as the original does.
+
+    Examples:
+      >>> from sme_registry.testing import check_team_pickling
+      >>> check_team_pickling(sme_registry.load("Team2").derive(horizon=5))
+    """
     spec = load_spec(task)
     episodes.expect_same_copies("team", parallel(spec), spec.horizon, seed)
 
 
 def check_turns(task: SpecLike, *, parallel: Make = SMETeamEnv, seed: int = 0) -> None:
-    """PettingZoo's conversions to AEC and back keep every number of a whole episode."""
+    """PettingZoo's conversions to AEC and back keep every number of a whole episode.
+
+    Examples:
+      >>> from sme_registry.testing import check_turns
+      >>> check_turns(sme_registry.load("Team2").derive(horizon=5))
+    """
     spec = load_spec(task)
     make = functools.partial(parallel, spec)
     direct = episodes.play(make(), seed, seed)

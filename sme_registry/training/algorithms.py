@@ -45,7 +45,13 @@ _MAX_REPLAY = 1_000_000  # SB3's default
 
 
 def default_algorithm(document: SMESpec | StreamSpec) -> str:
-    """The algorithm used by default: TD3, and PPO for a team."""
+    """The algorithm used by default: TD3, and PPO for a team.
+
+    Examples:
+      >>> from sme_registry.training import default_algorithm
+      >>> default_algorithm(sme_registry.load("Team4"))
+      'PPO'
+    """
     single = isinstance(document, StreamSpec) or document.team is None
     return "TD3" if single else "PPO"
 
@@ -86,6 +92,11 @@ def full_name(uses: str, agents: str | None = None) -> str:
 
     Raises:
       OptionError: `agents` is none of them, or "sb3" for a name in JAX.
+
+    Examples:
+      >>> from sme_registry.training import full_name
+      >>> full_name("ppo", agents="jax")
+      'jax:PPO'
     """
     ours = in_jax(uses.casefold())
     plain = uses[len(JAX) :] if ours else uses
@@ -101,12 +112,24 @@ def full_name(uses: str, agents: str | None = None) -> str:
 
 
 def short_name(uses: str) -> str:
-    """What figures and reports call an algorithm: `TQC` for `sb3_contrib:TQC`."""
+    """What figures and reports call an algorithm: `TQC` for `sb3_contrib:TQC`.
+
+    Examples:
+      >>> from sme_registry.training import short_name
+      >>> short_name("sb3_contrib:TQC")
+      'TQC'
+    """
     return uses.rpartition(":")[2]
 
 
 def folder_name(uses: str) -> str:
-    """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`."""
+    """What default folders call an algorithm: its short name, and `jax-PPO` for `jax:PPO`.
+
+    Examples:
+      >>> from sme_registry.training import folder_name
+      >>> folder_name("jax:PPO")
+      'jax-PPO'
+    """
     return f"{'jax-' * in_jax(uses)}{short_name(uses)}"
 
 
@@ -115,6 +138,11 @@ def known_algorithm(name: str, algorithms: Collection[str] = tuple(ALGORITHMS)) 
 
     Raises:
       UnknownNameError: no such algorithm; lists all, and suggests a similar one.
+
+    Examples:
+      >>> from sme_registry.training import known_algorithm
+      >>> known_algorithm("td3")
+      'TD3'
     """
     for known in algorithms:
         if known.casefold() == str(name).casefold():

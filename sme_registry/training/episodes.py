@@ -60,6 +60,12 @@ def read_episodes(path: Path) -> list[Episode]:
 
     Raises:
       OptionError: the file has other columns, or cannot be read.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import read_episodes
+      >>> read_episodes(Path("runs/ppo/episodes.csv"))[0].length
+      100
     """
     try:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))

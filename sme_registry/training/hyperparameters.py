@@ -30,6 +30,11 @@ def nested_hyperparameters(flat: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises:
       OptionError: a name has an empty part, or is used both for a value and for a dict.
+
+    Examples:
+      >>> from sme_registry.training import nested_hyperparameters
+      >>> nested_hyperparameters({"policy_kwargs.net_arch": [64, 64], "gamma": 0.9})
+      {'policy_kwargs': {'net_arch': [64, 64]}, 'gamma': 0.9}
     """
     nested: dict[str, Any] = {}
     for name, value in flat.items():
@@ -52,6 +57,13 @@ def read_hyperparameters(path: Path) -> dict[str, Any]:
     Raises:
       MalformedDocumentError: it cannot be read, or is no JSON.
       OptionError: it is not an object.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import read_hyperparameters
+      >>> _ = Path("ppo.json").write_text('{"n_steps": 256}')
+      >>> read_hyperparameters(Path("ppo.json"))
+      {'n_steps': 256}
     """
     values = read_json(path)
     if not isinstance(values, dict):
@@ -82,6 +94,14 @@ def check_hyperparameters(
     Raises:
       OptionError: it has no hyperparameter of a name; the message suggests a similar one.
       UnknownNameError, OptionError, MissingDependencyError: see `find_algorithm`.
+
+    Examples:
+      >>> from sme_registry.training import check_hyperparameters
+      >>> check_hyperparameters("PPO", {"learning_rate": 1e-4})
+      >>> check_hyperparameters("PPO", {"learning_rat": 1e-4})
+      Traceback (most recent call last):
+      ...
+      sme_registry.errors.OptionError: hyperparameters.learning_rat: PPO has no such ...
     """
     if in_jax(uses):
         from sme_registry.jax.run import full_name, settings_of

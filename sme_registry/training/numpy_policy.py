@@ -48,6 +48,13 @@ def numpy_policy(
     Raises:
       SpecError: the task is a team's.
       PolicyError, OptionError: see `as_policy`.
+
+    Examples:
+      >>> from sme_registry.evaluation import load_sb3
+      >>> from sme_registry.training import numpy_policy
+      >>> policy = numpy_policy(load_sb3("runs/ppo/model.zip"), sme_registry.load("Default"))
+      >>> policy(np.full((3, 10), 0.5, np.float32)).shape
+      (3, 4)
     """
     if isinstance(document, StreamSpec):
         spec, observed = document.phases[0].spec, document.observed_phases

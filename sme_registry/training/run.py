@@ -175,6 +175,20 @@ def train(
       PolicyError: the checkpoint cannot be loaded, or the weights are not finite any longer.
       ResourceLimitError: the task would not fit in memory.
       MissingDependencyError: Stable-Baselines3, PyTorch or JAX is not installed.
+
+    Examples:
+      >>> from sme_registry.training import train
+      >>> result = train(
+      ...     "Default",
+      ...     algorithm="PPO",
+      ...     steps=128,
+      ...     folder="runs/mine",
+      ...     hyperparameters={"n_steps": 128, "batch_size": 64},
+      ...     protocol="quick-v1",
+      ...     progress=False,
+      ... )
+      >>> result.record.steps_done
+      128
     """
     plan = _plan(
         spec,

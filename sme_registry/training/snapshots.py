@@ -26,6 +26,12 @@ def model_of_cell(study: Path, key: str) -> Path:
     Args:
       study: its folder.
       key: the cell's digest.
+
+    Examples:
+      >>> from pathlib import Path
+      >>> from sme_registry.training import model_of_cell
+      >>> model_of_cell(Path("study"), "66e9b7a9a266").suffix
+      '.zip'
     """
     return study / MODELS / f"{key.removeprefix('sha256:')}.zip"
 

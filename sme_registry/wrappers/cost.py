@@ -25,6 +25,15 @@ class StepWithCost(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
 
     Raises:
       OptionError: the task has no limits.
+
+    Examples:
+      >>> from sme_registry.wrappers import StepWithCost
+      >>> env = StepWithCost(sme_registry.make("Safety20"))
+      >>> observation, info = env.reset(seed=0)
+      >>> action = env.action_space.sample()
+      >>> observation, reward, cost, terminated, truncated, info = env.step(action)
+      >>> bool(cost == info["cost"])
+      True
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:

@@ -29,6 +29,15 @@ class RecordRegret(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
 
     Attributes:
       episodes: the finished episodes, oldest first, as `plots.training_curve` takes them.
+
+    Examples:
+      >>> from sme_registry.wrappers import RecordRegret
+      >>> env = RecordRegret(sme_registry.make("Default", horizon=2), "mine/episodes.csv")
+      >>> observation, info = env.reset(seed=0)
+      >>> steps = [env.step(env.action_space.sample()) for _ in range(2)]
+      >>> bool(0 <= steps[-1][-1]["episode"]["regret"] <= 1)
+      True
+      >>> env.close()
     """
 
     def __init__(

@@ -32,6 +32,14 @@ class RecordVectorRegret(VectorWrapper, RecordConstructorArgs):
 
     Attributes:
       episodes: see `RecordRegret`.
+
+    Examples:
+      >>> from sme_registry.wrappers import RecordVectorRegret
+      >>> envs = RecordVectorRegret(sme_registry.make_vec("Default", 3, horizon=2))
+      >>> observations, infos = envs.reset(seed=0)
+      >>> steps = [envs.step(envs.action_space.sample()) for _ in range(2)]
+      >>> steps[-1][-1]["episode"]["regret"].shape
+      (3,)
     """
 
     def __init__(

@@ -22,6 +22,13 @@ class VectorStepWithCost(VectorWrapper, RecordConstructorArgs):
 
     Raises:
       OptionError: the task has no limits, or the vector is not one of `make_vec`.
+
+    Examples:
+      >>> from sme_registry.wrappers import VectorStepWithCost
+      >>> envs = VectorStepWithCost(sme_registry.make_vec("Safety20", 3))
+      >>> observations, infos = envs.reset(seed=0)
+      >>> envs.step(envs.action_space.sample())[2].shape
+      (3,)
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:

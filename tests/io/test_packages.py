@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 import shlex
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -11,6 +15,7 @@ import pytest
 import sme_registry
 from sme_registry.errors import MissingDependencyError
 from sme_registry.io import install_command, missing_dependency, packages, require_packages
+from tests.wheel.test_extras import NAME, closure
 
 ROOT = Path(sme_registry.__file__).parents[1]
 
@@ -97,3 +102,52 @@ def test_a_failed_import_is_explained_by_the_extra_that_has_the_module() -> None
     assert extra("torch", "leaderboard") in ("offline", "train")
     assert extra("sme_registry.no_such_module") is None
     assert extra("numpy") is None
+
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def plain(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def hints() -> list[tuple[str, str, list[str]]]:
+    """Every place in the code that names an extra: where, the extra, the modules that it lacks."""
+    found = []
+    for path in (*ROOT.glob("sme_registry/**/*.py"), *ROOT.glob("leaderboard/**/*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+                continue
+            where = f"{path.relative_to(ROOT)}:{node.lineno}"
+            if node.func.id == "require_packages" and isinstance(node.args[2], ast.Constant):
+                named = node.args[1]
+                keys = named.keys if isinstance(named, ast.Dict) else []
+                modules = [key.value for key in keys if isinstance(key, ast.Constant)]
+                found.append((where, str(node.args[2].value), [str(each) for each in modules]))
+            elif node.func.id == "install_command" and isinstance(node.args[0], ast.Constant):
+                found.append((where, str(node.args[0].value), []))
+    return found
+
+
+@pytest.mark.skipif(not packages._extras(), reason="reads the extras of the installed package")
+def test_every_hint_names_an_extra_that_has_the_missing_module() -> None:
+    requirements, distributions = metadata.requires(NAME) or [], metadata.packages_distributions()
+    found = hints()
+    assert len(found) > 20
+    for where, extra, modules in found:
+        assert extra in EXTRAS, where
+        for module in modules:
+            needed = {plain(name) for name in closure(requirements, extra)}
+            assert needed & {plain(name) for name in distributions[module]}, (where, module)
+
+
+def test_the_documentation_installs_existing_extras_from_a_clone() -> None:
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.py")]
+    found = 0
+    for page in pages:
+        text = page.read_text()
+        assert "sme-registry[" not in text, f"{page}: nobody with a clone alone can install it"
+        for extras in re.findall(r"install [^\n`]*?\.\[([\w,]+)\]", text):
+            found += 1
+            assert set(extras.split(",")) <= EXTRAS.keys(), page
+    assert found > 5

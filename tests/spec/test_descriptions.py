@@ -94,7 +94,7 @@ def test_ranges_follow_from_the_fields():
         first: Annotated[Integer, Field(ge=3, lt=7)] = 4
         second: bool
 
-    assert summary(Tuned) == "A document.\n\nExamples:\n  none"
+    assert summary(Tuned) == "A document."
     assert Tuned.__doc__ == (
         "A document.\n\nAttributes:\n  first: of two.\n    An integer in [3, 7); default: 4.\n"
         "  second: of two.\n    True or false.\n\nExamples:\n  none\n"

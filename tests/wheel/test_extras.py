@@ -27,16 +27,6 @@ EXTRAS = [extra for extra in PROJECT["optional-dependencies"] if extra != "dev"]
 HINT = re.compile(rf"install .?{NAME}\[(\w+)\]")
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
-    built = subprocess.run([*command, str(ROOT)], capture_output=True, text=True)
-    assert built.returncode == 0, built.stdout + built.stderr
-    (path,) = folder.glob("*.whl")
-    return path
-
-
 def closure(requirements: list[str], extra: str) -> set[str]:
     """The installed distributions that these requirements of a package need."""
     waiting = [(Requirement(text), extra) for text in requirements]

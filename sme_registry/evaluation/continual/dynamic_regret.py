@@ -136,6 +136,14 @@ def dynamic_regret(
     Raises:
       OptionError: no rows, arrays of different lengths, values out of range, or rows that overlap.
       UnknownNameError, SpecError: no such stream, or a field is out of range.
+
+    Examples:
+      >>> from sme_registry.evaluation import dynamic_regret
+      >>> phases = [{"spec": "Default", "steps": 200}, {"spec": "Complexity10", "steps": 200}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> log = dynamic_regret(stream, [100, 200, 300, 400], [0.5, 0.25, 0.5, 0.25], length=100)
+      >>> log.dynamic_regret
+      150.0
     """
     spec = resolve_stream(stream).stream
     ends, lengths, means = _rows(step, length, regret)

@@ -68,6 +68,14 @@ def evaluate_stream(
       PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
       MissingDependencyError: the library that loads a policy is not installed.
       ResourceLimitError: the tasks would not fit in memory together.
+
+    Examples:
+      >>> from sme_registry.evaluation import evaluate_stream
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> report = evaluate_stream(["linear", "optimal"], stream, "quick-v1")  # after each visit
+      >>> len(report.visits)
+      2
     """
     stream = load_stream(stream)
     stream.refuse_many_visits()
@@ -134,6 +142,12 @@ def frozen_after_first(stream: StreamSpec, policies: Sequence[_Any]) -> list[_An
     Args:
       stream: the stream.
       policies: the agent's policies at the ends of the visits, or the first of them alone.
+
+    Examples:
+      >>> from sme_registry.evaluation import frozen_after_first
+      >>> stream = sme_registry.load("Cycle2")
+      >>> set(frozen_after_first(stream, ["after the first visit"]))
+      {'after the first visit'}
     """
     return [policies[0]] * stream.visits
 
@@ -144,6 +158,12 @@ def fresh_per_phase(stream: StreamSpec, fresh: Sequence[_Any]) -> list[_Any]:
     Args:
       stream: the stream.
       fresh: for each phase a policy trained on that phase alone.
+
+    Examples:
+      >>> from sme_registry.evaluation import fresh_per_phase
+      >>> stream = sme_registry.load("Cycle2")
+      >>> fresh_per_phase(stream, ["first", "second"])[:4]
+      ['first', 'second', 'first', 'second']
     """
     return [*fresh] * stream.cycles
 

@@ -63,6 +63,14 @@ def expected_regret(
       PolicyError: a policy cannot be loaded, or its actions are invalid; names it.
       MissingDependencyError: the library that loads a policy is not installed.
       ResourceLimitError: the tasks would not fit in memory together.
+
+    Examples:
+      >>> from sme_registry.evaluation import expected_regret
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> regret = expected_regret(["constant", "constant"], stream, episodes=10)
+      >>> 0 < regret.dynamic_regret < 200
+      True
     """
     stream = load_stream(stream)
     stream.refuse_many_visits()
@@ -115,6 +123,12 @@ def reference_regret(
     Raises:
       OptionError: only one of `frozen` and `training`, or a training without steps in visit 0.
       As `expected_regret`.
+
+    Examples:
+      >>> from sme_registry.evaluation import reference_regret
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> sorted(reference_regret(sme_registry.StreamSpec(phases=phases), episodes=10))
+      ['constant_half', 'fresh_optimum', 'frozen_optimum']
     """
     stream = load_stream(stream)
     stream.refuse_many_visits()

@@ -45,6 +45,15 @@ def across_seeds(
     Raises:
       OptionError: no report, or reports of different streams or protocols.
       UnknownNameError: no region has this name.
+
+    Examples:
+      >>> from sme_registry.evaluation import across_seeds, evaluate_stream
+      >>> phases = [{"spec": "Default", "steps": 100}, {"spec": "Complexity10", "steps": 100}]
+      >>> stream = sme_registry.StreamSpec(phases=phases)
+      >>> runs = ("linear", "constant")
+      >>> lives = [evaluate_stream([policy] * 2, stream, "quick-v1") for policy in runs]
+      >>> across_seeds(lives)["average_performance"].value.shape
+      (2,)
     """
     same_stream(reports)
     runs = {

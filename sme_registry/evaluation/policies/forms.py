@@ -76,6 +76,14 @@ def as_policy(
         or an agent of a team has none or is unknown.
       OptionError: `action_range` is neither "unit" nor "symmetric".
       MissingDependencyError: the library that loads it is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import as_policy
+      >>> def centre(observations):
+      ...     return np.zeros((len(observations), 4))
+      >>> policy = as_policy(centre, sme_registry.load("Default"), action_range="symmetric")
+      >>> policy(np.full((1, 10), 0.5, np.float32))  # in the unit range
+      array([[0.5, 0.5, 0.5, 0.5]])
     """
     if action_range is not None:
         choice("action_range", action_range, ACTION_RANGES)
@@ -98,6 +106,11 @@ def interface_of(spec: SMESpec, observed_phases: int = 0) -> Interface:
     """The widths of a policy for a task; of a team's, for the one that all agents share.
 
     `observed_phases` are the phases of a stream that the policy observes, for a single agent.
+
+    Examples:
+      >>> from sme_registry.evaluation import interface_of
+      >>> interface_of(sme_registry.load("Default")).observation_dim
+      10
     """
     if spec.team is None:
         S, A, m = spec.state_dim, spec.action_dim, spec.distractors

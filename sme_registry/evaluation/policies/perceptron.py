@@ -60,6 +60,13 @@ class Perceptron:
     Raises:
       PolicyError: there is no layer, an array has another shape or no finite numbers, or an
         activation is unknown.
+
+    Examples:
+      >>> from sme_registry.evaluation import Perceptron
+      >>> W, b = np.zeros((10, 4)), np.full(4, 0.5)
+      >>> policy = Perceptron([(W, b, "identity")])
+      >>> policy(np.full((2, 10), 0.5, np.float32)).shape
+      (2, 4)
     """
 
     def __init__(

@@ -60,6 +60,11 @@ def load_sb3(path: str | os.PathLike[str], algorithm: str | None = None) -> Any:
       PolicyError: it does not exist, is not such a file, does not tell its algorithm, or cannot be
         loaded as a model of it.
       MissingDependencyError: the package of its algorithm is not installed.
+
+    Examples:
+      >>> from sme_registry.evaluation import load_sb3
+      >>> type(load_sb3("runs/ppo/model.zip")).__name__
+      'PPO'
     """
     path = Path(path)
     fields = _saved_fields(path)

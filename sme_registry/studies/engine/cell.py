@@ -68,6 +68,13 @@ def run_cell(
         not accept the hyperparameters, or the model cannot be written.
       ResourceLimitError: the task would not fit in memory.
       PolicyError: the learner's actions cannot be used, or it stopped early.
+
+    Examples:
+      >>> from sme_registry.spec import StudyFile
+      >>> from sme_registry.studies import run_cell
+      >>> cell = StudyFile.read("study/plan.json").plan.cells[0].cell
+      >>> run_cell(cell).report.policy
+      'reference:linear'
     """
     start = time.thread_time()
     progress = progress or (lambda done, total: None)

@@ -90,6 +90,13 @@ def run_study(
       UnknownNameError: a pattern matches nothing, or an algorithm cannot be found.
       MissingDependencyError: an algorithm, or Ray, needs a package that is not installed.
       KeyboardInterrupt: interrupted; says how to continue.
+
+    Examples:
+      >>> from sme_registry.spec import StudyFile
+      >>> from sme_registry.studies import run_study
+      >>> plan = StudyFile.read("study/plan.json")
+      >>> run_study(plan, "study", executor="in-process", progress=False).count("done")
+      6
     """
     if jobs is not None:
         jobs = integer_in("jobs", jobs, 1)

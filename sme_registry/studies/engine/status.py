@@ -153,6 +153,11 @@ def study_status(
       OptionError: the folder contains no study.
       UnknownNameError: a pattern matches nothing.
       SpecError: plan.json is not a valid plan.
+
+    Examples:
+      >>> from sme_registry.studies import study_status
+      >>> study_status("study").count("done")
+      6
     """
     ledger = Ledger(folder)
     file = ledger.plan_file()

@@ -61,6 +61,12 @@ def compare(
       UnknownNameError: the study has no finished run of such an algorithm, or no such metric.
       OptionError: both are the same, no class has a pair, or the folder holds no study, or one of
         streams alone.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> differences = studies.compare("study", "linear", "constant", ["wd_regret"])
+      >>> bool(differences["difference"].iloc[-1] < 0)
+      True
     """
     if not isinstance(study, StudyFrames):
         _refuse_streams_alone(study)
@@ -119,6 +125,12 @@ def write_comparison(
     Raises:
       MissingDependencyError: Matplotlib is not installed.
       UnknownNameError, OptionError: see `compare`; or a file cannot be written.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> files = studies.write_comparison("study", "compared", "linear", "constant", ["wd_regret"])
+      >>> sorted({path.suffix for path in files})
+      ['.csv', '.json', '.pdf', '.png', '.tex']
     """
     from sme_registry.plots.style import WRITTEN
     from sme_registry.studies.report.figures.differences import draw_class_curves, draw_differences

@@ -146,6 +146,12 @@ def load(folder: str | os.PathLike[str]) -> StudyFrames:
       OptionError: the folder holds no study.
       MalformedDocumentError, SpecError, DigestMismatchError: its plan is invalid.
       MissingDependencyError: pandas is not installed.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> results, curves = studies.load("study")
+      >>> sorted(results["algorithm"].unique())
+      ['PPO', 'constant', 'linear']
     """
     ledger = Ledger(folder)
     file = plan_file(ledger)

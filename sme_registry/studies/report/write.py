@@ -60,6 +60,11 @@ def write_report(
         report cannot be written.
       SpecError: the folder's plan is invalid.
       MissingDependencyError: Matplotlib is not installed.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> studies.write_report("study", "report", formats=["csv"])[-1].suffix
+      '.csv'
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:

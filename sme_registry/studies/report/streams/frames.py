@@ -136,6 +136,11 @@ def load_streams(folder: str | os.PathLike[str]) -> StreamFrames:
       OptionError: the folder holds no study.
       MalformedDocumentError, SpecError, DigestMismatchError: its plan is invalid.
       MissingDependencyError: pandas is not installed.
+
+    Examples:
+      >>> from sme_registry import studies
+      >>> len(studies.load_streams("study").retention)  # a study without streams
+      0
     """
     ledger = Ledger(folder)
     plan = plan_file(ledger).plan
