@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from docstrings import short_types
 from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
 from sphinx.util.typing import stringify_annotation
@@ -92,7 +93,7 @@ def _alias(value: Any) -> str:
             return f"{stringify_annotation(value.__origin__, 'smart')}: {mark.description}."
     if hasattr(value, "__metadata__"):
         value = value.__origin__
-    return f"``{stringify_annotation(value, 'smart').replace('~', '')}``"
+    return f"``{short_types(stringify_annotation(value, 'smart')).replace('~', '')}``"
 
 
 def write(source: Path) -> None:
