@@ -26,6 +26,7 @@ from sme_registry.errors import (
     PolicyError,
     SealedError,
 )
+from sme_registry.evaluation.references import NAMES, SHORT_NAMES
 from sme_registry.sealed import Instance, Ticket, actions_in, connection
 from sme_registry.spec import Setting
 from tests.leaderboard.serving import serving
@@ -65,6 +66,7 @@ def test_a_hidden_task_is_stepped_as_the_same_task_is_here(server, action_range)
     hidden = sealed.make_vec(server.url, server.ticket, 1, 3, action_range=action_range)
     for name in ("action_space", "observation_space", "single_action_space", "num_envs"):
         assert getattr(hidden, name) == getattr(here, name)
+    assert hidden.metadata["autoreset_mode"] == here.metadata["autoreset_mode"]
     observation, info = hidden.reset(seed=5)
     assert info == {}
     assert np.array_equal(observation, here._batch.observe())
@@ -413,6 +415,16 @@ def test_a_policy_that_cannot_be_used_does_not_end_the_stepping(server):
     with pytest.raises(PolicyError):
         sealed.answer(server.url, server.ticket, "missing.zip")
     assert server.requests == []
+
+
+@pytest.mark.parametrize("name", [*NAMES, *SHORT_NAMES])
+def test_a_reference_policy_answers_only_if_it_needs_no_task(name):
+    setting = Setting(state_dim=3, action_dim=2)
+    if ("constant" in name and "best" not in name) or "random" in name:
+        assert actions_in(np.zeros((4, 5), np.float32), name, setting).shape == (4, 2)
+    else:
+        with pytest.raises(PolicyError, match="follows from the task, which is hidden"):
+            actions_in(np.zeros((4, 5), np.float32), name, setting)
 
 
 def test_actions_are_asked_for_in_every_form_that_evaluate_takes():

@@ -20,6 +20,7 @@ from sme_registry import sealed
 from sme_registry.errors import OptionError, SealedError
 from sme_registry.sb3 import SMEVecEnv
 from sme_registry.sealed.sb3 import SealedVecEnv
+from sme_registry.sealed.wire import Steps
 from sme_registry.training.learners import new_learner
 from tests.sealed.server import ROWS, Server, serving_season
 
@@ -69,6 +70,17 @@ def test_an_sb3_batch_is_stepped_as_the_same_task_is_here(server):
     hidden.set_options({"state": [0, 0, 0]})
     with pytest.raises(OptionError, match="the server draws"):
         hidden.reset()
+
+
+def test_an_episode_that_terminates_at_the_horizon_is_not_cut(server, monkeypatch):
+    hidden = SealedVecEnv(server.url, server.ticket, 0, 3)
+    observation = hidden.reset()
+    terminated, truncated = np.array([True, False, True]), np.array([True, True, False])
+    steps = Steps(observation, np.zeros(3, np.float32), terminated, truncated, observation)
+    monkeypatch.setattr(hidden._stepped, "step", lambda _: steps)
+    *_, dones, infos = hidden.step(np.zeros((3, 2)))
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, True, False]
 
 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
