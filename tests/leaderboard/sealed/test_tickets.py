@@ -23,7 +23,7 @@ from leaderboard.intake import start_ticket
 from leaderboard.scoring.sealed import instances
 from leaderboard.sealed import Tickets
 from leaderboard.sealed import tickets as tickets_module
-from leaderboard.sealed.attendant import Attendant
+from leaderboard.sealed.attendant import Attendant, _score
 from leaderboard.sealed.instance import SteppedInstance
 from leaderboard.sealed.scores import score_ticket
 from leaderboard.sealed.stepping import Lanes
@@ -434,6 +434,67 @@ def test_a_ticket_takes_nothing_while_it_is_scored_and_what_it_took_is_flushed(
     Attendant(played.tickets).attend()
     instance = played.tickets.ticket(played.number).instance(0)
     refused("ticket_ended", instance.step, WIRE.pack_request(2, np.zeros((LANES, 1))))
+
+
+class Failed:
+    """A process that has ended in vain."""
+
+    exitcode = 1
+
+    def is_alive(self) -> bool:
+        return False
+
+    def close(self) -> None:
+        pass
+
+
+def test_tickets_that_could_not_be_scored_are_tried_again_after_a_pause_one_by_one(
+    played: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played.store.start_ticket(played.board.request(KEY, 1))
+    for number in (1, 2):
+        instance = played.tickets.ticket(number).instance(0)
+        instance.start(LANES)
+        instance.step(WIRE.pack_request(1, np.zeros((LANES, 1))))
+    clock, uptime = tickets_module.time.time, tickets_module.time.monotonic
+    monkeypatch.setattr(tickets_module.time, "time", lambda: clock() + 25 * 3600)
+    played.restart()
+    started: list[list[int]] = []
+
+    def start(attendant: Attendant) -> Failed:
+        started.append(attendant._numbers)
+        return Failed()
+
+    monkeypatch.setattr(Attendant, "_start", start)
+    attendant = Attendant(played.tickets)
+    attendant.attend()
+    attendant.attend()
+    assert started == [[1, 2]]
+    monkeypatch.setattr(tickets_module.time, "monotonic", lambda: uptime() + 2)
+    for _ in range(3):
+        attendant.attend()
+    assert started == [[1, 2], [1], [2]]
+    attendant.attend()
+    assert len(started) == 3
+
+
+@pytest.mark.parametrize("fault", [False, True])
+def test_a_process_says_whether_all_tickets_were_scored(
+    played: Played, monkeypatch: pytest.MonkeyPatch, fault: bool
+) -> None:
+    played.start()
+    played.step(1)
+    played.tickets.close()
+    board, season = played.board, played.board.season
+    if fault:
+        folder = played.store.season_folder(season.digest).ticket(played.number)
+        (folder / "0.journal").write_bytes(b"no journal")
+    monkeypatch.setattr("leaderboard.sealed.attendant.signal.signal", lambda *_: None)
+    with pytest.raises(SystemExit) as end:
+        _score(board.path, season.digest, board.secret, [played.number])
+    assert bool(end.value.code) is fault
+    row = played.store.ticket(season.digest, played.number)
+    assert (row.result is None) is fault
 
 
 def test_a_disk_that_fails_for_a_moment_ends_no_server(

@@ -84,6 +84,13 @@ def test_columns_of_a_run_are_those_of_the_cube_and_of_its_training() -> None:
         key = planned.cell.digest
         if planned.cell.spec.safety is not None:
             results[key] = results[key].model_copy(update={"online_cost": costs[key]})
+        else:  # references do not see distractors
+            report = results[key].report
+            inside, *shells = report.observation.invariance
+            invariance = (inside.model_copy(update={"invariance": 0.25}), *shells)
+            seen = report.observation.model_copy(update={"invariance": invariance})
+            report = report.model_copy(update={"observation": seen})
+            results[key] = results[key].model_copy(update={"report": report})
     runs = frames.runs(study_frames(file.plan, results).results).set_index("key")
     for planned in file.plan.cells:
         key, report = planned.cell.digest, results[planned.cell.digest].report
