@@ -134,7 +134,7 @@ def test_the_page_on_seasons_leads_from_a_ticket_to_its_end(server, tmp_path, mo
     with sealed.Instance(server.url, server.ticket) as first:
         used = [each.used for each in first.status().instances]
         assert used == [4096, 4096, 8]
-        [command] = re.findall(r"^sme-leaderboard (answer .*)$", page, re.M)
+        command = re.search(r"^sme-leaderboard (answer .*)$", page, re.M)[1]
         words = shlex.split(command.replace("https://board.example", server.url))
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, result.output

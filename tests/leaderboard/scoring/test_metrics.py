@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import time
 import tracemalloc
 
 import numpy as np
@@ -197,20 +196,6 @@ def test_intervals_cover_the_truth_and_do_not_separate_equal_methods(
     if instances == 1:  # few runs on an instance are trimmed less, so their θ has another limit
         assert actual.coverage >= 0.93 - slack
     assert actual.separated <= 0.02 + 3 * math.sqrt(0.02 * 0.98 / 200)
-
-
-def test_the_bootstrap_of_a_board_takes_well_under_a_second(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    classes = runs_of(6, 10, metrics=11)
-
-    start = time.process_time()
-    bootstrap(classes, 10_000, "a")
-    seconds = time.process_time() - start
-
-    with capsys.disabled():
-        print(f"\n6 classes × 10 runs × 10,000 draws × 11 scores: {seconds:.2f} s")
-    assert seconds < 1.0
 
 
 def test_the_bootstrap_of_many_runs_needs_little_memory() -> None:
