@@ -190,7 +190,6 @@ def dynamic_regret_curve(
       MissingDependencyError: Matplotlib is not installed.
 
     Examples:
-      >>> from sme_registry.evaluation import StreamReport
       >>> from sme_registry.plots import dynamic_regret_curve
       >>> figure = dynamic_regret_curve("runs/life", "dynamic_regret.png")
     """
