@@ -104,11 +104,11 @@ def explore(
     from sme_registry import explorer
 
     shown = _shown(what, task, cell, set_, action_range, log)
-    is_run = not isinstance(shown, SMESpec) and task is None and cell is None
+    is_run = not isinstance(shown, SMESpec) and task is None
     written = explorer.write_explorer(
         target,
         shown,
-        report=explorer.run_report(what) if is_run else None,
+        report=explorer.run_report(what, cell) if is_run else None,
         channels=pairs,
         episodes=episodes,
         seed=seed,

@@ -33,6 +33,7 @@ __all__ = [
     "Log",
     "Subject",
     "TeamSubject",
+    "cell_path",
     "load_cell",
     "load_policy",
     "load_run",
@@ -200,7 +201,7 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
       'PPO'
     """
     study = Path(study)
-    path = _cell_path(study, key)
+    path = cell_path(study, key)
     cell, log = _read_cell(path)
     if cell.uses.startswith(INDEPENDENT):
         raise OptionError(
@@ -221,7 +222,8 @@ def load_cell(study: str | Path, key: str) -> AnySubject:
     return Subject(name, cell.spec, policy, plan, log, networks.exploration(model, policy))
 
 
-def _cell_path(study: Path, key: str) -> Path:
+def cell_path(study: Path, key: str) -> Path:
+    """The result of a finished cell of a study; `load_cell` has the arguments and errors."""
     results = sorted((study / "cells").glob("*.json"))
     if not results:
         raise OptionError(

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from sme_registry.diagnosis import AnySubject
 from sme_registry.diagnosis.stream_subject import StreamSubject
+from sme_registry.diagnosis.subject import cell_path
 from sme_registry.errors import OptionError
 from sme_registry.evaluation import EvaluationReport
 from sme_registry.explorer.collect import EPISODES, facts
 from sme_registry.explorer.page import page
-from sme_registry.io import write_atomically
+from sme_registry.io import read_json, write_atomically
 from sme_registry.spec import SMESpec
 from sme_registry.training import EXPLORER as FILE
 from sme_registry.training.reports import EVALUATION
@@ -96,7 +97,10 @@ def explorer_page(
     return page(content, static)
 
 
-def run_report(folder: str | os.PathLike[str]) -> EvaluationReport | None:
-    """The evaluation of a run's folder; None if there is none yet."""
+def run_report(folder: str | os.PathLike[str], cell: str | None = None) -> EvaluationReport | None:
+    """The evaluation of a run's folder, or of a finished cell of a study; None if there is none."""
+    if cell is not None:
+        result = read_json(cell_path(Path(folder), cell))
+        return EvaluationReport.from_dict(result["report"]) if "report" in result else None
     path = Path(folder) / EVALUATION
     return EvaluationReport.read(path) if path.exists() else None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from sme_registry.diagnosis import load_cell
 from sme_registry.errors import SMEError
-from sme_registry.explorer import explorer_page
+from sme_registry.explorer import explorer_page, run_report
 from sme_registry.spec import StudyFile
 from sme_registry.studies.engine.ledger import Ledger
 from sme_registry.studies.engine.status import run_label
@@ -45,7 +45,8 @@ def explorers_of(ledger: Ledger, file: StudyFile, models: Mapping[str, Path]) ->
         label = run_label(planned.class_name, planned.algorithm, planned.run)
         name = key.removeprefix("sha256:")[:_DIGITS]
         try:
-            content = explorer_page(load_cell(ledger.folder, key))
+            report = run_report(ledger.folder, key)
+            content = explorer_page(load_cell(ledger.folder, key), report=report)
         except SMEError:
             continue
         pages[key] = Explorer(label, f"explorers/{name}.html", content)
